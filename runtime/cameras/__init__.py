@@ -1,6 +1,6 @@
-"""Cameras without middleware: each comes by a source of its own and joins the observations of any transport."""
+"""Cameras that the deployment opens itself, one module per kind; they join the observations of any transport."""
 
-# Each kind with its module, which is imported where a deployment names it.
+# Module of each kind. It is imported only if a deployment names it.
 KINDS = {
     "file": "runtime.cameras.file",
     "mjpeg": "runtime.cameras.mjpeg",

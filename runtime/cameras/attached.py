@@ -1,4 +1,4 @@
-"""A transport with cameras of the deployment's own: their pictures join each of its observations."""
+"""Source wrapper that adds the pictures of the deployment's own cameras to each observation of a transport."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _PLAYS_VIDEO = Pattern(
 
 
 class SourceWithCameras(Source):
-    """Another source, whose observations get the newest picture of each camera with its own time of capture.
+    """Wrapper of another source that adds the newest picture of each camera, with its own capture time.
 
-    A camera without a new picture repeats its last one, with that one's time: by this its age is told, refused and
-    recorded as of any other camera. One that has shown nothing yet is missing from the observation.
+    A camera without a new picture repeats its last one with the old capture time, so that its age is checked and
+    recorded like that of any other camera. A camera without a first picture is missing from the observation.
     """
 
     def __init__(self, source: Source, cameras: Sequence[Camera], clock: Clock) -> None:
@@ -37,7 +37,7 @@ class SourceWithCameras(Source):
         self._said: dict[str, CameraHealth] = {}
 
     def connect(self) -> None:
-        """Start the cameras, which nobody waits for, and connect the source."""
+        """Start the cameras without waiting for them, and connect the source."""
         for camera in self._cameras:
             camera.start()
         self._source.connect()
@@ -48,6 +48,7 @@ class SourceWithCameras(Source):
 
     def _add_images(self, observation: Observation) -> Observation:
         pictures, captured = dict(observation.pictures), dict(observation.captured)
+        # Our camera replaces a picture of the transport with the same key, even before its own first picture.
         for camera in self._cameras:
             pictures.pop(camera.key, None)
             captured.pop(camera.key, None)
@@ -67,7 +68,7 @@ class SourceWithCameras(Source):
         self._source.end_run()
 
     def faults(self) -> dict[str, int]:
-        """Those of the source, and of each camera."""
+        """Return the faults of the source and of each camera."""
         counts = dict(self._source.faults())
         for camera in self._cameras:
             counts |= camera.faults()
@@ -77,11 +78,11 @@ class SourceWithCameras(Source):
         return self._source.describe_fault(fault)
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
-        """Health of each camera: kind, place, condition, since when, why, age of its newest picture [s]."""
+        """Return the health of each camera: kind, source, condition, since when [s], why, newest picture's age [s]."""
         return {camera.key: self._health_dict(camera) for camera in self._cameras}
 
     def pop_events(self) -> list[Event]:
-        """That of the source; a camera that was lost, ended or came back, and why one cannot be opened."""
+        """Return the source's events, and one for each camera that was lost, ended, is back or cannot be opened."""
         events = self._source.pop_events()
         for camera in self._cameras:
             health, before = camera.health(), self._said.get(camera.key)
@@ -112,7 +113,7 @@ class SourceWithCameras(Source):
         return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._health_dict(camera)})
 
     def _warning(self, camera: Camera) -> Event:
-        """A policy that moves a robot by a video acts on what is not there: whoever stands beside it is told."""
+        """Return the warning that a policy receives a video instead of the robot's surroundings."""
         text = _PLAYS_VIDEO(camera=camera.key, video=camera.shown)
         return Event("camera_is_a_video", text, self._clock.now(), data={"camera": camera.key})
 

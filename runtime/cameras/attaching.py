@@ -1,4 +1,4 @@
-"""From a deployment's `[cameras.KEY]` tables to cameras on a source."""
+"""Construction of cameras from a deployment's `[cameras.KEY]` tables."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 
 def check(cameras: Mapping[str, Any], robot: Robot) -> None:
-    """Raise ConfigurationError where a table is of no camera of the robot, or its password is not there."""
+    """Check that each table belongs to a camera of the robot and that its password is set.
+
+    Raises ConfigurationError.
+    """
     known = [camera.key for camera in robot.cameras]
     for key in cameras:
         if key not in known:
@@ -29,9 +32,9 @@ def check(cameras: Mapping[str, Any], robot: Robot) -> None:
 
 
 def attach_cameras(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source:
-    """`source` with these cameras; itself where there are none.
+    """Return `source` with these cameras added; `source` itself if there are none.
 
-    On a virtual clock files alone can be played: SetupError for a camera that goes on by itself.
+    With a virtual clock only files can be played: SetupError for a live camera.
     """
     if not cameras:
         return source
@@ -41,7 +44,7 @@ def attach_cameras(source: Source, cameras: Mapping[str, Any], clock: Clock) -> 
 
 
 def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> Camera:
-    kind = str(settings.kind)  # type: ignore[attr-defined]  # every variant has one
+    kind = str(settings.kind)  # type: ignore[attr-defined]  # every variant declares it
     if kind == "file":
         from runtime.cameras.file import Config
         from runtime.cameras.playing import FileCamera

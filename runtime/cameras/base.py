@@ -1,4 +1,4 @@
-"""A camera of our own: its settings, its address, its newest picture, its health."""
+"""Camera interface: settings, address, newest picture, health."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from runtime.core.errors import ConfigurationError, TransportError
 from runtime.core.settings import Settings
 from runtime.core.types import UInt8
 
-LARGEST = 1920 * 1080 * 3  # bytes of a picture as it is handed on
+LARGEST = 1920 * 1080 * 3  # bytes of a picture after processing
 
 Pixels = Annotated[int, Field(ge=8, le=4096)]
 Offset = Annotated[int, Field(ge=0, le=8192)]
 
 
 class CameraError(TransportError):
-    """A camera cannot be opened, is lost, or its pictures are unusable; says what was found there."""
+    """Error about a camera that cannot be opened, is lost, or sends unusable pictures; the message is the finding."""
 
 
 class CameraSettings(Settings):
@@ -53,18 +53,18 @@ class CameraSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Address of a camera's pictures, as FFmpeg takes it."""
+    """Address of a camera's pictures, in FFmpeg's terms."""
 
     url: str = field(repr=False)  # may hold a password
-    shown: str  # for people
+    shown: str  # for display, without a password
     format: str | None = None
     options: Mapping[str, str] = field(default_factory=dict)
-    stamped: bool = True  # the stream says when each picture was taken
+    stamped: bool = True  # the stream carries capture times
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedImage:
-    """One picture uint8 [H, W, 3] RGB, when it was taken and when it was here, on our clock [s]."""
+    """One picture uint8 [H, W, 3] RGB, with its capture and arrival time on our clock [s]."""
 
     picture: UInt8
     captured: float
@@ -76,23 +76,23 @@ class CameraCondition(StrEnum):
 
     OPENING = "opening"  # no picture yet
     LIVE = "live"
-    LOST = "lost"  # it had pictures, and gives none now
-    ENDED = "ended"  # a file that is over
+    LOST = "lost"  # had pictures, sends none now
+    ENDED = "ended"  # a file that has been played
 
 
 @dataclass(frozen=True, slots=True)
 class CameraHealth:
-    """Condition of a camera, its beginning on our clock [s], and its reason."""
+    """Condition of a camera, since when on our clock [s], and why."""
 
     condition: CameraCondition
     since: float
     why: str = ""
-    losses: int = 0  # how often it was lost
-    failed: bool = False  # it was tried, and could not be opened
+    losses: int = 0  # number of times that it was lost
+    failed: bool = False  # an attempt to open it has failed
 
 
 class Camera(ABC):
-    """One camera; whatever happens to it, nobody who asks it waits."""
+    """One camera. No method waits for the camera, whatever its state."""
 
     key: str
     kind: str
@@ -100,30 +100,30 @@ class Camera(ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Begin to look; safe to call twice."""
+        """Start reading. Safe to call twice."""
 
     @abstractmethod
     def latest(self) -> CapturedImage | None:
-        """The newest picture, the same one until there is another; None before the first."""
+        """Return the newest picture, again and again until there is a newer one; None before the first."""
 
     @abstractmethod
     def health(self) -> CameraHealth:
-        """Present health of the camera."""
+        """Return the present health of the camera."""
 
     @abstractmethod
     def request_stop(self) -> None:
-        """Stop looking, as soon as that is possible; nobody waits."""
+        """Request the end of reading, without waiting for it."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop looking, and wait a moment for that; safe to call twice."""
+        """Stop reading and wait briefly for the end. Safe to call twice."""
 
-    def begin_run(self) -> None:  # noqa: B027  # a live camera has nothing to do
-        """A run starts: a file plays from its first picture."""
+    def begin_run(self) -> None:  # noqa: B027  # not abstract: a live camera needs nothing
+        """Start a run; a file plays from its first picture."""
 
     def end_run(self) -> None:  # noqa: B027
-        """The run is over: a file shows its first picture again."""
+        """End the run; a file returns to its first picture."""
 
     def faults(self) -> dict[str, int]:
-        """Counts by name of what went wrong since the start."""
+        """Return the count of each fault since the start."""
         return {}

@@ -1,4 +1,4 @@
-"""URLs of cameras on the network: what they may be, and how a password gets into one without being written down."""
+"""URLs of network cameras: their check, and passwords that come from the environment and are never recorded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from runtime.core.errors import ConfigurationError
 
 
 def check_url(key: str, url: str, schemes: tuple[str, ...]) -> str:
-    """`url` itself; raises ConfigurationError where it is none of `schemes`, has no host, or a password in it."""
+    """Return `url` after checking it.
+
+    Raises:
+        ConfigurationError: Its scheme is not in `schemes`, it has no host, or it contains a user or password.
+    """
     allowed = " or ".join(f"{scheme}://HOST[:PORT]/PATH" for scheme in schemes)
     try:
         parts = urlsplit(url)
@@ -27,7 +31,7 @@ def check_url(key: str, url: str, schemes: tuple[str, ...]) -> str:
 
 
 def with_password(url: str, user: str | None, variable: str | None) -> str:
-    """`url` with the user, and the password that the environment holds; ConfigurationError where it holds none."""
+    """Return `url` with the user, and with the password of the environment variable. Raises ConfigurationError."""
     if user is None:
         return url
     name = quote(user, safe="")

@@ -1,4 +1,4 @@
-"""The coordinator's sentences on cameras that give no pictures, from media's report of them."""
+"""Sentences about cameras without pictures, made by the coordinator from media's camera report."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOT_LIVE = Pattern("cameras.not_live", "camera {camera} ({source}) is {condition
 def describe_camera_problems(
     cameras: Mapping[str, Mapping[str, Any]], keys: Iterable[str] | None = None
 ) -> list[str]:
-    """A sentence for each camera, or each of `keys`, that is not live: which, where, how, why."""
+    """Return a sentence for each camera, or each of `keys`, that is not live: camera, source, condition, reason."""
     chosen = cameras if keys is None else [key for key in keys if key in cameras]
     return [
         NOT_LIVE(camera=key, source=told["source"], condition=told["condition"], why=told["why"])

@@ -1,4 +1,4 @@
-"""An open connection to one camera: pictures in RGB, one after the other, each within a deadline."""
+"""Open connection to one camera: decoded RGB pictures in sequence, each within a deadline."""
 
 from __future__ import annotations
 
@@ -16,41 +16,42 @@ from runtime.cameras.jpegs import Jpegs
 from runtime.core.picture_bounds import DECODING, TooLargeError, bound, require_size
 from runtime.core.types import UInt8
 
-_THERE_S = 0.003  # a packet that comes within was there before it was asked for
-_AT_ONCE = 2
-_SHOWN = 100
-_PARTS = "mpjpeg"  # FFmpeg's name; its reader refuses streams whose parts are not described to the letter
+_THERE_S = 0.003  # [s]; a packet that arrives faster was already waiting
+_AT_ONCE = 2  # packets in a row that may arrive together
+_SHOWN = 100  # of a continuous backlog, every hundredth packet is used
+_PARTS = "mpjpeg"  # FFmpeg's name; its own reader refuses streams with incorrect part headers
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedFrame:
-    """A picture uint8 [H, W, 3] RGB and the stream's own time of it [s], None where it has none."""
+    """Decoded picture uint8 [H, W, 3] RGB, with the stream's own time [s] or None."""
 
     picture: UInt8
     stamp: float | None
 
 
 class Backlog:
-    """Notices by the waits for packets that a stream is read more slowly than it comes, and where its end is."""
+    """Detector of a reader that is slower than its stream, from the waiting times for packets."""
 
     def __init__(self) -> None:
-        self._waiting = 0  # packets in a row that nobody had to wait for
+        self._waiting = 0  # packets in a row that arrived without waiting
 
     def should_skip(self, waited: float) -> bool:
-        """True if the packet waited for so long [s] is to be passed over, as newer ones are there already.
+        """Return True if a packet that took `waited` [s] to arrive can be skipped because newer packets are queued.
 
-        The first few are not, because two may well come at once; nor is each hundredth: something is shown of a
-        stream that never pauses.
+        The first few are used, because two packets may arrive together; so is every hundredth, so that a stream that
+        never pauses still yields pictures.
         """
         self._waiting = self._waiting + 1 if waited < _THERE_S else 0
         return self._waiting > _AT_ONCE and self._waiting % _SHOWN != 0
 
 
 class VideoStream:
-    """One stream opened by PyAV; used by one thread, which waits in FFmpeg without the interpreter's lock.
+    """Stream opened with PyAV, for use by one thread. Waiting happens in FFmpeg, without the interpreter lock.
 
-    FFmpeg looks at the deadlines while it waits (PyAV's `timeout`); packets that never become a picture are bounded
-    here. Of JPEG pictures in parts FFmpeg fetches the bytes alone. Opening raises CameraError that says what was found.
+    FFmpeg enforces the deadlines while it waits (PyAV's `timeout`); packets that never become a picture are bounded
+    here. For JPEG pictures in multipart streams, FFmpeg only fetches the bytes. Opening raises CameraError with the
+    finding.
     """
 
     def __init__(self, address: Address, open_s: float, read_s: float) -> None:
@@ -59,8 +60,8 @@ class VideoStream:
 
         self._address = address
         self._open_s, self._read_s = open_s, read_s
-        self._seen = False  # a picture
-        self._newest: Any = None  # of its packets
+        self._seen = False  # whether a picture has been decoded
+        self._newest: Any = None  # newest packet
         self._errors: Any = av.error
         self._jpegs = Jpegs() if address.format == _PARTS else None
         begun = time.monotonic()
@@ -75,7 +76,7 @@ class VideoStream:
                     **DECODING,
                 },
                 timeout=(open_s, read_s),
-                metadata_errors="replace",  # a camera's title is written as its maker likes
+                metadata_errors="replace",  # the title of a camera may have any encoding
             )
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise CameraError(
@@ -92,18 +93,21 @@ class VideoStream:
             self._container.close()
             raise CameraError(str(error)) from None
         self._stream = videos[0]
-        self._stream.codec_context.thread_count = 1  # frame threads hold pictures back
-        # A stamp tells how old a picture is. Where there is none, it must not have lain in a socket for seconds.
+        self._stream.codec_context.thread_count = 1  # threads per frame would delay pictures
+        # A stamp shows the age of a picture. Without stamps, a picture must not have waited in a socket for seconds.
         self._passes_over = not address.stamped and self._stream.codec_context.codec.intra_only
         self._frames = self._decoded()
 
     @property
     def rate(self) -> float:
-        """Pictures per second as the stream says, 25 where it does not [Hz]."""
+        """Frame rate [Hz] that the stream states; 25 if it states none."""
         return float(self._stream.average_rate or self._stream.guessed_rate or 25.0)
 
     def read(self) -> DecodedFrame | None:
-        """The next picture, None at the end of a file; CameraError where it does not come in time, or is lost."""
+        """Return the next picture; None at the end of a file.
+
+        Raises CameraError if it is late or the stream is lost.
+        """
         begun = time.monotonic()
         try:
             frame = next(self._frames, None)
@@ -125,14 +129,14 @@ class VideoStream:
         return DecodedFrame(picture, None if stamp is None else float(stamp))
 
     def close(self) -> None:
-        """Let it go, with its decoder: the generator and this hold each other, and the collector comes late."""
+        """Close the stream with its decoder now: generator and object form a cycle that is collected late."""
         self._frames = iter(())
         self._container.close()
 
     def _decoded(self) -> Iterator[Any]:
-        """Decoded frames; packets that cannot be decoded are skipped for as long as pictures may be awaited.
+        """Yield decoded frames; packets that cannot be decoded are skipped until a picture is overdue.
 
-        The first picture may take as long as opening: many cameras send one that stands for itself every few seconds.
+        The first picture may take as long as opening, because many cameras send a key frame only every few seconds.
         """
         since = time.monotonic()
         for packet in self._packets():
@@ -149,21 +153,21 @@ class VideoStream:
 
     @property
     def _is_still(self) -> bool:
-        """True if the answer was one picture and not a stream of them."""
+        """True if the response was a single picture instead of a stream."""
         return self._jpegs is not None and self._jpegs.is_single
 
     @property
     def _allowed(self) -> float:
-        """Seconds until the next picture, at the most."""
+        """Longest time until the next picture [s]."""
         return self._read_s if self._seen else max(self._open_s, self._read_s)
 
     def _too_large(self) -> str:
-        """Sentence on the size of the newest picture, "" where it is none that no camera has."""
+        """Return a sentence if the newest picture is too large, else ""."""
         width, height = self._stream.width, self._stream.height
         if self._stream.codec_context.name == "mjpeg" and self._newest is not None:
             import simplejpeg
 
-            with contextlib.suppress(ValueError):  # no whole header
+            with contextlib.suppress(ValueError):  # incomplete header
                 height, width, _, _ = simplejpeg.decode_jpeg_header(bytes(self._newest))
         try:
             require_size(width, height)
@@ -172,7 +176,7 @@ class VideoStream:
         return ""
 
     def _packets(self) -> Iterator[Any]:
-        """As they come; of a stream without stamps whose every packet is a picture, without those of a backlog."""
+        """Yield packets; a backlog is skipped if the stream has no stamps and every packet is a picture."""
         backlog = Backlog()
         packets = self._container.demux(self._stream) if self._jpegs is None else self._parts(self._jpegs)
         while True:
@@ -184,7 +188,7 @@ class VideoStream:
                 yield packet
 
     def _parts(self, jpegs: Jpegs) -> Iterator[Any]:
-        """Whole JPEG pictures; CameraError where none comes in time, however many bytes do."""
+        """Yield whole JPEG pictures. Raises CameraError if none is complete in time, however many bytes arrive."""
         import av
 
         since = time.monotonic()
@@ -207,8 +211,9 @@ class VideoStream:
             raise CameraError(f"its pixel format {frame.format.name} cannot be made RGB") from None
 
 
-# A live stream is not studied for long, and nothing is kept back for order's sake.
+# A live stream is analysed only briefly, and frames are not delayed for reordering.
 _QUICK = {"fflags": "nobuffer", "flags": "low_delay", "analyzeduration": "500000", "fpsprobesize": "0"}
-# Bytes as they come, unparsed: a parser knows a picture by the beginning of the next. At the most so many, and some of
-# them before it counts as open: the first picture may take as long as that.
+# Bytes are passed unparsed: a parser recognises the end of a picture only at the start of the next. `raw_packet_size`
+# is the largest piece; `probesize` is small because the stream counts as open only after that many bytes, and the first
+# picture may take as long.
 _PIECES = {"fflags": "noparse+nofillin", "raw_packet_size": str(1 << 16), "probesize": "32"}

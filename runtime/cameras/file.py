@@ -1,4 +1,4 @@
-"""A video file as a camera."""
+"""Video file as a camera."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ class Config(CameraSettings):
 
 
 def address(config: Config) -> Address:
-    """The file as it is."""
+    """Return the address of the file."""
     path = Path(config.path).expanduser()
     return Address(f"file:{path}", str(path))

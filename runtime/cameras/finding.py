@@ -1,4 +1,4 @@
-"""Findings at a camera's address, in words on which the operator can act."""
+"""Explanations of camera errors, in terms on which an operator can act."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ _PEEK_S = 1.0
 def explain_open_error(
     error: Exception, address: Address, waited: float, allowed: float, opening: bool
 ) -> str:
-    """One clause for an error of FFmpeg's after `waited` of `allowed` seconds; never the URL with its password.
+    """Return one clause about an error of FFmpeg, without the URL and its password.
 
-    `opening`: nothing has come yet; else pictures have, and the stream breaks.
+    Args:
+        error: Exception of FFmpeg or the system.
+        address: Address of the camera.
+        waited: Time until the error [s].
+        allowed: Deadline [s].
+        opening: True if no picture has come yet; False if a running stream broke.
     """
     import av.error
 
@@ -41,7 +46,7 @@ def explain_open_error(
         return "there is no such file"
     if isinstance(error, PermissionError):
         return "this user may not read it"
-    if not opening and address.format == "mpjpeg":  # an answer without a length ends in an error
+    if not opening and address.format == "mpjpeg":  # a response without a length ends in an error
         return "it closed the connection"
     if not opening:
         return f"the stream broke: {getattr(error, 'strerror', '') or type(error).__name__}"
@@ -49,9 +54,12 @@ def explain_open_error(
 
 
 def ended(address: Address, single: bool, stated: str) -> str:
-    """One clause for a stream that ended without pictures in parts, which it called `stated`.
+    """Return one clause about a multipart stream that ended without pictures.
 
-    `single`: it was a picture by itself.
+    Args:
+        address: Address of the camera.
+        single: Whether the response was one picture without parts.
+        stated: Content type of its parts, "" if none was stated.
     """
     if _is_other(stated):
         return f"it ended, and sent parts of type {stated}, no JPEG"
@@ -61,7 +69,7 @@ def ended(address: Address, single: bool, stated: str) -> str:
 
 
 def others(allowed: float, stated: str) -> str:
-    """One clause for what came for `allowed` seconds and is no picture; `stated` is the type that it was said to be."""
+    """Return one clause about data that was not a picture for `allowed` [s]; `stated` is its declared content type."""
     kind = f": parts of type {stated}, no JPEG" if _is_other(stated) else ""
     return f"what it sent for {allowed:g} s cannot be decoded{kind}"
 
@@ -71,7 +79,7 @@ def _is_other(stated: str) -> bool:
 
 
 def _device(error: Exception, address: Address) -> str:
-    """Sentence on what is wrong with a device of this machine."""
+    """Return one clause about a local device that cannot be opened."""
     number = getattr(error, "errno", None)
     if isinstance(error, FileNotFoundError):
         others = ", ".join(sorted(map(str, Path("/dev").glob("video*"))))
@@ -89,7 +97,7 @@ def _device(error: Exception, address: Address) -> str:
 
 
 def _no_video(error: Exception, address: Address) -> str:
-    """It answers, or its host is not known, and there is no video."""
+    """Return one clause about a host that is unknown, or responds without a video."""
     parts = urlsplit(address.shown)
     if parts.scheme in ("rtsp", "rtsps", "http", "https") and not _known(parts.hostname or ""):
         return f"the host {parts.hostname} is not known"
@@ -112,8 +120,8 @@ def _known(host: str) -> bool:
 
 
 def _content_type(url: str) -> str:
-    """Content type that a server states; "" where it says nothing."""
-    import http.client  # with these every process of a station would start later
+    """Return the content type that a server states, "" if it states none."""
+    import http.client  # imported here: every process of a station would start later
     import urllib.error
     import urllib.request
 

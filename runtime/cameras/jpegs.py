@@ -1,35 +1,37 @@
-"""Finds whole JPEG pictures in a stream of bytes, whatever a camera writes between them."""
+"""Extraction of whole JPEG pictures from a byte stream, whatever a camera writes between them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 
-MOST_BYTES = 64 << 20  # more than a picture of MOST_PIXELS has that is noise
-_HEAD = 2048  # bytes from the beginning that are kept for a complaint
-_SHORTEST = 4096  # bytes beside pictures that are more than headers of parts
+MOST_BYTES = 64 << 20  # more than a noise picture of MOST_PIXELS needs
+_HEAD = 2048  # [bytes] from the start of the stream, for messages
+_SHORTEST = 4096  # [bytes] outside pictures, more than part headers have
 _TYPE = re.compile(rb"content-type:[ \t]*([^\r\n]{1,80})", re.IGNORECASE)
 _BEGIN = b"\xff\xd8\xff"
-_WITHOUT_LENGTH = frozenset((0x00, 0x01, *range(0xD0, 0xD8)))  # stuffing, TEM, RSTn: no segment follows
+_WITHOUT_LENGTH = frozenset(
+    (0x00, 0x01, *range(0xD0, 0xD8))
+)  # stuffing, TEM, RSTn: markers without a segment
 
 
 class Jpegs:
-    """Pictures by their own markers, each as soon as its last byte is there; not by what headers say of it.
+    """JPEG pictures found by their markers, each as soon as its last byte has arrived; part headers are not used.
 
-    Boundaries, types and lengths of parts are passed over: cameras write them wrongly, or not at all. Thumbnails within
-    a picture belong to it.
+    Boundaries, content types and lengths of parts are skipped: cameras write them wrongly or not at all. Thumbnails
+    inside a picture belong to it.
     """
 
     def __init__(self) -> None:
         self._held = bytearray()
         self._begun = False
-        self._at = 0  # where in what is held the next marker of the picture is looked for
+        self._at = 0  # offset in the buffer from which the next marker is searched
         self._head = b""
         self._pictures = 0
-        self._beside = 0  # bytes since the last whole picture that were no part of one
+        self._beside = 0  # bytes outside pictures since the last whole picture
 
     def add(self, piece: bytes) -> Iterator[bytes]:
-        """The pictures that end in this piece; raises ValueError where one has no end within MOST_BYTES."""
+        """Yield the pictures that end in this piece. Raises ValueError if a picture has no end within MOST_BYTES."""
         self._head += piece[: _HEAD - len(self._head)]
         self._held += piece
         while (picture := self._whole()) is not None:
@@ -41,22 +43,22 @@ class Jpegs:
 
     @property
     def is_single(self) -> bool:
-        """True if the stream was one picture so far, and no header of a part before it."""
+        """True if the stream was one picture so far, without a part header before it."""
         return self._pictures == 1 and self._head.startswith(_BEGIN)
 
     @property
     def is_other(self) -> bool:
-        """True if more has come since the last whole picture than headers, and it was no picture."""
+        """True if more bytes than headers came since the last whole picture, and none was a picture."""
         return self._beside > _SHORTEST
 
     @property
     def stated(self) -> str:
-        """The type that the first part states, "" where it states none."""
+        """Content type of the first part, "" if it has none."""
         found = _TYPE.search(self._head)
         return "" if found is None else found[1].decode("latin-1").strip()
 
     def _whole(self) -> bytes | None:
-        """The next picture, None where its end has not come yet."""
+        """Return the next picture; None until its end has arrived."""
         if not self._begun:
             self._drop(self._held.find(_BEGIN))
         while self._begun:
@@ -70,9 +72,9 @@ class Jpegs:
                 del self._held[: mark + 2]
                 self._begun = False
                 return picture
-            if kind == 0xD8:  # of another picture: this one was cut off
+            if kind == 0xD8:  # start of another picture: this one was cut off
                 self._drop(mark)
-            elif 0x01 < kind < 0xC0:  # no marker of JPEG
+            elif 0x01 < kind < 0xC0:  # not a JPEG marker
                 self._drop(self._held.find(_BEGIN, mark))
             elif kind == 0xFF or kind in _WITHOUT_LENGTH:
                 self._at = mark + (1 if kind == 0xFF else 2)
@@ -84,7 +86,7 @@ class Jpegs:
         return None
 
     def _drop(self, until: int) -> None:
-        """Pass over what lies before a picture's beginning; without one (-1) all that cannot be part of it."""
+        """Drop the bytes before a picture's start; if there is none (-1), all that cannot belong to a start."""
         self._begun = until >= 0
         dropped = until if self._begun else max(0, len(self._held) - len(_BEGIN) + 1)
         self._beside += dropped

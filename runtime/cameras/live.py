@@ -1,4 +1,4 @@
-"""A camera that goes on by itself: a thread of its own opens it, reads it, and opens it again when it is lost."""
+"""Live camera, read by its own thread, which opens it again when it is lost."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ from runtime.core.backoff import BackOff
 from runtime.core.clock import Clock
 
 log = logging.getLogger(__name__)
-SETTLE_S = 0.3  # after opening: what was buffered until then is older than it looks
-_GRACE_S = 1.0  # beyond its own deadline, after which a thread is stuck where none reaches it
+SETTLE_S = (
+    0.3  # time after opening [s] in which pictures may come from a buffer and be older than their arrival
+)
+_GRACE_S = 1.0  # beyond its own deadline; then the thread is stuck in a driver [s]
 _JOIN_S = 0.3
 
 
 class LiveCamera(Camera):
-    """Keeps the newest picture alone; a reader that is stuck in a driver is noticed by who asks."""
+    """Camera of which only the newest picture is stored. `health` also detects a reader that is stuck in a driver."""
 
     def __init__(self, key: str, kind: str, settings: CameraSettings, address: Address, clock: Clock) -> None:
         self.key, self.kind, self.shown = key, kind, address.shown
@@ -54,6 +56,7 @@ class LiveCamera(Camera):
     def health(self) -> CameraHealth:
         with self._lock:
             health, newest = self._health, self._newest
+        # Computed by the caller, because a thread that is stuck in a driver cannot report itself.
         allowed = self._settings.read_s + _GRACE_S
         if (
             health.condition is CameraCondition.LIVE
@@ -65,22 +68,22 @@ class LiveCamera(Camera):
         return health
 
     def faults(self) -> dict[str, int]:
-        """`camera_clock_jumped_KEY`: the stream's time broke."""
+        """Return `camera_clock_jumped_KEY`: number of jumps of the stream's time."""
         return {f"camera_clock_jumped_{self.key}": self._time.jumps} if self._time.jumps else {}
 
     def request_stop(self) -> None:
         self._ending.set()
 
     def close(self) -> None:
-        """A thread that waits for a mute camera ends by itself within its deadline; nobody waits for that."""
+        """Request the end; a thread that waits for a mute camera ends by its own deadline."""
         self.request_stop()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
 
     def _run(self) -> None:
-        """The thread: nothing that happens in it may end it, because nobody else looks."""
-        realtime.leave_realtime()  # decoding comes after who may stop the robot
+        """Run the thread. No error may end it, because nothing else reads the camera."""
+        realtime.leave_realtime()  # decoding must not delay the processes that can stop the robot
         while not self._ending.is_set():
             try:
                 self._read_until_lost()
@@ -92,7 +95,7 @@ class LiveCamera(Camera):
             self._ending.wait(self._back_off.remaining_delay(self._clock.now()))
 
     def _read_until_lost(self) -> None:
-        """Open it and read until it is lost; raises CameraError."""
+        """Open the camera and read until it is lost. Raises CameraError."""
         feed = VideoStream(self._address, self._settings.open_s, self._settings.read_s)
         try:
             self._time.reset()

@@ -1,4 +1,4 @@
-"""A camera that sends JPEG pictures one after the other in one HTTP answer."""
+"""Camera that sends JPEG pictures in one HTTP response."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Config(CameraSettings):
 
 
 def address(config: Config) -> Address:
-    """`rw_timeout` [us] bounds each read and write; these streams carry no time of their own."""
+    """Return the address; `rw_timeout` [us] bounds each read and write. These streams carry no time of their own."""
     options = {"rw_timeout": str(int(max(config.open_s, config.read_s) * 1e6))}
     url = with_password(config.url, config.user, config.password_env)
     return Address(url, config.url, "mpjpeg", options, stamped=False)

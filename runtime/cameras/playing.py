@@ -1,4 +1,4 @@
-"""A video file as a camera: paced by our clock, by a thread of its own, or step by step on a virtual clock."""
+"""Video file as a camera: paced by our clock in its own thread, or step by step on a virtual clock."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from runtime.core import realtime
 from runtime.core.clock import Clock
 
 log = logging.getLogger(__name__)
-_EARLY_S = 1e-6  # due times are sums of floats
+_EARLY_S = 1e-6  # [s]; due times are sums of floats
 _RETRY_S = 2.0
 _JOIN_S = 0.3
 
 
 class FilePlayer:
-    """Pictures of a file as they are due; the next one is decoded before that.
+    """Pictures of a file at their due times; the next one is decoded in advance.
 
-    Until `begin`, and from `stand` on, the first picture stands, as if taken again and again at the file's own rate.
+    Before `start`, and after `reset`, the first picture is repeated at the file's own rate with new capture times.
     """
 
     def __init__(self, config: file.Config) -> None:
@@ -40,12 +40,15 @@ class FilePlayer:
         self._rewind(now)
 
     def reset(self, now: float) -> None:
-        """Show the first picture from now on."""
+        """Repeat the first picture from now on."""
         self._begun, self.over = None, False
         self._rewind(now)
 
     def frame_at(self, now: float) -> CapturedImage | None:
-        """The newest picture that is due and was not given yet; CameraError where the file cannot be read."""
+        """Return the newest picture that is due and not yet returned, else None.
+
+        Raises CameraError for an unreadable file.
+        """
         if self._feed is None:
             self._rewind(now)
         shown = None
@@ -55,13 +58,13 @@ class FilePlayer:
         return shown
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         if self._feed is not None:
             self._feed.close()
             self._feed = None
 
     def _rewind(self, due: float) -> None:
-        """The first picture is next, due at `due`."""
+        """Make the first picture the next one, due at `due`."""
         self.close()
         self._feed = VideoStream(file.address(self._config), self._config.open_s, self._config.read_s)
         first = self._feed.read()
@@ -86,14 +89,14 @@ class FilePlayer:
             self.over, self.due = True, math.inf
 
     def _offset(self, frame: DecodedFrame, period: float) -> float:
-        """When it is due after the first one [s]: by its stamp, a period after the one before where it has none."""
+        """Return its due time after the first picture [s]: by its stamp, else one period after the previous."""
         if frame.stamp is None or self._first.stamp is None:
             return self.due - self._since + period
         return frame.stamp - self._first.stamp
 
 
 class FileCamera(Camera):
-    """Plays a file. `threaded`: by a thread, so that nobody waits for its decoder; else whenever it is asked."""
+    """Camera that plays a file. `threaded`: a thread decodes, so that `latest` does not wait; else `latest` does."""
 
     kind = "file"
 
@@ -107,7 +110,7 @@ class FileCamera(Camera):
         self._health = CameraHealth(CameraCondition.OPENING, clock.now(), "it is being opened")
         self._wake = threading.Event()
         self._ending = False
-        self._asked: Callable[[float], None] | None = None  # what the player is to do first
+        self._asked: Callable[[float], None] | None = None  # next request to the player
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -150,7 +153,7 @@ class FileCamera(Camera):
             self._player.close()
 
     def _run(self) -> None:
-        realtime.leave_realtime()  # decoding comes after who may stop the robot
+        realtime.leave_realtime()  # decoding must not delay the processes that can stop the robot
         while not self._ending:
             self._step()
             due = self._player.due if self._healthy() else self._clock.now() + _RETRY_S
@@ -164,9 +167,9 @@ class FileCamera(Camera):
         return self.health().condition in (CameraCondition.LIVE, CameraCondition.ENDED)
 
     def _step(self) -> None:
-        """Show what is due; what is wrong with the file is its health.
+        """Publish the picture that is due; an error of the file becomes the camera's health.
 
-        A file that breaks while it plays stays lost until a run begins or ends: it would begin again unasked.
+        A file that breaks while it plays stays lost until a run begins or ends; otherwise it would restart by itself.
         """
         with self._lock:
             asked, self._asked = self._asked, None
@@ -181,7 +184,7 @@ class FileCamera(Camera):
         except CameraError as error:
             self._fail(str(error))
             return
-        except Exception as error:  # of a decoder: it must not end the thread, or reception
+        except Exception as error:  # a decoder's error must not end the thread or reception
             log.exception("camera %s: playing %s failed", self.key, self.shown)
             self._fail(f"playing it failed: {type(error).__name__}: {error}")
             return

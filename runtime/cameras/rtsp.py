@@ -1,4 +1,4 @@
-"""A camera that speaks RTSP, its pictures over the same TCP connection."""
+"""Camera with RTSP, its pictures over the same TCP connection."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Config(CameraSettings):
 
 
 def address(config: Config) -> Address:
-    """Pictures alone, over TCP: over UDP they come torn. `timeout` [us] is what FFmpeg's RTSP knows."""
+    """Return the address: video only, over TCP, because UDP loses packets; `timeout` [us] is FFmpeg's RTSP option."""
     options = {
         "rtsp_transport": "tcp",
         "allowed_media_types": "video",

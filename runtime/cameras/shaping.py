@@ -1,4 +1,4 @@
-"""From a camera's picture to the one that everybody is shown: colours, crop, rotation, flip, size."""
+"""Processing of a camera's pictures: colours, crop, rotation, flip, size."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from runtime.core.types import UInt8
 
 
 class ImageTransform:
-    """Shapes pictures of one camera, which keep the size of the first one: recordings and policies count on it."""
+    """Transformation of one camera's pictures. The size of the first is fixed: recordings and policies depend on it."""
 
     def __init__(self, settings: CameraSettings) -> None:
         self._settings = settings
         self._source: tuple[int, int] | None = None  # width, height of the first picture
 
     def __call__(self, picture: UInt8) -> UInt8:
-        """`picture` [H, W, 3] shaped, contiguous and read-only; CameraError where it cannot be used."""
+        """Return `picture` [H, W, 3] transformed, contiguous, read-only. Raises CameraError if it cannot be used."""
         import cv2
 
         settings = self._settings

@@ -1,4 +1,4 @@
-"""When a picture was taken: the stream's time on our clock."""
+"""Capture times of pictures: the stream's time on our clock."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from runtime.core.clock import ClockMap
 
 
 class StreamTime:
-    """Maps the stamps of one stream by the smallest (arrival - stamp) over a window; `jumps` counts where it broke.
+    """Map from one stream's stamps to our clock, by the smallest (arrival - stamp) over a window.
 
-    A stamp that goes back begins a new map; one that is further ahead than time has passed is the smallest offset
-    by itself. What is returned always increases: pictures are told apart by it.
+    A stamp that goes back begins a new map; a stamp that runs ahead is itself the smallest offset. `jumps` counts both.
+    Returned times always increase, because pictures are distinguished by them.
     """
 
     def __init__(self) -> None:
@@ -20,11 +20,11 @@ class StreamTime:
         self._begin()
 
     def reset(self) -> None:
-        """The stream was opened anew: its stamps begin anywhere."""
+        """Begin a new map: a stream that was opened again starts with any stamp."""
         self._begin()
 
     def to_monotonic(self, stamp: float | None, arrived: float) -> float:
-        """Our time [s] for the stream's `stamp` [s], never after `arrived`; `arrived` where there is no stamp."""
+        """Return our time [s] for the stream's `stamp` [s], at most `arrived`; `arrived` itself without a stamp."""
         time = arrived if stamp is None else self._mapped(stamp, arrived)
         if time <= self._newest:
             time = math.nextafter(self._newest, math.inf)

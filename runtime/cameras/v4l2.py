@@ -1,4 +1,4 @@
-"""A camera on this machine, as Video4Linux has it."""
+"""Camera of this machine, through Video4Linux."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Config(CameraSettings):
 
 
 def address(config: Config) -> Address:
-    """The device with what is asked of it."""
+    """Return the device with its options."""
     options = {}
     if config.frame_size is not None:
         options["video_size"] = "x".join(map(str, config.frame_size))

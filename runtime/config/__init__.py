@@ -1,1 +1,1 @@
-"""Contents of a deployment file: schema, loader, reference."""
+"""Deployment files: schema, loader, reference."""

@@ -1,4 +1,4 @@
-"""Collecting of demonstrations in a deployment: which leader, and what an episode must have."""
+"""Settings for collecting demonstrations: the leader, and the required content of an episode."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ class CollectionSettings(Settings):
         return self
 
     def primary_camera_of(self, cameras: tuple[str, ...]) -> str:
-        """The camera that stands for an episode; "" where there is none."""
+        """Return the key of the camera that represents an episode; "" without cameras."""
         kept = self.cameras or list(cameras)
         return self.primary_camera or (kept[0] if kept else "")
 
     def manifest_entry(self, cameras: tuple[str, ...]) -> dict[str, Any]:
-        """It, for a manifest; `cameras` are the station's."""
+        """Return these settings in the form of a manifest; `cameras` are the station's."""
         kept = [key for key in cameras if self.cameras is None or key in self.cameras]
         return {
             **self.model_dump(mode="json", exclude={"leader", "max_age_s"}),
@@ -88,7 +88,7 @@ class CollectionSettings(Settings):
 
 
 def check(settings: CollectionSettings | None, cameras: tuple[str, ...]) -> None:
-    """ConfigurationError where it names what the station does not have."""
+    """Raise ConfigurationError if it names cameras that the station lacks."""
     if settings is None:
         return
     unknown = [key for key in settings.cameras or () if key not in cameras]

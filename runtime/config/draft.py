@@ -1,4 +1,4 @@
-"""A first deployment file from a few choices: what there is to choose from, and the text of the file."""
+"""First deployment file from a few choices: the available choices and the text of the file."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _SCALARS = {"string": "text", "integer": "whole", "number": "number", "boolean":
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One key of a table that has a single value: `type` is text, whole, number, yes or choice."""
+    """One key of a table with a single value: `type` is text, whole, number, yes or choice."""
 
     key: str
     type: str
     choices: tuple[str, ...]
-    default: str  # as it is typed, "" for none
+    default: str  # as typed, "" for none
     required: bool
     meaning: str
 
     @property
     def address(self) -> bool:
-        """True of what says where something is, which nobody can guess: it is asked first."""
+        """Whether it is an address or similar, which has no useful default and is therefore asked first."""
         return (
             self.required
             or self.key in ("url", "network", "master", "address", "domain", "user")
@@ -39,7 +39,7 @@ class Entry:
         )
 
     def value(self, typed: str) -> Any:
-        """The value of what was typed; ConfigurationError says what is allowed."""
+        """Return the value of typed text. Raises ConfigurationError with the allowed values."""
         if self.type == "yes":
             return _one_of(self.key, typed, {"yes": True, "no": False})
         if self.type == "choice":
@@ -54,12 +54,12 @@ class Entry:
 
 
 def kinds(part: str) -> dict[str, str]:
-    """The kinds of a part, a key of PACKAGES, each with what it is in a sentence, or why it cannot be loaded here."""
+    """Return the kinds of a part (a key of PACKAGES), each with its description, or why it cannot be loaded here."""
     return {kind: _about(part, kind) for kind in variants(PACKAGES[part])}
 
 
 def entries(part: str, kind: str) -> tuple[Entry, ...]:
-    """What may be said of a part of that kind, its own keys first; ConfigurationError lists the kinds."""
+    """Return the keys of a part of that kind, its own keys first. Raises ConfigurationError with the known kinds."""
     known = variants(PACKAGES[part])
     if kind not in known:
         raise ConfigurationError(f"{part}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
@@ -67,7 +67,7 @@ def entries(part: str, kind: str) -> tuple[Entry, ...]:
 
 
 def table(part: str, kind: str, typed: Mapping[str, str]) -> dict[str, Any]:
-    """The table of a part from what was typed, without keys that were left empty or have their own default."""
+    """Return the table of a part from typed text, without keys that are empty or equal to their default."""
     found: dict[str, Any] = {"kind": kind}
     for entry in entries(part, kind):
         given = typed.get(entry.key, "").strip()
@@ -77,7 +77,7 @@ def table(part: str, kind: str, typed: Mapping[str, str]) -> dict[str, Any]:
 
 
 def text_of(tree: Mapping[str, Any], comments: Sequence[str]) -> str:
-    """A deployment file as TOML: scalars, lists of them, and tables."""
+    """Return a deployment file as TOML: scalars, lists of scalars, and tables."""
     return "\n".join([*(f"# {line}" for line in comments), *_lines(tree, ())]) + "\n"
 
 
@@ -100,7 +100,7 @@ def _entries(model: type[BaseModel]) -> Iterator[Entry]:
 
 
 def _given(schema: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The schema of a key where it has a value."""
+    """Return the schema of a key that may also be null, without the null."""
     parts = [part for part in schema.get("anyOf", ()) if part.get("type") != "null"]
     return parts[0] if len(parts) == 1 else schema
 

@@ -1,4 +1,4 @@
-"""Reads deployment files: TOML with `extends` and `--set key=value`; errors name file, key and value."""
+"""Loading of deployment files: TOML with `extends` and `--set key=value`; errors name file, key and value."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """A valid deployment, its canonical form and the hash of that."""
+    """Valid deployment, its canonical form and the digest of that."""
 
     deployment: Deployment
     tree: Mapping[str, Any]
@@ -42,23 +42,23 @@ class Resolved:
 
 
 def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
-    """The deployment of `path` with `key=value` assignments on top; raises ConfigurationError.
+    """Load the deployment of `path` with `key=value` assignments on top. Raises ConfigurationError.
 
-    A `kind` is assigned before anything else, because a new kind replaces the table it stands in.
+    A `kind` is assigned before all other keys, because a new kind replaces its whole table.
     """
     tree, origin = _read(path, ())
     return apply_assignments(tree, origin, str(path), assignments)
 
 
 def tree_of(path: Path) -> dict[str, Any]:
-    """What a file says, with what it extends, unchecked; raises ConfigurationError where it cannot be read."""
+    """Return the content of a file merged with the files that it extends, unchecked. Raises ConfigurationError."""
     return _read(path, ())[0]
 
 
 def apply_assignments(
     tree: dict[str, Any], origin: dict[Key, str], source: str, assignments: Sequence[str]
 ) -> Resolved:
-    """The deployment in `tree`, which is changed, with `key=value` assignments on top, as in `load`."""
+    """Return the deployment in `tree`, which is modified, with `key=value` assignments on top, as in `load`."""
     parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
     for key, value, option in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
         _set_key(tree, key, value, option)
@@ -72,9 +72,9 @@ def apply_assignments(
 def resolve_deployment(
     tree: Mapping[str, Any], origin: Mapping[Key, str], source: str, unread: Collection[str] = ()
 ) -> Resolved:
-    """Check a tree of settings; `origin` says which file or option each key came from.
+    """Check a tree of settings; `origin` names the file or option that each key came from.
 
-    Tables whose kinds are in one of the packages `unread` are kept as they are.
+    Tables whose kinds are in one of the packages `unread` stay plain tables. Raises ConfigurationError.
     """
     try:
         deployment = Deployment.model_validate(tree, context={"unread": unread})
@@ -82,22 +82,22 @@ def resolve_deployment(
         raise ConfigurationError(
             explain_validation_error(invalid, Deployment, tree, source, origin)
         ) from None
-    except ConfigurationError as error:  # of a variant's own check, which knows no file
+    except ConfigurationError as error:  # from a variant's own check, which does not know the file
         raise ConfigurationError(f"{source}: {error}") from None
     canonical = deployment.model_dump(mode="json")
     return Resolved(deployment, canonical, config_digest(canonical))
 
 
 def config_digest(canonical: Mapping[str, Any]) -> str:
-    """The hash of a deployment in its canonical form, also as it came back from a manifest."""
+    """Return the SHA-256 of a deployment in its canonical form, which may come from a manifest."""
     text = json.dumps(canonical, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def apply_changes(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Resolved:
-    """`resolved` with the tables of `changes` on top, merged as those of a file over what it extends.
+    """Return `resolved` with the tables of `changes` merged on top, as those of a file that extends another.
 
-    Raises ConfigurationError, which names `source` for what came with the changes.
+    Raises ConfigurationError, which names `source` for keys of the changes.
     """
     tree = deepcopy(dict(resolved.tree))
     _merge(tree, deepcopy(dict(changes)))
@@ -105,10 +105,10 @@ def apply_changes(resolved: Resolved, changes: Mapping[str, Any], source: str) -
 
 
 def server_address(settings: Deployment) -> str:
-    """Address of the policy's server in one spelling, host and port; "" for a policy without one.
+    """Return host and port of the policy's server in a canonical spelling; "" for a policy without a server.
 
-    Two deployments of one machine have the same server where this is the same. What is behind a tunnel is named as
-    from its far end.
+    Two deployments on one machine use the same server if these are equal. Behind a tunnel it is the address at the far
+    end.
     """
     policy = settings.policy
     url = urlsplit(str(getattr(policy, "url", "")))
@@ -146,7 +146,7 @@ def _read(path: Path, chain: tuple[Path, ...]) -> tuple[dict[str, Any], dict[Key
 
 
 def _merge(base: dict[str, Any], over: Mapping[str, Any]) -> None:
-    """Tables merge key by key; a table of another `kind` replaces the old one whole."""
+    """Merge tables key by key; a table of another `kind` replaces the old table as a whole."""
     for key, value in over.items():
         old = base.get(key)
         replaces = isinstance(value, dict) and isinstance(old, dict) and _changes_kind(old, value)
@@ -186,5 +186,5 @@ def _set_key(tree: dict[str, Any], key: Key, value: Any, source: str) -> None:
         if not isinstance(tree, dict):
             raise ConfigurationError(f"{source}: {'.'.join(key[: depth + 1])} is not a table")
     if key[-1] == "kind" and tree.get("kind") not in (None, value):
-        tree.clear()  # settings of another kind would be unknown keys here
+        tree.clear()  # settings of the other kind would be unknown keys
     tree[key[-1]] = value

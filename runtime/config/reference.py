@@ -1,4 +1,4 @@
-"""`python -m runtime.config.reference`: every key of a deployment file as Markdown, read off the models."""
+"""`python -m runtime.config.reference`: every key of a deployment file as Markdown, from the models."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _NAMES = {"string": "string", "integer": "integer", "number": "number", "boolean
 
 
 def render_reference() -> str:
-    """The whole document."""
+    """Return the whole document."""
     lines = [_INTRODUCTION, *_section("The top of the file", Deployment)]
     for name, field in Deployment.model_fields.items():
         lines.extend(_tables(name, field.annotation))
@@ -47,7 +47,7 @@ def render_reference() -> str:
 
 
 def _tables(path: str, annotation: Any, kind: str = "") -> Iterator[str]:
-    """The sections of what may stand at `path`, one per kind, each followed by those of the tables in it."""
+    """Yield the sections of the tables possible at `path`, one per kind, each followed by its nested tables."""
     for place, model in _models(path, annotation):
         own = _kind(model) or kind
         yield from _section(f"`[{place}]`" + (f" of kind `{own}`" if own else ""), model)
@@ -56,7 +56,7 @@ def _tables(path: str, annotation: Any, kind: str = "") -> Iterator[str]:
 
 
 def _models(path: str, annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
-    """The tables that may stand at `path`."""
+    """Yield the models of tables that are possible at `path`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield path, annotation
     elif get_origin(annotation) is dict:
@@ -67,13 +67,13 @@ def _models(path: str, annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]
 
 
 def _kind(model: type[BaseModel]) -> str:
-    """The kind that tells this variant from the others, "" for a table that has no variants."""
+    """Return the kind of this variant, "" for a table without variants."""
     field = model.model_fields.get("kind")
     return str(field.default) if field and get_args(field.annotation) == (field.default,) else ""
 
 
 def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
-    """A heading and a table of keys."""
+    """Yield a heading and a table of keys."""
     schema = model.model_json_schema()
     yield f"## {title}\n\n{first_line(model)}\n\n| key | type | default | meaning |\n|---|---|---|---|"
     for name, field in own_first(model):
@@ -89,18 +89,18 @@ def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
 
 
 def own_first(model: type[BaseModel]) -> list[tuple[str, FieldInfo]]:
-    """A table's own keys, then those that it shares with others."""
+    """Return a table's own keys, then those that it shares with others."""
     own = model.__annotations__
     return sorted(model.model_fields.items(), key=lambda key: key[0] not in own)
 
 
 def first_line(model: type[BaseModel]) -> str:
-    """What a table is, in a sentence."""
+    """Return the first line of a table's docstring."""
     return (model.__doc__ or "").splitlines()[0]
 
 
 def _type(schema: Schema) -> str:
-    """A JSON schema in words."""
+    """Return a JSON schema in words."""
     if "const" in schema:
         return f"`{json.dumps(schema['const'])}`"
     if "enum" in schema:
@@ -138,7 +138,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
-    """What a key of a table means, as the string below it says."""
+    """Return the meaning of a key: its docstring, else the first line of its table's."""
     for owner in model.__mro__:
         if name in inspect.get_annotations(owner) and (said := _key_docstrings(owner).get(name)):
             return " ".join(said.split())
@@ -148,7 +148,7 @@ def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
 
 @functools.cache  # cache: of sources, which do not change while this runs
 def _key_docstrings(model: type) -> dict[str, str]:
-    """The strings below a model's own keys. Read here: every process of a station would wait for its sources else."""
+    """Return the docstrings of a model's own keys. Read only here, so that station processes need not read sources."""
     (table,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(table, ast.ClassDef)
     return {
@@ -164,7 +164,7 @@ def _key_docstrings(model: type) -> dict[str, str]:
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Print it."""
+    """Print the reference."""
     print(render_reference(), end="")
     return 0
 

@@ -50,7 +50,7 @@ else:
     KinematicsConfig = kind_union("runtime.kinematics")
 
 
-# Addresses and ports of the bus, from before its sockets had names in a folder.
+# Former keys of the bus, from the time when it used ports.
 REMOVED_BUS_KEYS = ("host", "command_port", "state_port", "camera_port", "estop_port")
 _NO_PORTS = (
     "the bus has no ports any more, but Unix sockets that this account alone can reach, in $XDG_RUNTIME_DIR/eva-web "
@@ -59,12 +59,12 @@ _NO_PORTS = (
 
 
 def policy_tables() -> tuple[type[Settings], ...]:
-    """Models that a [policy] table may be: one for each kind."""
+    """Return the models of a [policy] table, one per kind."""
     return union_members(PolicyConfig)
 
 
 def strategy_tables() -> tuple[type[Settings], ...]:
-    """The same of a [strategy] table."""
+    """Return the models of a [strategy] table, one per kind."""
     return union_members(StrategyConfig)
 
 
@@ -338,7 +338,7 @@ class Deployment(Settings):
         return self
 
     def heartbeat_timeout_s(self, process: str) -> float:
-        """Silence [s] after which `process` counts as gone: those that stop the robot have the shortest."""
+        """Return the silence after which `process` counts as dead [s]; shortest for those that stop the robot."""
         if process == "media":
             return self.recording.heartbeat_timeout_s
         return (
@@ -349,17 +349,17 @@ class Deployment(Settings):
 
     @property
     def data(self) -> Path:
-        """The absolute data folder."""
+        """Absolute data folder."""
         return Path(self.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
 
     @property
     def station_dir(self) -> Path:
-        """Folder of the station's latch, command journal and endpoints."""
+        """Folder with the station's latch, command journal and endpoints."""
         return self.data / "stations" / self.station
 
     @property
     def ssh_dir(self) -> Path:
-        """Folder of what checkpoints name for ssh: keys, known hosts, configurations."""
+        """Folder for files that checkpoints name for ssh: keys, known hosts, configurations."""
         return self.station_dir / "ssh"
 
     @property

@@ -1,6 +1,6 @@
-"""One file per policy protocol. Each declares `Config` and `build`."""
+"""Policies, one module per protocol. Each declares `Config` and `build`."""
 
-# Each kind with its module, which is imported where a deployment names it.
+# Module of each kind. It is imported only if a deployment names it.
 KINDS = {
     "gr00t": "runtime.policies.gr00t",
     "lerobot": "runtime.policies.lerobot",

@@ -1,4 +1,4 @@
-"""Meaning of state and rows in a deployment, where the server states none: settings, and chunks of rows."""
+"""Settings of state and action rows for protocols whose server does not state their meaning."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class ActionLayoutSettings(ActionFormatSettings):
 
     @property
     def sees_poses(self) -> bool:
-        """True if the answers depend on the poses of an observation."""
+        """True if the responses depend on the poses of an observation."""
         relative = self.action_space == "eef" and self.action_mode != "absolute"
         return self.observation_space == "eef" or relative
 
     def layout(self, robot: Robot, cameras: dict[str, str]) -> RequestLayout:
-        """Requests with the keys "state" float32 [W], "images" (by the names in `cameras`, HWC) and "prompt"."""
+        """Return the layout of requests: "state" float32 [W], "images" (by the names in `cameras`, HWC), "prompt"."""
         settings = RequestSettings(
             observation_space=self.observation_space,
             observation_pose=self.observation_pose,
@@ -50,13 +50,13 @@ class ActionLayoutSettings(ActionFormatSettings):
         return RequestLayout(settings, robot)
 
     def widths(self, robot: Robot) -> tuple[int, int]:
-        """Widths of the state and of a row; ConfigurationError where a format does not fit the robot."""
+        """Return the widths of the state and of a row. Raises ConfigurationError if a format does not fit the robot."""
         state = pose_rows_for(self.observation_space, self.observation_pose, robot, "observation_pose")
         rows = pose_rows_for(self.action_space, self.action_pose, robot, "action_pose")
         return robot.dim if state is None else state.width, robot.dim if rows is None else rows.width
 
     def chunk(self, rows: Float32, timing: Mapping[str, float]) -> ActionChunk:
-        """Rows [H, W] and what they mean."""
+        """Return a chunk of the rows [H, W] with their meaning."""
         return ActionChunk(
             actions=rows,
             space=self.action_space,

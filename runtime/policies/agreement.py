@@ -1,4 +1,4 @@
-"""A policy server's statement of itself, held against the deployment's: no side overrides the other."""
+"""Comparison of a policy server's metadata with the deployment: neither side overrides the other."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from runtime.policies.request import RequestSettings
 
 _SPACES: dict[str, Space] = {"joint": "joint", "qpos": "joint", "eef": "eef"}
 _MODES = ("absolute", "relative", "delta")
-_QUATERNIONS = ("wxyz", "xyzw")  # a word that leaves their order open contradicts neither
-_ORIENTATIONS: dict[str, tuple[str, ...]] = {  # words that are in use for what PoseFormat calls otherwise
+_QUATERNIONS = ("wxyz", "xyzw")  # a name that leaves their order open contradicts neither
+_ORIENTATIONS: dict[str, tuple[str, ...]] = {  # other names of the orientations of PoseFormat
     "quat": _QUATERNIONS,
     "quaternion": _QUATERNIONS,
     "quat_wxyz": ("wxyz",),
@@ -43,7 +43,7 @@ _COMPARED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class DeclaredPolicy:
-    """A deployment's statement of a policy: its request, and the rows of its answers (`rate` in Hz)."""
+    """Declaration of a policy by the deployment: its request, and the rows of its responses (`rate` in Hz)."""
 
     request: RequestSettings
     space: Space
@@ -55,14 +55,17 @@ class DeclaredPolicy:
 
 
 def check_server_claims(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
-    """The action space that the server names in its `where` (metadata or an answer), None where it names none.
+    """Return the action space that the server names in its `where` (metadata or an answer), or None.
 
-    Compared are action_mode and action_space, action_dim, action_rate, relative_frame, action_orientation (or
-    orientation), observation_orientation, action_pose and observation_pose (maps with the keys of a pose format),
-    and image_size (image_resolution, training_obs_image_size). Raises ContradictionError with both
-    sides, ActionSpaceError where it is about the actions themselves.
+    Compared keys: action_mode and action_space, action_dim, action_rate, relative_frame, action_orientation (or
+    orientation), observation_orientation, action_pose and observation_pose (maps with the keys of a pose format), and
+    image_size (image_resolution, training_obs_image_size).
+
+    Raises:
+        ActionSpaceError: The two sides differ about the actions; the message names both.
+        ContradictionError: They differ about something else.
     """
-    if _COMPARED.isdisjoint(said):  # as in most answers
+    if _COMPARED.isdisjoint(said):  # the case of most responses
         return None
     space = _space(said, declared, where)
     for key, given, key_here, here in _pairs(said, declared):
@@ -72,7 +75,7 @@ def check_server_claims(said: Mapping[str, Any], declared: DeclaredPolicy, where
 
 
 def _pairs(said: Mapping[str, Any], declared: DeclaredPolicy) -> Iterator[tuple[str, Any, str, Any]]:
-    """Key and value of the server, key and value of the deployment, where the server says something."""
+    """Yield (server's key, its value, deployment's key, its value) for each key that the server states."""
     if said.get("action_dim") is not None:
         what = "joints" if declared.space == "joint" else f"poses ({declared.pose})"
         yield "action_dim", said["action_dim"], f"action_space: {what} of this robot, numbers", declared.width
@@ -108,13 +111,13 @@ def _pose_pairs(said: Mapping[str, Any], side: str, pose: PoseFormat) -> Iterato
 
 
 def _orientation(said: object, here: str) -> object:
-    """A server's name of an orientation, in our words; ours where its word leaves that open."""
+    """Return our name for a server's name of an orientation; `here` if its name leaves that open."""
     meant = _ORIENTATIONS.get(str(said).lower(), (said,))
     return here if here in meant else meant[0]
 
 
 def _space(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
-    """The space named by action_space or action_mode, which some servers use for the mode instead."""
+    """Return the space named by action_space, or by action_mode, which some servers use for the space."""
     found: Space | None = None
     for key, words in (("action_space", [*_SPACES]), ("action_mode", [*_SPACES, *_MODES])):
         given = said.get(key)
@@ -136,7 +139,7 @@ def _space(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Spa
 
 
 def _size(given: Any) -> Any:
-    """Height and width as a list of two, of one number (a square), two, or three with the channels."""
+    """Return height and width as a list of two, from one number (a square), two numbers, or three with the channels."""
     if isinstance(given, int | np.integer):
         return [int(given), int(given)]
     if isinstance(given, list | tuple | np.ndarray) and len(given) in (2, 3):

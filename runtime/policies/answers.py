@@ -1,4 +1,4 @@
-"""Meaning of a policy server's rows, where the wire leaves it open: declared in the deployment."""
+"""Settings for the meaning of a policy server's rows if the protocol leaves it open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Interface of a policy: it answers an observation with a chunk of actions."""
+"""Policy interface: a policy answers an observation with a chunk of actions."""
 
 from __future__ import annotations
 
@@ -13,55 +13,62 @@ from runtime.policies.connection import Dial
 
 @dataclass(frozen=True, slots=True)
 class PolicyInfo:
-    """The policy's statement of itself when it is reached; None where it does not say."""
+    """Description of a policy, returned when it is connected; None for unknown fields."""
 
     name: str
     action_space: Space | None = None
-    horizon: int | None = None  # rows of an answer
-    rate: float | None = None  # of its rows [Hz]; None: the control rate
-    supports_rtc: bool | None = False  # it continues a chunk that it is given
+    horizon: int | None = None  # rows per response
+    rate: float | None = None  # rate of its rows [Hz]; None: the control rate
+    supports_rtc: bool | None = False  # whether it continues a previous chunk
     metadata: Mapping[str, object] = field(default_factory=dict)
 
 
 class Policy(ABC):
-    """One connection to one policy; one request in flight, every wait has a deadline.
+    """One connection to one policy; one request in flight, and every wait has a deadline.
 
-    `observation_eef` says which poses it is shown where the robot measures its own, and what relative chunks are
-    relative to; where the robot measures none, those of its joints in any case.
+    `observation_eef` selects the poses that it receives, and to which relative chunks refer: those that the robot
+    measures, or those computed from its joints. Without measured poses the latter are always used.
     """
 
     observation_eef: Literal["measured", "fk"] = "measured"
-    uses_poses: bool = False  # its answers depend on the poses of an observation
+    uses_poses: bool = False  # its responses depend on the poses of an observation
     observe_period_s: float | None = (
-        None  # how often it is to be shown what is seen, between requests too [s]; None: never
+        None  # period at which `observe` is called during a run, also between requests [s]; None: never
     )
-    uses_images: bool = True  # it is shown those of an observation
-    is_queried: bool = True  # False where nobody is asked, because the robot is driven by its own node
-    # Where a server is connected to in the place of its url's host and port, as the near end of a tunnel; asked before
-    # each connection, raises PolicyError where there is none. All else, names of certificates included, is of the url.
+    uses_images: bool = True  # it receives the pictures of an observation
+    is_queried: bool = True  # False if the robot is driven by its own node, so that nothing is requested
+    # Function that returns the (host, port) to connect to instead of the url's, such as the near end of a tunnel. It is
+    # called before each connection and raises PolicyError if there is none. Everything else, including the name in
+    # certificates, comes from the url.
     address_override: Dial | None = None
 
     @abstractmethod
     def connect(self) -> PolicyInfo:
-        """Reach the policy; raises PolicyError with a sentence that says what was found instead."""
+        """Connect to the policy. Raises PolicyError with the reason if that fails."""
 
     @abstractmethod
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk for this observation; raises PolicyError. A connection that timed out is dropped, not reused."""
+        """Return the chunk for an observation.
 
-    def observe(self, observation: Observation) -> None:  # noqa: B027  # most see only what they are asked about
-        """Take in an observation, every `glances_s` of a run, without waiting even for a pending request."""
+        Raises PolicyError. A connection that timed out is dropped, not reused.
+        """
+
+    def observe(self, observation: Observation) -> None:  # noqa: B027  # not abstract: most need only the requests
+        """Receive an observation every `observe_period_s` during a run, without waiting even for a pending request."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Forget the episode; a reply still in flight belongs to the old one."""
+        """Start a new episode; a reply still in flight belongs to the old one."""
 
-    def resume(self) -> None:  # noqa: B027  # most answer what they are shown
-        """The episode goes on after a hold in which nothing was asked; called before the next inference."""
+    def resume(self) -> None:  # noqa: B027  # not abstract: most depend on the observation alone
+        """Continue the episode after a hold without requests; called before the next `infer`."""
 
-    def end_episode(self) -> None:  # noqa: B027  # most servers keep nothing of a rollout
-        """The rollout is over: end what the server keeps of it; raises PolicyError. `reset` comes before the next."""
+    def end_episode(self) -> None:  # noqa: B027  # not abstract: most servers keep no state
+        """End the rollout on the server if it keeps state.
+
+        `reset` is called before the next one. Raises PolicyError.
+        """
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything; safe to call twice."""
+        """Release all resources. Safe to call twice."""

@@ -1,4 +1,4 @@
-"""A TCP connection within a deadline that holds for everything, and that can be given up from another thread."""
+"""TCP connections with one deadline for all steps, which another thread can abort."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ Address = tuple[Any, ...]
 Place = tuple[str, int]  # host and port
 Dial = Callable[[], Place]
 
-_SPELL_MS = 20  # how soon a connection that is being made notices that nobody wants it any more
+_SPELL_MS = 20  # period of the check for an abort while connecting [ms]
 
 
 def open_connection(
     url: str, host: str, port: int, deadline: float, seconds: float, require_wanted: Callable[[], None]
 ) -> socket.socket:
-    """As `reach`, with errors that name `url`, and the `seconds` that there were until the deadline.
+    """Connect as `connect_any`, with errors that name `url` and the time `seconds` [s] until the deadline.
 
-    PortClosedError where the machine answers and nobody listens, UnreachableError where nothing answers.
+    Raises:
+        PortClosedError: The machine responds, but nothing listens on the port.
+        UnreachableError: The machine does not respond, or its name is unknown.
     """
     try:
         return connect_any(host, port, deadline, require_wanted)
@@ -49,10 +51,16 @@ def open_connection(
 
 
 def connect_any(host: str, port: int, deadline: float, require_wanted: Callable[[], None]) -> socket.socket:
-    """A connection to the first address of the host that takes one; OSError of the last one else.
+    """Return a connection to the first address of the host that accepts one.
 
-    `deadline` is on the monotonic clock, past it TimeoutError. `require_wanted` raises where the caller was told
-    to give up; it is asked every few milliseconds.
+    Args:
+        host: Name or address.
+        port: TCP port.
+        deadline: Time limit on the monotonic clock [s].
+        require_wanted: Function that raises if the caller was aborted; called every few milliseconds.
+
+    Raises:
+        OSError: That of the last address; TimeoutError after the deadline.
     """
     refusal: OSError = OSError(f"{host} has no address")
     for family, kind, protocol, _, address in _addresses(host, port, deadline - time.monotonic()):
@@ -87,7 +95,7 @@ def _try_address(
 
 
 def _addresses(host: str, port: int, seconds: float) -> list[Address]:
-    """Addresses of the host's name, resolved in a thread because the resolver itself knows no deadline."""
+    """Return the addresses of the host, resolved in a thread because the resolver has no deadline."""
     found: queue.SimpleQueue[list[Address] | OSError] = queue.SimpleQueue()
 
     def resolve() -> None:

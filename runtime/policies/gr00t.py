@@ -1,8 +1,8 @@
-"""GR00T's policy servers N1.5, N1.6 and N1.7: one request, one answer over a ZMQ REQ socket.
+"""Policies on GR00T servers N1.5, N1.6 and N1.7: one request, one response over a ZMQ REQ socket.
 
-The server is asked first what its model is shown and answers (its modality configuration); requests are built of
-that by maps that the deployment declares, and arrays are sent in the form that it reads. Its `kill` endpoint is never
-used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality configuration StarVLA's.
+First the server is asked for its modality configuration, i.e. the inputs and outputs of its model. Requests follow
+from that and from maps in the deployment; arrays are sent in the form that the server reads. Its `kill` endpoint is
+never used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality configuration, StarVLA.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-ANSWER_LIMIT = 64 * 1024 * 1024  # bytes
-_HINTS = (  # what servers of one form say to requests in another
+ANSWER_LIMIT = 64 * 1024 * 1024  # [bytes]
+_HINTS = (  # errors of servers of one dialect on requests in another
     (
         r"must contain a '(video|state|language)'|KeyError: '(video|state|language)'",
         'policy.dialect = "nested"',
@@ -74,18 +74,18 @@ class Config(RequestSettings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Gr00tPolicy:
-    """The policy, not yet connected; ConfigurationError where its maps do not fit the robot."""
+    """Create the policy, not yet connected. Raises ConfigurationError if its maps do not fit the robot."""
     return Gr00tPolicy(config, robot, control_rate)
 
 
 class UnknownEndpoint(WrongProtocolError):
-    """The server does not know what it was asked for."""
+    """Error about an endpoint that the server does not know."""
 
 
 class Gr00tPolicy(Policy):
-    """One REQ socket; after a timeout or a lost reply it is dropped, and the next `infer` makes another.
+    """Policy on one REQ socket; after a timeout or a lost reply it is dropped, and the next `infer` opens another.
 
-    Deadlines are real seconds whatever the clock. The long first deadline holds once after `connect`.
+    Deadlines are real seconds, whatever the clock. The long first deadline applies once after `connect`.
     """
 
     def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
@@ -95,16 +95,16 @@ class Gr00tPolicy(Policy):
         self.observation_eef = config.observation_eef
         self.uses_poses = config.sees_poses
         self._link = self._new_link()
-        self._lock = threading.Lock()  # of the wire: held through every wait
-        self._turning = threading.Lock()  # between open and closed: held for a moment
+        self._lock = threading.Lock()  # for the connection; held through every wait
+        self._turning = threading.Lock()  # for the change between open and closed; held briefly
         self._closed = False
         self._warm = False
-        self._mnp = False  # how arrays are written
-        self._guessed = False  # of a server that does not say how it reads them
+        self._mnp = False  # whether arrays are sent as MNP
+        self._guessed = False  # whether that is a guess, because the server does not state it
         self._asked = False  # since the last reset
 
     def connect(self) -> PolicyInfo:
-        """Reach the server and read its modality configuration; an open connection is replaced."""
+        """Connect to the server and read its modality configuration; an open connection is replaced."""
         with self._lock:
             self._warm = False
             self._link.drop()
@@ -114,9 +114,9 @@ class Gr00tPolicy(Policy):
             return self._open()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk; `timing` has our `round_trip_ms`.
+        """Return the chunk; `timing` contains our `round_trip_ms`.
 
-        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        Raises PolicyLostError if the server is absent or does not respond: the next call opens another connection.
         """
         if conditioning is not None:
             raise PolicyError("the GR00T protocol has no real-time chunking; choose another strategy")
@@ -133,7 +133,7 @@ class Gr00tPolicy(Policy):
         return self._config.chunk(rows, {"round_trip_ms": round_trip})
 
     def reset(self) -> None:
-        """Forget what was seen, here and on the server, which N1.5 has no word for."""
+        """Forget earlier observations, here and on the server; N1.5 has no such endpoint."""
         with self._lock:
             self._request.reset()
             if not self._asked or self._config.dialect == "n1.5":
@@ -146,12 +146,12 @@ class Gr00tPolicy(Policy):
     def close(self) -> None:
         """Return at once; a call that waits in another thread raises PolicyError.
 
-        What is left of the connection is dropped by whoever uses it, now or at the next `connect`.
+        The user of the connection drops it, now or at the next `connect`.
         """
         with self._turning:
             self._closed = True
             self._link.abort()
-        if self._lock.acquire(blocking=False):  # else whoever waits drops it
+        if self._lock.acquire(blocking=False):  # otherwise the waiting thread drops it
             try:
                 self._link.drop()
             finally:
@@ -184,7 +184,7 @@ class Gr00tPolicy(Policy):
         )
 
     def _act(self, data: Mapping[str, Any], seconds: float) -> Any:
-        """The answer to get_action; to a server that does not say how it reads arrays once in the other form too."""
+        """Return the response to get_action; after a guess of the array form, the other form is tried once."""
         until = time.monotonic() + seconds
         guessed, self._guessed = self._guessed, False
         try:
@@ -195,12 +195,15 @@ class Gr00tPolicy(Policy):
             self._mnp = not self._mnp
             try:
                 return self._call("get_action", max(0.1, until - time.monotonic()), data)
-            except ServerReportedError:
+            except ServerReportedError:  # the form was not the problem: restore it and report the first error
                 self._mnp = not self._mnp
                 raise error from None
 
     def _call(self, endpoint: str, seconds: float, data: Mapping[str, Any] | None = None) -> Any:
-        """The result of an endpoint; PolicyError for the server's own error, after which it goes on serving."""
+        """Return the result of an endpoint.
+
+        Raises PolicyError for the server's own error, after which it continues to serve.
+        """
         message: dict[str, Any] = {"endpoint": endpoint}
         message |= {} if data is None else {"data": data}
         message |= {} if self._token is None else {"api_token": self._token}

@@ -1,4 +1,4 @@
-"""Grippers as DROID counts them, 0 open and 1 closed, from and to a robot's own numbers."""
+"""Conversion of grippers between DROID's convention, 0 open and 1 closed, and a robot's own values."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Convention = Literal["droid", "robot"]
 
 
 class GripperConvention:
-    """The numbers of all grippers of a robot, [..., G]; the convention "robot" leaves them as they are.
+    """Conversion of the values of all grippers of a robot, [..., G]; with the convention "robot" they are unchanged.
 
-    `poses` are the rows of the answers where these are poses, None for joints.
+    `poses` is the row format of the responses if these are poses, None for joints.
     """
 
     def __init__(self, convention: Convention, robot: Robot, poses: PoseRows | None = None) -> None:
@@ -33,13 +33,13 @@ class GripperConvention:
         self._gripped = [(EEF_WIDTH * arm + EEF_WIDTH - 1, dim) for arm, dim in arms if dim is not None]
 
     def to_policy(self, numbers: Float64) -> Float64:
-        """As the policy is shown them; a gripper a little beyond its ends is at them."""
+        """Convert to the policy's values, clipped to the ends of the travel."""
         if not self._converts:
             return numbers
         return np.clip((numbers - self._open) / self._travel, 0.0, 1.0)
 
     def convert_observation(self, observation: Observation) -> Observation:
-        """The observation with the grippers of its joints and poses as the policy is shown them."""
+        """Return the observation with the grippers of its joints and poses in the policy's values."""
         if not self._converts:
             return observation
         qpos = observation.qpos.copy()
@@ -52,7 +52,7 @@ class GripperConvention:
         return replace(observation, qpos=qpos, eef=eef)
 
     def to_robot(self, rows: Float32) -> Float32:
-        """Rows of an answer [T, W] with the robot's numbers; beyond 0 and 1 there is nothing to close or open."""
+        """Convert rows of a response [T, W] to the robot's values, clipped to 0 and 1."""
         if not self._converts:
             return rows
         made = rows.copy()
@@ -62,7 +62,7 @@ class GripperConvention:
         return made
 
     def served(self, rows: Float32) -> Float32:
-        """The way back: rows of the robot's numbers [T, W] as the server counts them."""
+        """Convert rows with the robot's values [T, W] back to the server's."""
         if not self._converts:
             return rows
         made = rows.copy()
@@ -72,7 +72,7 @@ class GripperConvention:
 
 
 def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
-    """Columns of a row that are grippers, each with the index of the robot's gripper."""
+    """Return the gripper columns of a row, each with the index of the robot's gripper."""
     dims = list(robot.gripper_dims)
     if poses is None:
         return [(dim, gripper) for gripper, dim in enumerate(dims)]

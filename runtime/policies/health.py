@@ -1,4 +1,4 @@
-"""Health of a policy server: the HTTP page that some answer beside their websocket."""
+"""Health check of a policy server through its HTTP page, which some serve on the websocket's port."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from runtime.core.errors import PolicyLostError, PolicyTimeout, RefusedError, Tl
 from runtime.policies.connection import Dial, open_connection
 
 _STATUS = re.compile(rb"HTTP/1\.[01] ([0-9]{3})([^\r\n]*)\r?\n")
-_LONGEST = 4096  # bytes of a first line
+_LONGEST = 4096  # longest first line [bytes]
 
 
 def require_healthy(
     url: str, path: str, headers: Mapping[str, str], seconds: float, dial: Dial | None = None
 ) -> None:
-    """GET `path` at the host and port of the websocket `url`, with TLS for wss; returns on status 200.
+    """GET `path` from the host and port of the websocket `url`, with TLS for wss; return on status 200.
 
-    `dial` says where these are connected to, where that is elsewhere.
+    `dial` returns the host and port to connect to, if they differ.
 
-    PolicyLostError where nobody answers within `seconds`, or the server says that it is not ready (HTTP 5xx);
-    another PolicyError where it answers anything else, because then another server is there, or the path is wrong.
+    Raises:
+        PolicyLostError: There is no response within `seconds`, or the server reports that it is not ready (HTTP 5xx).
+        PolicyError: Any other response: another server listens there, or the path is wrong.
     """
     try:
         status, reason = _get_status(url, path, headers, time.monotonic() + seconds, seconds, dial)
@@ -58,7 +59,7 @@ def require_healthy(
 def _get_status(
     url: str, path: str, headers: Mapping[str, str], deadline: float, seconds: float, dial: Dial | None
 ) -> tuple[int, str]:
-    """Status and reason; TimeoutError at the deadline on the monotonic clock however slowly the server speaks."""
+    """Return status and reason. Raises TimeoutError at the deadline (monotonic clock), even if bytes trickle in."""
     place = urlsplit(url)
     secure = place.scheme == "wss"
     host, port = place.hostname or "", place.port or (443 if secure else 80)

@@ -1,9 +1,9 @@
-"""LeRobot's asynchronous inference over gRPC, without LeRobot and without torch.
+"""LeRobot's asynchronous inference over gRPC, without the packages lerobot and torch.
 
-Its messages are pickles both ways: whoever reaches the server's port runs code there, so this is for servers on this
-machine or behind a tunnel, and has to be allowed for each checkpoint. What comes from it is read by a machine of our
-own that runs nothing. The server answers with nothing where it has no observation, and where its inference
-failed: it says neither. Source: lerobot.async_inference of LeRobot 0.4.
+Its messages are pickles in both directions: any peer that reaches the server's port can run code there. So this is
+for servers on this machine or behind a tunnel, and must be allowed per checkpoint. Responses are read by our own
+interpreter of pickles, which executes nothing. The server sends an empty response both without an observation and
+after a failed inference, and does not distinguish the two. Source: lerobot.async_inference of LeRobot 0.4.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-ANSWER_LIMIT = 8 * 1024 * 1024  # bytes; every row carries the whole chunk: 100 rows of 32 numbers are 1.3 MB
-EXCLUSIVE = True  # the server has one checkpoint and one observation, those of whoever told it last
-_PAUSES = (0.05, 0.5)  # s between questions that were answered with nothing: the first, and the longest
+ANSWER_LIMIT = 8 * 1024 * 1024  # [bytes]; every row carries the whole chunk: 100 rows of 32 values are 1.3 MB
+EXCLUSIVE = True  # the server has one checkpoint and one observation, those of its last client
+_PAUSES = (0.05, 0.5)  # shortest and longest pause after an empty response [s]
 
 
 class Config(RequestSettings):
@@ -70,7 +70,7 @@ class Config(RequestSettings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> LerobotPolicy:
-    """The policy, not yet connected; ConfigurationError where it is not allowed, not installed, or does not fit."""
+    """Create the policy, not yet connected. Raises ConfigurationError if it is not allowed, installed or suitable."""
     if not config.accept_pickle:
         raise ConfigurationError(
             'policy.kind = "lerobot" exchanges pickles: whoever reaches the server\'s port can run code there; '
@@ -88,10 +88,10 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Le
 
 
 class LerobotPolicy(Policy):
-    """One channel; after a timeout or a lost answer it is dropped, and the next `infer` makes another.
+    """Policy on one channel; after a timeout or a lost response it is dropped, and the next `infer` opens another.
 
-    Every observation is one that must go: the server would skip one in which the joints have hardly moved. Deadlines
-    are real seconds whatever the clock. The long first deadline holds once after `connect`.
+    Every observation has `must_go` set: the server would skip one with nearly unchanged joints. Deadlines are real
+    seconds, whatever the clock. The long first deadline applies once after `connect`.
     """
 
     def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
@@ -100,16 +100,16 @@ class LerobotPolicy(Policy):
         self.observation_eef = config.observation_eef
         self.uses_poses = config.sees_poses
         self._link = self._new_link()
-        self._lock = threading.Lock()  # of the wire: held through every wait
-        self._turning = threading.Lock()  # between open and closed: held for a moment
+        self._lock = threading.Lock()  # for the connection; held through every wait
+        self._turning = threading.Lock()  # for the change between open and closed; held briefly
         self._ended = threading.Event()
-        self._loaded = False  # by the server, as far as we know
+        self._loaded = False  # whether the server has the checkpoint, as far as known
         self._warm = False
         self._asked = False  # since the last reset
         self._timestep = 0
 
     def connect(self) -> PolicyInfo:
-        """Reach the server and let it load the checkpoint; an open connection is replaced."""
+        """Connect to the server and let it load the checkpoint; an open connection is replaced."""
         with self._lock:
             self._warm = self._loaded = False
             self._link.drop()
@@ -126,10 +126,13 @@ class LerobotPolicy(Policy):
         )
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk; `timing` has our `round_trip_ms`.
+        """Return the chunk; `timing` contains our `round_trip_ms`.
 
-        PolicyLostError where the server is not there or does not answer: the next call opens another connection, and
-        has the server load the checkpoint again where that was lost. PolicyError where it answers with nothing only.
+        Raises:
+            PolicyLostError: The server is absent or does not respond. The next call opens another connection, and lets
+                the
+                server load the checkpoint again if it has lost it.
+            PolicyError: All responses were empty.
         """
         if conditioning is not None:
             raise PolicyError(
@@ -155,9 +158,9 @@ class LerobotPolicy(Policy):
         return self._config.chunk(rows, {"round_trip_ms": round_trip})
 
     def reset(self) -> None:
-        """Let the server forget its observation; nothing is sent where nothing was asked."""
+        """Make the server forget its observation; nothing is sent if there was no request."""
         with self._lock:
-            if self._asked and self._link.is_open:  # a connection that is yet to be opened begins so anyway
+            if self._asked and self._link.is_open:  # a new connection starts without an observation anyway
                 self._link.call(messages.READY, messages.EMPTY, self._config.connect_deadline)
             self._asked = False
 
@@ -166,7 +169,7 @@ class LerobotPolicy(Policy):
         with self._turning:
             self._ended.set()
             self._link.abort()
-        if self._lock.acquire(blocking=False):  # else whoever waits drops it
+        if self._lock.acquire(blocking=False):  # otherwise the waiting thread drops it
             try:
                 self._link.drop()
             finally:
@@ -193,9 +196,9 @@ class LerobotPolicy(Policy):
             ) from error
 
     def _answer(self, shown: bytes, seconds: float) -> bytes:
-        """The pickle of the actions for an observation, which is sent again where nothing comes back.
+        """Return the pickled actions for an observation, which is sent again after an empty response.
 
-        Nothing comes back too where a call of ours that was given up took the observation off the server's queue.
+        A response is also empty if one of our aborted calls took the observation from the server's queue.
         """
         deadline, pause, asked = time.monotonic() + seconds, _PAUSES[0], 0
         while True:
@@ -226,7 +229,7 @@ class LerobotPolicy(Policy):
             ) from error
 
     def _nothing(self, asked: int, seconds: float) -> PolicyError:
-        self._loaded = False  # perhaps it came back without it
+        self._loaded = False  # it may have restarted without the checkpoint
         self._link.drop()
         return ServerReportedError(
             f"{self._config.url} answered with nothing, {asked} times within {seconds:g} s: its inference fails, which "

@@ -1,7 +1,7 @@
-"""One websocket to a policy server: a first frame on connect, then strictly one request and one answer.
+"""Websocket to a policy server: a first frame on connect, then strictly one request and one response.
 
-Replies carry no id, so a connection whose answer did not come in time is dropped and never used again, and so is one
-on which something waits before a question is asked.
+Responses carry no id. A connection whose response is late is therefore dropped and never reused; so is one that has a
+message waiting before a request is sent.
 """
 
 from __future__ import annotations
@@ -102,14 +102,16 @@ _CLOSED = Pattern(
     "the policy server at {url} closed the connection ({error}): see that it runs",
 )
 
-ANSWER_LIMIT = 64 * 1024 * 1024  # bytes of a message, metadata too; a chunk of 50 rows is some kilobytes
-_TOO_BIG = 1009  # the close code for it
-CLOSING = "websocket-leave"  # threads that say goodbye to a server
-_CLOSE_TIMEOUT = 0.5  # seconds for the closing handshake; a server busy with inference does not answer it
+ANSWER_LIMIT = (
+    64 * 1024 * 1024
+)  # [bytes] per message, metadata included; a chunk of 50 rows has some kilobytes
+_TOO_BIG = 1009  # websocket close code "message too big"
+CLOSING = "websocket-leave"  # name of the threads that close connections
+_CLOSE_TIMEOUT = 0.5  # [s] for the closing handshake; a server busy with inference does not answer it
 
 
 def wait_closed(seconds: float) -> None:
-    """Wait until all servers that are being left have been told, at most so long: for a process that is to end."""
+    """Wait until all closing handshakes are done, at most `seconds` [s]. For a process that is about to end."""
     until = time.monotonic() + seconds
     for thread in threading.enumerate():
         if thread.name == CLOSING:
@@ -117,9 +119,9 @@ def wait_closed(seconds: float) -> None:
 
 
 class WebsocketLink:
-    """A connection that can be opened again until it is aborted; for one thread, except for `abort`.
+    """Connection that can be opened again until it is aborted. For one thread, except `abort`.
 
-    `dial` says where the url's host and port are connected to, where that is elsewhere.
+    `dial` returns the host and port to connect to, if they differ from the url's.
     """
 
     def __init__(
@@ -131,26 +133,28 @@ class WebsocketLink:
         self._connect_deadline = connect_deadline
         self._stack = contextlib.ExitStack()
         self._connection: ClientConnection | None = None
-        self._shaking: ClientConnection | None = None  # its handshake is under way
+        self._shaking: ClientConnection | None = None  # connection during its handshake
         self._aborted = False
         self._watchdog = Watchdog("websocket-send", self._cut)
 
     @property
     def is_open(self) -> bool:
-        """True if a connection is held; the peer may have gone since."""
+        """True if there is a connection; the peer may have left since."""
         return self._connection is not None
 
     @property
     def closed_by_peer(self) -> bool:
-        """True if the peer is known to have ended the held connection, as servers do with idle ones."""
+        """True if the peer is known to have closed the connection, as servers do with idle connections."""
         from websockets.protocol import State
 
         return self._connection is not None and self._connection.state is not State.OPEN
 
     def open(self) -> bytes:
-        """Connect anew and return the server's first frame; both together within the connect deadline.
+        """Connect anew and return the server's first frame, both within the connect deadline.
 
-        PolicyLostError where nobody is there, or not yet, or not any more; PolicyError where somebody else is.
+        Raises:
+            PolicyLostError: There is no server, not yet or no longer.
+            PolicyError: Another kind of server listens there.
         """
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
@@ -167,7 +171,10 @@ class WebsocketLink:
             return self._receive(self._connection, deadline, _ITS_METADATA, self._connect_deadline)
 
     def exchange(self, request: bytes, seconds: float) -> bytes:
-        """The answer to `request`; PolicyTimeout after `seconds`, PolicyGone, or the server's error."""
+        """Return the response to `request`.
+
+        Raises PolicyTimeout after `seconds`, PolicyDisconnected, or the server's error.
+        """
         connection = self._connection
         if connection is None:
             raise PolicyError(_NOT_CONNECTED(url=self._url))
@@ -178,9 +185,9 @@ class WebsocketLink:
             return self._receive(connection, deadline, _AN_ANSWER, seconds)
 
     def exchange_ack(self, request: bytes, seconds: float, text: str) -> bytes | None:
-        """Answer to a request: None if it is `text`, with which some servers acknowledge it, else the bytes.
+        """Return None if the response is `text`, with which some servers acknowledge, else its bytes.
 
-        Any other text is the server's error; so is every text that answers an `exchange`.
+        Any other text is raised as the server's error, as is every text in response to `exchange`.
         """
         connection = self._connection
         if connection is None:
@@ -193,9 +200,9 @@ class WebsocketLink:
             return None if answer == text else self._binary(answer)
 
     def abort(self) -> None:
-        """Unblock, from another thread, whoever waits here: they raise PolicyError, now and later.
+        """Make calls that wait in another thread raise PolicyError, now and later.
 
-        Only the search for a host's address goes on until the connect deadline.
+        Only the resolution of a host name continues until the connect deadline.
         """
         self._aborted = True
         for connection in (self._shaking, self._connection):
@@ -208,7 +215,7 @@ class WebsocketLink:
             raise PolicyError(_CLOSED_BY_US(url=self._url))
 
     def close_gracefully(self) -> None:
-        """End the connection with a close frame, without which servers print a traceback; waits for nothing."""
+        """Close with a close frame, without which servers print a traceback, on a thread of its own."""
         self._watchdog.stop()
         connection, self._connection = self._connection, None
         held = self._stack.pop_all()
@@ -216,7 +223,7 @@ class WebsocketLink:
             threading.Thread(target=held.close, name=CLOSING).start()
 
     def drop(self) -> None:
-        """End the connection without waiting for the server's consent; safe to call twice."""
+        """Close without waiting for the server. Safe to call twice."""
         self._watchdog.stop()
         connection, self._connection = self._connection, None
         if connection is not None:
@@ -240,7 +247,7 @@ class WebsocketLink:
         link = self
 
         class Connection(ClientConnection):
-            """Known before its handshake, so that `abort` can end that too."""
+            """Connection that is known before its handshake, so that `abort` can end it, too."""
 
             def __init__(self, *arguments: Any, **options: Any) -> None:
                 super().__init__(*arguments, **options)
@@ -273,16 +280,16 @@ class WebsocketLink:
         except TimeoutError as error:
             found = self._shaking and self._shaking.protocol.handshake_exc
             if isinstance(found, Exception) and not isinstance(found.__cause__, OSError | EOFError):
-                raise self._foreign(found) from error  # it has said something else, and stays
+                raise self._foreign(found) from error  # it sent something else and stays connected
             raise PolicyTimeout(_NO_HANDSHAKE(url=self._url, seconds=self._connect_deadline)) from error
         except InvalidStatus as error:
             raise self._refused(error.response.status_code) from error
         except ssl.SSLError as error:
             raise TlsError(_NO_TLS(url=self._url, error=error)) from error
-        except (InvalidURI, ValueError) as error:  # what websockets raises where it is told to go elsewhere
+        except (InvalidURI, ValueError) as error:  # raised by websockets for a bad redirect
             raise WrongProtocolError(_POINTS_ELSEWHERE(url=self._url, error=error)) from error
         except (WebSocketException, OSError, EOFError) as error:
-            gone = isinstance(error, OSError | ConnectionClosed)  # or in the middle of a word
+            gone = isinstance(error, OSError | ConnectionClosed)  # or it closed in the middle of a message
             if gone or isinstance(error.__cause__, OSError | EOFError):
                 raise PolicyLostError(_HANDSHAKE_FAILED(url=self._url, error=error)) from error
             raise self._foreign(error) from error
@@ -291,7 +298,10 @@ class WebsocketLink:
         return WrongProtocolError(_NO_WEBSOCKET(url=self._url, error=error))
 
     def _refused(self, status: int) -> PolicyError:
-        """A gateway before a server that restarts says 502 to 504; whatever else is said stays so."""
+        """Return the error for an HTTP status.
+
+        A gateway sends 502 to 504 while its server restarts; others are permanent.
+        """
         if status in (401, 403):
             return RefusedError(_WANTS_KEY(url=self._url, status=status))
         if status in (502, 503, 504):
@@ -299,7 +309,7 @@ class WebsocketLink:
         return WrongProtocolError(_REFUSED(url=self._url, status=status))
 
     def _send(self, connection: ClientConnection, request: bytes, seconds: float) -> None:
-        """Send, but not for ever: a server that stopped reading leaves our socket full."""
+        """Send with a deadline: a server that stopped reading leaves our socket full."""
         from websockets.exceptions import ConnectionClosed
 
         with self._watchdog.deadline(seconds) as was_cut:
@@ -311,7 +321,7 @@ class WebsocketLink:
                 raise self._gone(error) from error
 
     def _require_silence(self, connection: ClientConnection) -> None:
-        """Whatever waits before a question is asked answers none, and would be taken for what answers this one."""
+        """Check that no message waits: it would be mistaken for the response to the next request."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -362,13 +372,13 @@ class WebsocketLink:
 
 
 def _end(wire: socket.socket) -> None:
-    """Wake every thread that waits on this socket; it is of no use afterwards."""
+    """Wake every thread that waits on this socket, which is unusable afterwards."""
     with contextlib.suppress(OSError):
         wire.shutdown(socket.SHUT_RDWR)
 
 
 def error_headline(text: str) -> str:
-    """A traceback's last line first, because that is the sentence, then the whole of it; of JSON what it says."""
+    """Return the last line of a traceback, which has the message, then the whole text; for JSON, its error fields."""
     try:
         said = json.loads(text)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""A policy without a server: smooth, deterministic motion around the first joints it sees."""
+"""Policy without a server: smooth, deterministic motion around the first observed joints."""
 
 from __future__ import annotations
 
@@ -32,16 +32,15 @@ class Config(Settings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> MockPolicy:
-    """The policy; it needs no connection."""
+    """Create the policy, which needs no connection."""
     return MockPolicy(config, robot, clock, control_rate)
 
 
 class MockPolicy(Policy):
-    """Each joint goes out and back as (1 - cos) / 2, so it starts at rest exactly where the robot is.
+    """Policy that moves each joint out and back as (1 - cos) / 2, starting at rest exactly at the robot's joints.
 
-    The motion is a function of the control step alone: row i of the chunk for step s is for the time of step
-    s + i since the first observation after a reset, whatever arrives in between. Grippers move half their
-    way, binary ones stay.
+    The motion depends on the control step alone: row i of the chunk for step s is for step s + i since the first
+    observation after a reset. Grippers move half their travel; binary grippers stay.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:
@@ -54,11 +53,11 @@ class MockPolicy(Policy):
         self._first_step = 0
 
     def connect(self) -> PolicyInfo:
-        """Nothing to reach."""
+        """Return its description; there is nothing to connect."""
         return PolicyInfo("mock", action_space="joint", horizon=self._config.horizon)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The next `horizon` rows of the motion, in joint space."""
+        """Return the next `horizon` rows of the motion, in joint space."""
         if observation.qpos.shape != (self._robot.dim,):
             raise PolicyError(
                 f"the observation has joints of shape {list(observation.qpos.shape)}; "
@@ -72,14 +71,14 @@ class MockPolicy(Policy):
         return ActionChunk(rows.astype(np.float32))
 
     def reset(self) -> None:
-        """The next observation is the first again."""
+        """Make the next observation the first again."""
         self._start = None
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""
 
     def _begin(self, observation: Observation) -> None:
-        """Each joint goes to the side with more room, and never past its limit."""
+        """Choose the side with more room for each joint, within its limits."""
         robot = self._robot
         self._start = np.clip(observation.qpos.astype(np.float64), robot.lower, robot.upper)
         self._first_step = observation.step

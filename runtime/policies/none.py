@@ -1,4 +1,4 @@
-"""No policy: for a station that only collects what a person does."""
+"""No policy, for a station that only collects demonstrations."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class Config(Settings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> NoPolicy:
-    """A policy that refuses to be asked."""
+    """Create a policy that refuses every request."""
     return NoPolicy()
 
 
 class NoPolicy(Policy):
-    """Refuses by name."""
+    """Policy that refuses every request with a reason."""
 
     def connect(self) -> PolicyInfo:
         raise PolicyError(_NONE)
@@ -37,7 +37,7 @@ class NoPolicy(Policy):
         raise PolicyError(_NONE)
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""

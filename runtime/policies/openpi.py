@@ -1,7 +1,7 @@
-"""The openpi websocket protocol: metadata on connect, then one observation map, one map of actions.
+"""Policies on openpi websocket servers: metadata on connect, then one map per observation, one map of actions.
 
-Source: openpi's websocket_policy_server and openpi-client. The request's layout is declared in the
-configuration, so that the ALOHA, DROID and LIBERO layouts are settings and not code.
+Source: openpi's websocket_policy_server and openpi-client. The layout of requests is declared in the configuration,
+so that those of ALOHA, DROID and LIBERO are settings and not code.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
 if TYPE_CHECKING:
     from robots import Robot
 
-_SOONER = 0.95  # of what a server says that its inference took: clocks differ by less
+_SOONER = 0.95  # tolerance on the inference time that the server states: clocks differ by less
 
-# Metadata keys by which servers of other protocols are known, and the kind that is theirs.
+# Metadata keys that identify servers of other protocols, with their kind.
 _MARKS = {
     "needs_wrist_camera": "roboarena",
     "n_external_cameras": "roboarena",
@@ -74,12 +74,15 @@ class Config(ServerSettings, RequestSettings, ActionFormatSettings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:
-    """The policy, not yet connected; ConfigurationError where the request's layout does not fit the robot."""
+    """Create the policy, not yet connected.
+
+    Raises ConfigurationError if the request's layout does not fit the robot.
+    """
     return OpenpiPolicy(config, robot, control_rate)
 
 
 class OpenpiPolicy(WebsocketPolicy):
-    """A policy on a websocket with openpi's messages, and whatever a dialect of real-time chunking adds to them."""
+    """Policy with openpi's messages, and the additions of a dialect of real-time chunking."""
 
     PROTOCOL = "openpi"
 
@@ -110,10 +113,11 @@ class OpenpiPolicy(WebsocketPolicy):
         self._own_relative = None if config.rtc_model_rows is None else config.rtc_model_rows == "relative"
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk; `timing` has the server's figures [ms] and our `round_trip_ms`.
+        """Return the chunk; `timing` contains the server's durations [ms] and our `round_trip_ms`.
 
-        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
-        PolicyError for conditioning that the dialect `policy.rtc` cannot carry.
+        Raises:
+            PolicyLostError: The server is absent or does not respond. The next call opens another connection.
+            PolicyError: The dialect `policy.rtc` cannot carry the conditioning.
         """
         shown, continued = self.request(observation), self._as_served(conditioning)
         with self._lock:
@@ -124,10 +128,10 @@ class OpenpiPolicy(WebsocketPolicy):
         return self._chunk(result, round_trip)
 
     def reset(self) -> None:
-        """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
+        """Do nothing: the protocol has no reset, and no response depends on an earlier one."""
 
     def request(self, observation: Observation) -> dict[str, object]:
-        """The request map for an observation, in the declared layout, without what a dialect adds."""
+        """Return the request map for an observation in the declared layout, without the dialect's additions."""
         return self._layout.build(self._grip.convert_observation(observation))
 
     def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
@@ -148,13 +152,16 @@ class OpenpiPolicy(WebsocketPolicy):
         try:
             return self._dialect.unwrap(reply)
         except PolicyError:
-            # After an error the server closes; after another's answer all that follow would be another's.
+            # After an error the server closes; after a wrong response all later ones would be wrong, too.
             self._link.close_gracefully()
             raise
 
     def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
-        """Also where it came sooner than the server says that it took: then it was under way before the question."""
-        with contextlib.suppress(CodecError):  # `infer` says so
+        """Return the reason to suspect a response; also one that is faster than the server's stated inference time.
+
+        Such a response was under way before its request.
+        """
+        with contextlib.suppress(CodecError):  # reported by `infer`
             reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)
             said = _timing(reply).get("server.infer_ms", 0.0) if isinstance(reply, dict) else 0.0
             if took < _SOONER * said:
@@ -186,7 +193,7 @@ class OpenpiPolicy(WebsocketPolicy):
         return None if origin is None else parse_action_rows("origin_actions", origin)
 
     def _as_served(self, conditioning: Conditioning | None) -> Conditioning | None:
-        """Rows of the robot's numbers as the server counts them; absolute ones are kept as it gave them."""
+        """Convert conditioning rows to the server's values; absolute rows were stored as the server sent them."""
         if conditioning is None or self._absolute or not self._converts:
             return conditioning
         rows = self._grip.served(conditioning.previous)
@@ -196,7 +203,7 @@ class OpenpiPolicy(WebsocketPolicy):
 
 
 def _refuse_others(metadata: Mapping[str, Any]) -> None:
-    """WrongProtocolError for servers that greet like openpi's, and take other requests."""
+    """Raise WrongProtocolError for servers that greet like openpi's but accept other requests."""
     kind = next((kind for mark, kind in _MARKS.items() if mark in metadata), None)
     if kind is not None:
         found = ", ".join(map(str, metadata))
@@ -226,7 +233,7 @@ def _dialect(config: Config) -> Dialect:
 
 
 def _timing(reply: Mapping[str, Any]) -> dict[str, float]:
-    """The server's figures [ms] as "server.infer_ms", "policy.infer_ms"; what is no number is left out."""
+    """Return the server's durations [ms] as "server.infer_ms", "policy.infer_ms"; other values are dropped."""
     timing: dict[str, float] = {}
     for group in ("server", "policy"):
         figures = reply.get(f"{group}_timing")

@@ -1,4 +1,4 @@
-"""Pictures as policies want them: resized as in their training, in their layout."""
+"""Preparation of pictures for policies: size as in their training, and memory layout."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Layout = Literal["chw", "hwc"]
 def resize_image(
     picture: UInt8, height: int, width: int, how: Resize, by: Literal["bilinear", "lanczos"] = "bilinear"
 ) -> UInt8:
-    """RGB uint8 [height, width, 3] from [H, W, 3], with Pillow because policies are trained with it.
+    """Resize a picture [H, W, 3] to RGB uint8 [height, width, 3], with Pillow because policies are trained with it.
 
-    "pad" keeps the aspect and centres the picture on black; sides are rounded down, as openpi does it.
+    "pad" preserves the aspect ratio and centres the picture on black; sides are rounded down as in openpi.
     """
     rows, columns = picture.shape[:2]
     if (rows, columns) == (height, width):
@@ -38,11 +38,11 @@ def resize_image(
 
 
 def to_layout(picture: UInt8, layout: Layout) -> UInt8:
-    """The picture in memory order: [H, W, 3] for "hwc", [3, H, W] for "chw"."""
+    """Return the picture in memory order: [H, W, 3] for "hwc", [3, H, W] for "chw"."""
     if layout == "hwc":
         return np.ascontiguousarray(picture)
-    import cv2  # imported here, as control locks all that it imports
+    import cv2  # imported here because control locks its imports into memory
 
     planes = np.empty((3, *picture.shape[:2]), np.uint8)
-    cv2.split(picture, list(planes))  # into their memory, ten times as fast as numpy's transpose
+    cv2.split(picture, list(planes))  # directly into their memory, ten times as fast as numpy's transpose
     return planes

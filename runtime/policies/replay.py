@@ -1,4 +1,4 @@
-"""A recorded episode as a policy: it answers with the recorded actions, exactly as they are stored."""
+"""Recorded episode as a policy: it returns the recorded actions exactly as they are stored."""
 
 from __future__ import annotations
 
@@ -48,22 +48,22 @@ class Config(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Recorded:
-    """The actions of an episode, and whose they are as far as it says."""
+    """Actions of an episode, and their robot if it is known."""
 
     actions: Float32  # [N, W]
     fps: float
     task: str
-    robot: str  # "": it does not say
-    names: Sequence[str]  # of the numbers; empty: it does not say
-    state: str = "unsealed"  # of its files, as in runtime.recording.scrub
+    robot: str  # "" if unknown
+    names: Sequence[str]  # of the dimensions; empty if unknown
+    state: str = "unsealed"  # integrity of its files, see runtime.recording.scrub
 
 
 class ReplayPolicy(Policy):
-    """Row 0 belongs to the first observation after a reset, later rows to the steps that passed since.
+    """Policy that replays an episode: row 0 is for the first observation after a reset, later rows for later steps.
 
-    After a hold it goes on with the row it had given that is nearest to the robot's joints, for actions in joints;
-    poses go on with the first row of the last answer. What a chunk has beyond the end is the last row again: there the
-    robot is held, where it would otherwise run out of rows while it moves, and brake beyond it.
+    After a hold, a replay in joint space continues with the row of the last chunk that is nearest to the robot's
+    joints; one in poses continues with the first row of the last chunk. A chunk beyond the end repeats the last row:
+    the robot holds there, instead of running out of rows in motion and braking beyond it.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:
@@ -76,11 +76,11 @@ class ReplayPolicy(Policy):
         self._actions: Float32 | None = None
         self._fps = 0.0
         self._first_step: int | None = None
-        self._row = 0  # with which the last answer began
-        self._held = False  # since then
+        self._row = 0  # first row of the last chunk
+        self._held = False  # whether there was a hold since
 
     def connect(self) -> PolicyInfo:
-        """Open the episode; raises PolicyError where it is absent or does not fit the robot."""
+        """Open the episode. Raises PolicyError if it is absent or does not fit the robot."""
         config = self._config
         try:
             recorded = self._recording() if self._is_recording() else self._of_dataset()
@@ -148,7 +148,7 @@ class ReplayPolicy(Policy):
         return _Recorded(actions, journal.fps, journal.task, journal.robot, names, state)
 
     def _require_same_robot(self, recorded: _Recorded) -> None:
-        """Numbers of another robot of ours, or in another order, would move this one nonsensically."""
+        """Raise PolicyError for actions of another known robot, or in another joint order."""
         own = self._robot
         if recorded.robot in robots.robot_names() and recorded.robot != own.name:
             raise PolicyError(
@@ -163,7 +163,7 @@ class ReplayPolicy(Policy):
             )
 
     def _mapping(self) -> ColumnMapping:
-        """The column of the actions alone, read as if it were the state: nothing else has to be there."""
+        """Return a mapping that reads the action column as the state, so that no other column is needed."""
         name = "action" if self._config.space == "joint" else "action_eef"
         column = getattr(self._config.mapping, name)
         if column is None:
@@ -182,7 +182,7 @@ class ReplayPolicy(Policy):
         return actions
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The rows recorded from the observation's moment on."""
+        """Return the recorded rows from the observation's step on."""
         if self._actions is None:
             raise PolicyError(f"the replay of {self._config.path} is not connected")
         answered_at = self._clock.now() + self._config.latency_s
@@ -211,7 +211,7 @@ class ReplayPolicy(Policy):
         )
 
     def _place(self, observation: Observation) -> int:
-        """The row at which the robot was held."""
+        """Return the row at which the robot was held."""
         if self._actions is None or self._config.space != "joint":
             return self._row
         given = self._actions[self._row : self._row + self._config.horizon]
@@ -230,5 +230,5 @@ class ReplayPolicy(Policy):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> ReplayPolicy:
-    """The policy; `control_rate` [Hz] is the rate of the steps that observations carry."""
+    """Create the policy; `control_rate` is the rate of the steps in observations [Hz]."""
     return ReplayPolicy(config, robot, clock, control_rate)

@@ -1,4 +1,4 @@
-"""An observation as a policy server's request, in the layout that a deployment declares."""
+"""Requests to a policy server from observations, in the layout that a deployment declares."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.spaces.pose_rows import PoseRows
 if TYPE_CHECKING:
     from robots import Robot
 
-PIXELS = range(8, 4097)  # of a side of a picture that a policy is shown
+PIXELS = range(8, 4097)  # allowed side of a picture for a policy
 Pixels = Annotated[int, Field(ge=PIXELS[0], le=PIXELS[-1])]
 Size = Annotated[list[Pixels], Field(min_length=2, max_length=2)]
 Dims = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
@@ -52,7 +52,10 @@ class RequestSettings(Settings):
 
 
 class RequestLayout:
-    """Places of state, pictures and instruction; ConfigurationError where they do not fit the robot."""
+    """Layout of state, pictures and instruction in a request.
+
+    Raises ConfigurationError if it does not fit the robot.
+    """
 
     def __init__(self, settings: RequestSettings, robot: Robot) -> None:
         self._settings = settings
@@ -69,7 +72,7 @@ class RequestLayout:
                 )
 
     def build(self, observation: Observation) -> dict[str, Any]:
-        """The request map; PolicyError where the observation lacks what belongs into it."""
+        """Return the request map. Raises PolicyError if the observation lacks a part."""
         settings = self._settings
         state = self._state(observation)
         request: dict[str, Any] = {settings.state_key: state} if settings.state_key else {}
@@ -88,7 +91,7 @@ class RequestLayout:
         return np.ascontiguousarray(state, dtype=np.float32)
 
     def _encode_poses(self, poses: PoseRows, observation: Observation) -> Float32:
-        """The observation's poses as the policy was trained with them; a single row is in the usual range."""
+        """Return the observation's poses in the policy's format; for a single row, angles are in their usual range."""
         if observation.eef is None:
             raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
         if observation.eef.size != self._poses_given:
@@ -111,7 +114,7 @@ class RequestLayout:
 
 
 def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
-    """The rows of a space that is poses, None for joints; ConfigurationError where the format does not fit."""
+    """Return the row format of a space of poses, None for joints. Raises ConfigurationError if it does not fit."""
     if space == "eef":
         return PoseRows(pose, robot, f"policy.{key}")
     reject_pose_format(pose, f"policy.{key}")
@@ -119,7 +122,7 @@ def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> Pos
 
 
 def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:
-    """The named cameras; None for whatever the observation has: a deployment may do without some."""
+    """Return the named cameras; None for all in the observation, because a deployment may lack some."""
     if settings.cameras is None:
         return None
     known = [camera.key for camera in robot.cameras]

@@ -1,7 +1,7 @@
-"""The RoboArena policy protocol, which DreamZero, IsaacLab-Arena and vLLM-Omni speak too, over openpi's arrays.
+"""Policies with the RoboArena protocol, also of DreamZero, IsaacLab-Arena and vLLM-Omni, over openpi's arrays.
 
-The server's first frame says what it wants. Every request names an endpoint, infer or reset. A text frame is an
-acknowledgement only where a reset was asked for and it says exactly "reset successful"; any other is an error.
+The server's first frame states its requirements. Every request names an endpoint, infer or reset. A text frame is an
+acknowledgement only in response to a reset, and only if it is exactly "reset successful"; any other is an error.
 Source: robo-arena's policy server and clients, and the openpi endpoint of vLLM-Omni.
 """
 
@@ -40,14 +40,14 @@ class Config(ServerSettings, ArenaRequestSettings, ArenaActionSettings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> RoboarenaPolicy:
-    """The policy, not yet connected; ConfigurationError where a setting does not fit the robot."""
+    """Create the policy, not yet connected. Raises ConfigurationError if a setting does not fit the robot."""
     return RoboarenaPolicy(config, robot)
 
 
 class RoboarenaPolicy(WebsocketPolicy):
-    """One session per run: its end, or a `reset`, ends it on the server, and the next request begins another.
+    """Policy with one session per run: its end, or a `reset`, ends it on the server; the next request begins another.
 
-    A connection that the server ended between two requests, as vLLM-Omni does after half a minute, is opened anew.
+    A connection that the server closed between two requests, as vLLM-Omni does after half a minute, is opened again.
     """
 
     PROTOCOL = "RoboArena"
@@ -64,13 +64,13 @@ class RoboarenaPolicy(WebsocketPolicy):
         self._session = _new_session()
         self._asked = False  # in this session
         self._ending: dict[str, str] | None = (
-            None  # what a session that is not yet ended on the server is called
+            None  # session field of a session that must still be ended on the server
         )
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk; `timing` has our `round_trip_ms`, the protocol has no figures of the server's.
+        """Return the chunk; `timing` contains our `round_trip_ms`, because the protocol has no durations of the server.
 
-        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        Raises PolicyLostError if the server is absent or does not respond: the next call opens another connection.
         """
         if conditioning is not None:
             raise PolicyError("the RoboArena protocol has no real-time chunking; choose another strategy")
@@ -87,13 +87,13 @@ class RoboarenaPolicy(WebsocketPolicy):
         return self._meant.chunk(reply, {"round_trip_ms": round_trip})
 
     def observe(self, observation: Observation) -> None:
-        """Keep its pictures for the requests to come."""
+        """Store its pictures for later requests."""
         self._shown.observe(observation)
 
     def reset(self) -> None:
-        """End the session on the server and wait for its acknowledgement; nothing is sent where it never began.
+        """End the session on the server and wait for the acknowledgement; nothing is sent if it had no request.
 
-        Where that fails, the next `infer` tries it again before it asks: the server may keep a history.
+        If that fails, the next `infer` tries again before its request, because the server may keep a history.
         """
         with self._lock:
             self._forget_session()
@@ -102,7 +102,7 @@ class RoboarenaPolicy(WebsocketPolicy):
                 self._end_session()
 
     def end_episode(self) -> None:
-        """As `reset`, on a connection that stands: none is opened to end a session, the next `infer` does that."""
+        """End the session as `reset`, but only over an open connection; otherwise the next `infer` does it."""
         with self._lock:
             self._forget_session()
             if self._link.is_open and not self._link.closed_by_peer and not self._closed:
@@ -119,7 +119,7 @@ class RoboarenaPolicy(WebsocketPolicy):
             return
         request = msgpack_arrays.pack(self._ending | {"endpoint": "reset"})
         answer = self._link.exchange_ack(request, self._config.reset_deadline, ACKNOWLEDGED)
-        self._last = None  # no answer of before can follow
+        self._last = None  # after the acknowledgement no earlier answer can arrive
         if answer is not None:
             self._require_acknowledged(self._value(answer, "an acknowledgement"))
         self._ending = None
@@ -154,7 +154,7 @@ class RoboarenaPolicy(WebsocketPolicy):
     def _require_acknowledged(self, reply: Any) -> None:
         _require_no_error(reply)
         if not isinstance(reply, Mapping) or reply.get("status") != ACKNOWLEDGED:
-            self._link.close_gracefully()  # whatever this answers, it is no reset
+            self._link.close_gracefully()  # it is not the response to the reset
             raise WrongProtocolError(
                 f"{self._config.url} answered a reset with {_short(reply)}; expected the text or the status "
                 f"{ACKNOWLEDGED!r}"
@@ -162,7 +162,7 @@ class RoboarenaPolicy(WebsocketPolicy):
 
 
 def _require_no_error(reply: Any) -> None:
-    """vLLM-Omni tells errors as a map and stays connected."""
+    """Raise the error in a reply, because vLLM-Omni reports errors as a map and stays connected."""
     if isinstance(reply, Mapping) and reply.get("type") == "error":
         said = reply.get("message") or reply.get("error") or "nothing more"
         raise ServerReportedError(f"the policy server reports an error: {said}")

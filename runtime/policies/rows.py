@@ -1,4 +1,4 @@
-"""Action rows of a reply: checked for shape, width and finite numbers, whatever the protocol."""
+"""Check of action rows in a reply: shape, width and finite numbers, for every protocol."""
 
 from __future__ import annotations
 
@@ -12,9 +12,16 @@ from runtime.core.types import Float32
 
 
 def parse_action_rows(name: str, given: object, width: int | None = None) -> Float32:
-    """float32 [T, W] of [W], [T, W] or [1, T, W]; raises ShapeError or NotFiniteError, which say where.
+    """Return float32 [T, W] from [W], [T, W] or [1, T, W].
 
-    `width` is the only W allowed, None allows any.
+    Args:
+        name: Name of the array in messages.
+        given: Array of the reply.
+        width: The only allowed W, None for any.
+
+    Raises:
+        ShapeError: Type, shape or width is wrong.
+        NotFiniteError: A number is not finite; the message tells where.
     """
     if not isinstance(given, np.ndarray):
         raise ShapeError(f"{name} is a {type(given).__name__}; expected a number array [T, {width or 'W'}]")
@@ -27,7 +34,7 @@ def parse_action_rows(name: str, given: object, width: int | None = None) -> Flo
         raise ShapeError(f"{name} has rows of {rows.shape[1]} numbers; this robot needs {width}")
     numbers = rows.astype(np.float32) if rows.dtype == np.float32 else _to_float32(rows)
     finite = np.isfinite(numbers)
-    if not finite.all():  # where it fails is looked for only then: every answer passes here
+    if not finite.all():  # the position is only searched after a failure, because every response passes here
         wrong = np.argwhere(~finite)
         row, column = wrong[0]
         raise NotFiniteError(
@@ -38,7 +45,7 @@ def parse_action_rows(name: str, given: object, width: int | None = None) -> Flo
 
 
 def _to_float32(rows: NDArray[Any]) -> Float32:
-    """As float32; what overflows becomes infinite, and is refused as such."""
+    """Convert to float32; an overflow becomes infinite and is refused as such."""
     with np.errstate(over="ignore"):
         return rows.astype(np.float32)
 

@@ -1,7 +1,7 @@
-"""The StarVLA websocket protocol: typed envelopes with a list of views in a declared order.
+"""Policies on StarVLA websocket servers: typed envelopes with a list of views in a declared order.
 
-Source: starVLA's websocket policy server and its policy wrapper. Frames and arrays are openpi's. The server's
-process ends after a while without requests, so a ping goes out where nothing else does.
+Source: starVLA's websocket policy server and its policy wrapper. Frames and arrays are openpi's. The server's process
+ends after a while without requests, so a ping is sent when there is no other traffic.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 _ENVIRONMENTS = (
     "starvla_policy_server",
     "simpler_env",
-)  # the second until May 2026, with nothing else beside it
+)  # the second was used until May 2026, without further keys
 
 
 class Config(ServerSettings, ActionLayoutSettings):
@@ -65,12 +65,12 @@ class Config(ServerSettings, ActionLayoutSettings):
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> StarvlaPolicy:
-    """The policy, not yet connected; ConfigurationError where a setting does not fit the robot."""
+    """Create the policy, not yet connected. Raises ConfigurationError if a setting does not fit the robot."""
     return StarvlaPolicy(config, robot)
 
 
 class StarvlaPolicy(WebsocketPolicy):
-    """One example per request; a connection that the server ended between two requests is opened anew."""
+    """Policy with one example per request; a connection that the server closed between requests is opened again."""
 
     PROTOCOL = "StarVLA"
 
@@ -96,7 +96,7 @@ class StarvlaPolicy(WebsocketPolicy):
         self._silent.set()
 
     def connect(self) -> PolicyInfo:
-        """Reach the server, read its metadata, and have it answer a ping: nothing but StarVLA's server does."""
+        """Connect, read the metadata, and ping, which only StarVLA's server answers."""
         info = super().connect()
         if self._config.ping_every is not None and self._silent.is_set():
             self._silent = threading.Event()
@@ -109,9 +109,9 @@ class StarvlaPolicy(WebsocketPolicy):
         return info
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The chunk; `timing` has our `round_trip_ms`.
+        """Return the chunk; `timing` contains our `round_trip_ms`.
 
-        PolicyLostError where the server is not there or does not answer: the next call opens another connection.
+        Raises PolicyLostError if the server is absent or does not respond: the next call opens another connection.
         """
         if conditioning is not None:
             raise PolicyError("the StarVLA protocol has no real-time chunking; choose another strategy")
@@ -127,15 +127,15 @@ class StarvlaPolicy(WebsocketPolicy):
         return self._chunk(reply.get("data"), round_trip)
 
     def reset(self) -> None:
-        """Nothing to forget: the protocol has no reset, and no answer depends on an earlier one."""
+        """Do nothing: the protocol has no reset, and no response depends on an earlier one."""
 
     def close(self) -> None:
-        """As every policy; no ping goes out any more."""
+        """Close as every policy, and stop the pings."""
         self._silent.set()
         super().close()
 
     def payload(self, observation: Observation) -> dict[str, Any]:
-        """One example, and whose statistics are meant."""
+        """Return one example, with the key of the statistics."""
         shown = self._layout.build(observation)
         example: dict[str, Any] = {"image": list(shown["images"].values()), "lang": observation.prompt}
         if self._config.state:
@@ -166,7 +166,7 @@ class StarvlaPolicy(WebsocketPolicy):
         )
 
     def _agreed_size(self, said: Any) -> list[int] | None:
-        """Height and width of the views; ContradictionError where both sides say something else."""
+        """Return height and width of the views. Raises ContradictionError if both sides state different sizes."""
         trained = _size(said)
         own = self._config.image_size
         if own is not None and trained is not None and own != trained:
@@ -189,7 +189,7 @@ class StarvlaPolicy(WebsocketPolicy):
         self._spoken = time.monotonic()
 
     def _keep_awake(self, silent: threading.Event, every: float) -> None:
-        """Ping while nobody asks; a request that is under way is no silence."""
+        """Ping while there are no requests; a request in progress counts as traffic."""
         while not silent.wait(every / 2):
             if not self._lock.acquire(blocking=False):
                 continue
@@ -203,7 +203,7 @@ class StarvlaPolicy(WebsocketPolicy):
                 self._lock.release()
 
     def _check_reply(self, reply: Mapping[str, Any], envelope: Mapping[str, Any]) -> None:
-        """An answer to this very request that is no error; any other is followed by another connection."""
+        """Check that the reply belongs to this request and is no error; else the connection is closed."""
         asked, found = envelope["request_id"], reply.get("request_id")
         if found != asked:
             self._link.close_gracefully()
@@ -239,7 +239,7 @@ class StarvlaPolicy(WebsocketPolicy):
 
 
 def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:
-    """Ours, else the server's default; PolicyError where it has others, or several and no default."""
+    """Return our key, else the server's default. Raises ContradictionError if it lacks our key or has no default."""
     available = metadata.get("available_unnorm_keys")
     known = [str(key) for key in available] if isinstance(available, list) else []
     if own is not None:
@@ -259,7 +259,7 @@ def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:
 
 
 def _size(said: Any) -> list[int] | None:
-    """Height and width of one number (a square), two, or three with the channels; None where nothing is said."""
+    """Return height and width from one number (a square), two, or three with the channels; None for none."""
     if said is None:
         return None
     numbers = [said, said] if type(said) is int else said

@@ -1,4 +1,4 @@
-"""Back from a model's own -1 .. 1 to the robot's numbers, where the server leaves that to its clients."""
+"""Conversion of a model's own range -1 .. 1 to the robot's values, for servers that leave it to their clients."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class Statistics(Settings):
         return self
 
     def require_width(self, width: int) -> None:
-        """ConfigurationError where rows have another number of numbers."""
+        """Raise ConfigurationError if rows have another width."""
         if len(self.low) != width:
             raise ConfigurationError(
                 f"policy.statistics has {len(self.low)} numbers; the rows of this robot have {width}"
             )
 
     def denormalize(self, rows: Float32) -> Float32:
-        """The robot's numbers of normalised rows [T, W]; what is beyond -1 and 1 is at them."""
+        """Return the robot's values for normalised rows [T, W], which are clipped to -1 .. 1."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         made = low + (np.clip(rows, -1.0, 1.0) + 1.0) / 2.0 * (high - low)
         mask = np.ones(len(low), bool) if self.mask is None else np.asarray(self.mask)

@@ -1,4 +1,4 @@
-"""Cuts what takes too long: one thread for a connection, because one for each request costs more than the request."""
+"""Watchdog that cuts operations after a deadline, with one thread per connection instead of one per request."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 
 
 class Watchdog:
-    """Calls what it is given once a deadline has passed; for one watched thread at a time.
+    """Timer that calls `cut` after a deadline. For one watched thread at a time.
 
-    Its thread begins with the first `watching`, and sleeps on from deadline to deadline without being woken between
-    them. `end` ends it, from any thread and without waiting; a later `watching` begins another.
+    Its thread starts with the first `deadline` and sleeps from deadline to deadline; operations that end in time do not
+    wake it. `stop` ends it, from any thread and without waiting; a later `deadline` starts another.
     """
 
     def __init__(self, name: str, cut: Callable[[], None]) -> None:
@@ -21,13 +21,13 @@ class Watchdog:
         self._cut = cut
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
-        self._deadline = math.inf  # of what is under way
-        self._wakes = math.inf  # when the thread looks again by itself
+        self._deadline = math.inf  # of the present operation
+        self._wakes = math.inf  # time of the thread's next check
         self._fired = False
 
     @contextlib.contextmanager
     def deadline(self, seconds: float) -> Iterator[Callable[[], bool]]:
-        """Cut the work of this context after `seconds`; the function given returns True if that was so."""
+        """Cut the operation in this context after `seconds` [s]; the yielded function returns True if that happened."""
         self._begin(time.monotonic() + seconds)
         try:
             yield lambda: self._fired
@@ -36,7 +36,7 @@ class Watchdog:
                 self._deadline = math.inf
 
     def stop(self) -> None:
-        """Nothing is cut any more."""
+        """End the thread; nothing is cut any more."""
         with self._changed:
             self._thread, self._deadline = None, math.inf
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""Common parts of websocket policies: a server with deadlines, one conversation at a time, metadata first."""
+"""Common parts of websocket policies: deadlines, one request at a time, metadata first."""
 
 from __future__ import annotations
 
@@ -55,32 +55,32 @@ class ServerSettings(Settings):
 
 
 class WebsocketPolicy(Policy):
-    """One connection; a timed-out one is dropped, and the next `infer` opens another.
+    """Policy on one connection; after a timeout it is dropped, and the next `infer` opens another.
 
-    Deadlines are real seconds whatever the clock, because a server on a wire knows no other. The long first
-    deadline holds once after `connect`: later no `infer` takes longer than the deadlines of connection and
-    inference together, so that a server that came back mute, or compiles again, is found out quickly.
+    Deadlines are real seconds, whatever the clock, because a remote server knows no other. The long first deadline
+    applies once after `connect`. Later no `infer` takes longer than the deadlines of connection and inference
+    together, so that a server that came back silent, or compiles again, is detected quickly.
     """
 
-    PROTOCOL = ""  # its name in sentences
+    PROTOCOL = ""  # name in messages
 
     def __init__(self, server: ServerSettings) -> None:
         self._server = server
         self._headers = headers(server)
         self._link = self._new_link()
-        self._lock = threading.Lock()  # of the wire: held through every wait
-        self._turning = threading.Lock()  # between open and closed: held for a moment
+        self._lock = threading.Lock()  # for the connection; held through every wait
+        self._turning = threading.Lock()  # for the change between open and closed; held briefly
         self._closed = False
         self._warm = False
-        self._last: tuple[bytes, bytes] | None = None  # question and answer
-        self._excused: set[str] = set()  # doubts that another connection has not confirmed
+        self._last: tuple[bytes, bytes] | None = None  # last request and its response
+        self._excused: set[str] = set()  # suspicions that another connection did not confirm
 
     @abstractmethod
     def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
-        """The server's statement of itself; PolicyError and a dropped connection if it is the wrong one."""
+        """Check the server's metadata. Raises PolicyError if it is the wrong server; the connection is then dropped."""
 
     def connect(self) -> PolicyInfo:
-        """Reach the server and read its metadata; an open connection is replaced."""
+        """Connect to the server and read its metadata; an open connection is replaced."""
         with self._lock:
             self._warm, self._last = False, None
             self._excused.clear()
@@ -91,12 +91,13 @@ class WebsocketPolicy(Policy):
             return self._open()
 
     def close(self) -> None:
-        """Leave the server and return at once; a call that waits in another thread is cut off and raises PolicyError.
+        """Leave the server and return at once; a call that waits in another thread raises PolicyError.
 
-        What is left of such a connection is dropped by whoever uses it, now or at the next `connect`.
+        The user of that connection drops it, now or at the next `connect`.
         """
         with self._turning:
             self._closed = True
+            # With a free lock no call waits, so the server gets a close frame; otherwise `abort` cuts the call.
             if self._lock.acquire(blocking=False):
                 try:
                     self._link.close_gracefully()
@@ -110,7 +111,7 @@ class WebsocketPolicy(Policy):
         )
 
     def _require_open(self) -> None:
-        """A connection, another one where there is none any more; PolicyError after `close`."""
+        """Open a connection if there is none. Raises PolicyError after `close`."""
         if self._closed:
             raise PolicyError(_POLICY_CLOSED(url=self._server.url))
         if not self._link.is_open:
@@ -123,7 +124,7 @@ class WebsocketPolicy(Policy):
                 self._server.url, self._server.health_path, self._headers, deadline, self.address_override
             )
         metadata = self._decode(self._link.open(), "metadata")
-        self._last = None  # the first answer of a connection is to its first question
+        self._last = None  # the first response on a connection belongs to its first request
         try:
             return self._check_metadata(metadata)
         except PolicyError:
@@ -131,10 +132,10 @@ class WebsocketPolicy(Policy):
             raise
 
     def _exchange(self, request: bytes) -> tuple[bytes, float]:
-        """The answer and its round trip [ms].
+        """Return the response and its round trip [ms].
 
-        Where it may be another question's, it is asked for once more over another connection, whose first answer
-        cannot be; a server that answers there no otherwise is believed from then on.
+        A suspicious response is requested once more over another connection, whose first response cannot belong to an
+        earlier request. If the server responds in the same way there, the suspicion is dropped from then on.
         """
         seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
         self._warm = True
@@ -149,7 +150,7 @@ class WebsocketPolicy(Policy):
             if answer == doubted or self._mismatch_reason(request, answer, took) == doubt:
                 self._excused.add(doubt)
         elif not doubt:
-            self._excused.discard(_REPEATED)  # it does answer otherwise
+            self._excused.discard(_REPEATED)  # its responses do differ
         self._last = request, answer
         return answer, took
 
@@ -159,7 +160,7 @@ class WebsocketPolicy(Policy):
         return answer, 1e3 * (time.monotonic() - started)
 
     def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
-        """Why an answer that took so long [ms] may be another question's; "" where nothing says so."""
+        """Return the reason to suspect that this response belongs to an earlier request, "" if there is none."""
         if self._last is not None and self._last[0] != request and self._last[1] == answer:
             return _REPEATED
         return ""
@@ -182,7 +183,7 @@ class WebsocketPolicy(Policy):
 
 
 def headers(server: ServerSettings) -> dict[str, str]:
-    """The request headers; ConfigurationError where the key that is named is not in the environment."""
+    """Return the request headers. Raises ConfigurationError if the named API key is not in the environment."""
     if server.api_key_env is None:
         return {}
     return {"Authorization": f"Api-Key {read_secret('policy.api_key_env', server.api_key_env)}"}

@@ -1,1 +1,1 @@
-"""A policy asked without a robot: what is found on the way from a deployment to rows that a robot could execute."""
+"""Preflight: a policy asked without a robot, from the deployment to action rows that a robot could execute."""

@@ -1,6 +1,6 @@
-"""python -m runtime.preflight DEPLOYMENT: asks the deployment's policy once without a robot, and says what is wrong.
+"""python -m runtime.preflight DEPLOYMENT: query the deployment's policy once without a robot, and report faults.
 
-Nothing is sent to any robot. Exit codes: 0 all is well, 1 it is not, 2 the deployment is wrong or misspelt.
+Nothing is sent to any robot. Exit codes: 0 success, 1 a fault of the policy, 2 an invalid deployment.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from runtime.station.preflight_child import default_deadline
 _LOOK_S = 0.2
 _LONGEST_S = 3600.0
 _GOODBYE_S = 1.0
-_BACKGROUND_NICE = 5  # stations of the same machine come first
+_BACKGROUND_NICE = 5  # stations on the same machine have priority
 
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly once and print what was found."""
+    """Run one preflight and print its report."""
     parser = _parser()
     given = parser.parse_args(arguments)
     if given.given == (given.deployment is not None) or (given.given and given.assignments):
@@ -51,7 +51,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def preflight(resolved: Any, deadline: float | None = None) -> Report:
-    """The report about what `resolved()` returns, within `deadline` seconds, None: the policy's own deadlines."""
+    """Return the report on the deployment that `resolved()` returns.
+
+    Args:
+        resolved: Function that returns the resolved deployment; it may raise RuntimeFault.
+        deadline: Time for everything [s]; None: the sum of the policy's own deadlines.
+    """
     try:
         made = check_deployment(resolved())
     except RuntimeFault as fault:
@@ -65,7 +70,7 @@ def preflight(resolved: Any, deadline: float | None = None) -> Report:
 
 
 def exit_code(report: Report) -> int:
-    """For a shell."""
+    """Return the exit code for a shell."""
     return 2 if report.verdict is PreflightVerdict.MISCONFIGURED else 0 if report.ok else 1
 
 
@@ -94,10 +99,10 @@ def _seconds(text: str) -> float:
 
 
 def _for_a_parent() -> int:
-    """Answer one line of JSON on standard input with one on standard output; we end with the input.
+    """Answer one line of JSON on standard input with one on standard output; end when the input closes.
 
-    The line: "tree" (a resolved deployment) or "deployment" (a file); "changes", tables that go on top as those of a
-    set-up; "deadline_s" or null.
+    The line has "tree" (a resolved deployment) or "deployment" (a file), "changes" (tables merged on top, as by a
+    set-up), and "deadline_s" or null.
     """
     os.nice(_BACKGROUND_NICE)
     log.configure_logging("preflight")
@@ -106,12 +111,12 @@ def _for_a_parent() -> int:
     report = preflight(lambda: _asked_for(asked), asked.get("deadline_s"))
     print(json.dumps(report.to_dict()), flush=True)
     wait_closed(_GOODBYE_S)
-    os._exit(exit_code(report))  # a policy's own threads are not waited for
+    os._exit(exit_code(report))  # without waiting for a policy's own threads
 
 
 def _asked_for(asked: Mapping[str, Any]) -> Resolved:
     changes = asked.get("changes", {})
-    if "tree" in asked:  # the station has seen to who may ask for what
+    if "tree" in asked:  # the station has already checked the permissions
         base = loader.resolve_deployment(asked["tree"], {}, "the station's deployment")
         return loader.apply_changes(base, changes, "the checkpoint")
     if "deployment" not in asked:
@@ -125,7 +130,7 @@ def _asked_for(asked: Mapping[str, Any]) -> Resolved:
 
 
 def _line() -> bytes:
-    """The first line of standard input; what comes after it stays there."""
+    """Read the first line of standard input, without consuming further input."""
     said = b""
     while not said.endswith(b"\n"):
         one = os.read(0, 1)

@@ -1,4 +1,4 @@
-"""The way of a preflight: connect, reset, ask twice, reset, each step by what a set-up uses."""
+"""Steps of a preflight: connect, reset, two requests, reset, each through the code of a set-up."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Result = TypeVar("Result")
 
 
 class TimedPolicy(Policy):
-    """A policy whose calls are counted and timed; `under_way` names the one that has not come back."""
+    """Policy wrapper that counts and times calls; `current_call` names the call that has not returned."""
 
     def __init__(self, policy: Policy, clock: Clock) -> None:
         self._policy = policy
@@ -46,23 +46,23 @@ class TimedPolicy(Policy):
         self.info: PolicyInfo | None = None
 
     def connect(self) -> PolicyInfo:
-        """As the policy's."""
+        """Call the policy's `connect`."""
         self.info = self._call("connect", self._policy.connect)
         return self.info
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """As the policy's."""
+        """Call the policy's `infer`."""
         note = (
             "" if any(call.name == "infer" for call in self.calls) else "the first: it may compile the model"
         )
         return self._call("infer", lambda: self._policy.infer(observation, conditioning), note)
 
     def reset(self) -> None:
-        """As the policy's."""
+        """Call the policy's `reset`."""
         self._call("reset", self._policy.reset)
 
     def close(self) -> None:
-        """As the policy's."""
+        """Call the policy's `close`."""
         self._policy.close()
 
     def _call(self, name: str, call: Callable[[], Result], note: str = "") -> Result:
@@ -78,7 +78,7 @@ class TimedPolicy(Policy):
 
 
 class PreflightRunner:
-    """One preflight of one plan; `run` once. It has no transport: no action can go anywhere."""
+    """One preflight of one station spec; call `run` once. It has no transport, so no action can reach a robot."""
 
     def __init__(self, spec: StationSpec, clock: Clock | None = None) -> None:
         self._plan = spec
@@ -87,13 +87,13 @@ class PreflightRunner:
         self._policy: TimedPolicy | None = None
         self._answered: PolicyResponse | None = None
         self._notes: list[str] = []
-        self._loading: float | None = None  # since when the compiler of kinematics has been at work
-        self._loaded = 0.0  # how long it was [s]
+        self._loading: float | None = None  # start of the present compilation of kinematics
+        self._loaded = 0.0  # total duration of compilation [s]
 
     def run(self, deadline: float) -> Report:
-        """Everything within `deadline` seconds; what has not come back by then is cut off, and is a timeout.
+        """Run all steps within `deadline` [s]; unfinished steps are cut off and reported as a timeout.
 
-        Time in which kinematics are compiled here does not count: it says nothing of the policy.
+        Time in which kinematics are compiled does not count, because it does not depend on the policy.
         """
         ended: list[RuntimeFault | BaseException | None] = []
         way = threading.Thread(target=lambda: ended.append(self._outcome()), name="preflight", daemon=True)
@@ -112,7 +112,7 @@ class PreflightRunner:
 
     @property
     def _call(self) -> str:
-        """Call under way, or the last: "connect" until the policy is asked, "" after an answer came back."""
+        """Present or last call: "connect" until the first request, "" after a response."""
         policy = self._policy
         if policy is None:
             return ""
@@ -128,7 +128,7 @@ class PreflightRunner:
     def _outcome(self) -> BaseException | None:
         try:
             self._run_steps()
-        except BaseException as error:  # for the thread that waits for us, whatever it is
+        except BaseException as error:  # any exception, for the waiting thread
             return error
         finally:
             if self._policy is not None:
@@ -146,11 +146,13 @@ class PreflightRunner:
         kinematics = LazyKinematics(ChainForward(spec.robot), self._kinematics, runner.run_in_background)
         spaces, subject = ActionSpaces(spec.robot, kinematics, spec.rate), VirtualRobot(spec, self._clock)
         asking = PolicyRequests(policy, spec.deployment.task, spaces, subject, runner, self._clock)
-        for _ in range(2):  # the first resets before it asks
+        for _ in range(2):  # the first request resets before
             answered = self._answered = asking.send(k_max=strategy.parameters.k_max).result()
         asking.log_ik_problems(answered)
         self._notes += [note.text for note in asking.notes]
-        runner.submit(policy.reset).result()  # what it was shown was no robot: nobody shall go on from it
+        runner.submit(
+            policy.reset
+        ).result()  # the observations were of no robot, so their state must not be continued
 
     def _kinematics(self) -> Kinematics:
         self._loading = begun = self._clock.now()
@@ -213,7 +215,7 @@ class PreflightRunner:
 
     @property
     def _latency(self) -> float:
-        """Of the last answer [ms]."""
+        """Duration of the last request [ms]."""
         return [call.ms for call in self._policy.calls if call.name == "infer"][-1] if self._policy else 0.0
 
     def _chunk(self, answered: PolicyResponse) -> Chunk:
@@ -259,7 +261,7 @@ class PreflightRunner:
         return made
 
     def _rtc_remarks(self) -> list[str]:
-        """Where a strategy continues the model's own rows: what they are relative to decides whether it can."""
+        """Return remarks on a strategy that continues the model's own rows: that needs absolute rows."""
         chunk = self._answered.chunk if self._answered else None
         if chunk is None or chunk.model_actions is None or not strategy_of(self._plan).query.uses_rtc:
             return []

@@ -1,4 +1,4 @@
-"""Findings of a preflight, for programs and for people."""
+"""Report of a preflight, for programs and people."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 
 from runtime.preflight.verdict import PreflightStage, PreflightVerdict
 
-_LONGEST_TEXT, _LONGEST_LIST, _DEEPEST = 300, 40, 6  # of what a server says of itself
+_LONGEST_TEXT, _LONGEST_LIST, _DEEPEST = 300, 40, 6  # limits of a server's metadata
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call to the policy: connect, reset or infer, how long it took [ms], whether it came back well."""
+    """One call to the policy (connect, reset or infer), its duration [ms], and whether it succeeded."""
 
     name: str
     ms: float
@@ -26,10 +26,11 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """The last answer: rows and numbers per row as the server gave them, at `rate` [Hz], `seconds` of motion.
+    """Last response: `rows` of `width` values as the server sent them, at `rate` [Hz], `seconds` of motion.
 
-    `command_rows` of `joints` numbers at the control rate is what they became. `first_away` [rad] is how far the first
-    one is from the robot's pose, by the joint `first_joint`; `beyond_limits` how many rows leave the joint limits.
+    `command_rows` of `joints` values at the control rate are its conversion. `first_away` [rad] is the distance of
+    the first one from the robot's pose, at the joint `first_joint`; `beyond_limits` is the number of rows that leave
+    the joint limits.
     """
 
     rows: int
@@ -47,10 +48,10 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Verdict, its stage, and everything that was measured until then.
+    """Verdict, its stage, and all measurements until then.
 
-    `endpoint` is the policy's address, "" for one without a server; `name` is what it calls itself. `metadata` are as
-    a page can show them: long values are cut. `notes` are sentences about what works and is worth knowing.
+    `endpoint` is the policy's address, "" for a policy without a server; `name` is the server's own name. `metadata`
+    is cut to a length that a page can show. `notes` are remarks that do not prevent a set-up.
     """
 
     verdict: PreflightVerdict
@@ -71,17 +72,17 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """True if a set-up could go on from here."""
+        """True if a set-up could continue."""
         return self.verdict is PreflightVerdict.OK
 
     @property
     def warm_up_ms(self) -> float | None:
-        """Duration of the first answer [ms], which may compile a model."""
+        """Duration of the first response [ms], which may include compiling a model."""
         return self._inferred(0)
 
     @property
     def latency_ms(self) -> float | None:
-        """Duration of the second answer [ms]: what a run can expect."""
+        """Duration of the second response [ms], as expected in a run."""
         return self._inferred(1)
 
     def _inferred(self, number: int) -> float | None:
@@ -89,7 +90,7 @@ class Report:
         return answers[number] if number < len(answers) else None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON may carry it."""
+        """Return the report in the form of JSON."""
         told = asdict(self)
         return {
             **told,
@@ -104,7 +105,7 @@ class Report:
         }
 
     def lines(self) -> list[str]:
-        """For a terminal."""
+        """Return the report as lines for a terminal."""
         made = [f"{self.verdict}  at {self.stage}", self.sentence]
         made += [self.advice] if self.advice else []
         made += [f"policy    {self._policy()}"] if self.kind else []
@@ -118,7 +119,7 @@ class Report:
 
 
 def chunk_summary(chunk: Chunk) -> str:
-    """The chunk in a line."""
+    """Return the chunk in one line."""
     return (
         f"[{chunk.rows}, {chunk.width}] {chunk.mode} {chunk.space} at {chunk.rate:g} Hz, {chunk.seconds:.2f} s; "
         f"{chunk.command_rows} rows of {chunk.joints} joints at the control rate"
@@ -126,7 +127,7 @@ def chunk_summary(chunk: Chunk) -> str:
 
 
 def truncate_value(value: Any, depth: int = 0) -> Any:
-    """Value from a server as JSON may carry it and a person may read it: cut where it is long or deep."""
+    """Return a server's value in a form for JSON and people: long or deeply nested parts are cut."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int):

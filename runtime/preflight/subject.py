@@ -1,4 +1,4 @@
-"""A robot that is not there: it stands at its pose and sees grey."""
+"""Virtual robot for a preflight: at rest, with grey pictures."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from runtime.core.clock import Clock
 from runtime.core.types import Float64, Observation, UInt8
 from runtime.station.spec import StationSpec
 
-_HEIGHT, _WIDTH = 480, 640  # of cameras for which the deployment says no size
-_GREY, _GRAIN = 128, 12  # noise: what a camera sees in the dark is never all the same
+_HEIGHT, _WIDTH = 480, 640  # default size of pictures [pixels]
+_GREY, _GRAIN = 128, 12  # noise, because a real camera's picture is never uniform
 
 
 class VirtualRobot:
-    """Shows a policy the robot of a plan at rest in the pose of its set-up, with pictures of grey noise.
+    """Observation provider without a robot: at rest in the set-up pose, with grey-noise pictures.
 
-    Every observation is new, of this moment. It measures no poses: those of its joints are taken.
+    Every observation has new time stamps. It measures no poses, so poses are computed from the joints.
     """
 
     simulated = False
@@ -28,7 +28,7 @@ class VirtualRobot:
         self._pictures = noise_images(spec)
 
     def latest(self, prompt: str, pictures: bool = True) -> Observation:
-        """The robot now."""
+        """Return the observation of this moment."""
         self._number += 1
         robot, now = self._plan.robot, self._clock.now()
         streams = ("joints", *self._pictures)
@@ -45,15 +45,15 @@ class VirtualRobot:
         )
 
     def use_simulated(self, simulated: bool) -> None:
-        """The same robot: it stands for either."""
+        """Do nothing: the virtual robot replaces the real and the simulated one."""
 
     def commanded(self) -> tuple[int, Float64] | None:
-        """It was never told anything."""
+        """Return None: there was no command."""
         return None
 
 
 def noise_images(spec: StationSpec) -> dict[str, UInt8]:
-    """Grey noise [H, W, 3] for each camera of the deployment, in the size that it says, the same on every call."""
+    """Return grey noise [H, W, 3] for each camera of the deployment, in its size; the same at every call."""
     noise = np.random.default_rng(0)
     made: dict[str, UInt8] = {}
     for key in spec.cameras:

@@ -1,4 +1,4 @@
-"""Ends of a preflight: how far it came, what it found, what to do about it."""
+"""Results of a preflight: stage, verdict and advice."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from runtime.core.errors import (
 class PreflightStage(StrEnum):
     """Stages of a preflight, in this order."""
 
-    RESOLVE = "resolve"  # the deployment, and that its policy fits its robot
-    CONNECT = "connect"  # somebody listens, with TLS where the address says so
-    PROTOCOL = "protocol"  # who answers there speaks the protocol, and lets us in
-    METADATA = "metadata"  # what the server says of itself agrees with the deployment
-    INFER = "infer"  # it answers
-    SHAPE = "shape"  # with rows of the right width, all finite
-    SPACE = "space"  # that become commands for this robot
+    RESOLVE = "resolve"  # deployment is valid and its policy fits its robot
+    CONNECT = "connect"  # a server listens, with TLS if the address demands it
+    PROTOCOL = "protocol"  # the server speaks the protocol and accepts us
+    METADATA = "metadata"  # the server's metadata agree with the deployment
+    INFER = "infer"  # the server responds to a request
+    SHAPE = "shape"  # rows have the right width and are finite
+    SPACE = "space"  # rows can be converted to commands for this robot
 
 
 class PreflightVerdict(StrEnum):
-    """Finding of a preflight."""
+    """Result of a preflight."""
 
     OK = "ok"
     MISCONFIGURED = "misconfigured"
@@ -57,7 +57,7 @@ class PreflightVerdict(StrEnum):
 
     @property
     def advice(self) -> str:
-        """Next step in one sentence; "" where nothing is to be done."""
+        """Next step in one sentence; "" if none is needed."""
         return _ADVICE[self]
 
 
@@ -95,7 +95,7 @@ _ADVICE = {
     PreflightVerdict.FAILED: "Read the sentence; it is none of the usual cases.",
 }
 
-# The first that fits; a subclass stands before its base.
+# The first match counts, so subclasses precede their base.
 _FOUND: tuple[tuple[type[RuntimeFault], PreflightVerdict], ...] = (
     (PortClosedError, PreflightVerdict.PORT_CLOSED),
     (UnreachableError, PreflightVerdict.UNREACHABLE),
@@ -124,12 +124,12 @@ _OF_WORDS = (PreflightVerdict.WRONG_ACTION_SPACE, PreflightVerdict.CONTRADICTION
 
 
 def verdict_of(error: RuntimeFault) -> PreflightVerdict:
-    """Verdict on an error of a policy, of its set-up or of its configuration."""
+    """Return the verdict on an error of a policy, a set-up or a configuration."""
     return next((verdict for kind, verdict in _FOUND if isinstance(error, kind)), PreflightVerdict.FAILED)
 
 
 def stage_of(verdict: PreflightVerdict, call: str) -> PreflightStage:
-    """Stage of that verdict; `call` is the policy's call that was under way, "" after the last of them."""
+    """Return the stage of a verdict; `call` is the policy's present call, "" after the last."""
     if verdict is PreflightVerdict.MISCONFIGURED:
         return PreflightStage.RESOLVE
     if call == "connect":

@@ -1,4 +1,4 @@
-"""`python -m runtime.quality EPISODE|DATASET`: says what is wrong with episodes of ours and of LeRobot datasets."""
+"""`python -m runtime.quality EPISODE|DATASET`: report faults of our episodes and of LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from runtime.quality.inspection import check_dataset_episode, check_episode
 from runtime.quality.report import Report
 from runtime.quality.settings import QualitySettings, read_settings
 
-SHOWN = 20  # flags of an episode that are printed
+SHOWN = 20  # most flags of an episode that are printed
 
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where every episode is clean, 1 where one is flagged, 2 where something cannot be judged."""
+    """Print the reports; return 0 if every episode is clean, 1 if one is flagged, 2 if one cannot be checked."""
     options = _parser().parse_args(arguments)
     clean, first = True, True
     try:

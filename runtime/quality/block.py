@@ -1,4 +1,4 @@
-"""Input of the checks: an episode's facts, and its rows in blocks, whatever it is stored as."""
+"""Input of the checks: an episode's properties, and its rows in blocks, independent of how it is stored."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from runtime.quality.report import Severity
 
 Bools = NDArray[np.bool_]
 
-BLOCK_ROWS = 64  # at most, in a block
+BLOCK_ROWS = 64  # largest number of rows of a block
 
 
 @dataclass(frozen=True, slots=True)
 class Vector:
-    """Facts about a column of vectors that are known before it is read.
+    """Properties of a column of vectors that are known before it is read.
 
-    `role` is its use by the checks: "state" and "action" are joints, "poses" 8 numbers per arm (x, y, z,
-    quaternion w, x, y, z, gripper), "other" anything else. `sparse` columns may be missing in any row.
+    `role` is its use by the checks: "state" and "action" are joints, "poses" 8 values per arm (x, y, z, quaternion w,
+    x, y, z, gripper), "other" anything else. `sparse` columns may be missing in any row.
     """
 
     width: int
@@ -35,7 +35,7 @@ class Vector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VectorColumn:
-    """A column of vectors in a block: `values` float32 [N, W], zeros where a row is `missing` or `malformed`."""
+    """Column of vectors in a block: `values` float32 [N, W], zeros in rows that are `missing` or `malformed`."""
 
     values: Float32
     missing: Bools
@@ -44,23 +44,21 @@ class VectorColumn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Consecutive rows from `first` on; an absent column is an absent key."""
+    """Consecutive rows from `first` on; absent columns have no key."""
 
     first: int
     rows: int
-    index: NDArray[np.int64] | None  # as numbered in the file
-    clocks: Mapping[str, Float64]  # [N] s: each has to increase
+    index: NDArray[np.int64] | None  # row numbers in the file
+    clocks: Mapping[str, Float64]  # by clock [N] [s]; each must increase
     vectors: Mapping[str, VectorColumn]
-    captured: Mapping[str, Float64] = field(default_factory=dict)  # by stream [N] s, NaN unknown
-    repeated: Mapping[str, Bools] = field(default_factory=dict)  # by camera
-    lost: Mapping[str, Bools] = field(
-        default_factory=dict
-    )  # by camera: it gave a picture, its video has none
+    captured: Mapping[str, Float64] = field(default_factory=dict)  # by stream [N] [s], NaN if unknown
+    repeated: Mapping[str, Bools] = field(default_factory=dict)  # by camera [N]
+    lost: Mapping[str, Bools] = field(default_factory=dict)  # by camera [N]: picture missing in the video
     simulated: Bools | None = None  # rows whose action moved a simulated robot
 
 
 class VideoEnd(NamedTuple):
-    """The row from which on a camera has no video, and why."""
+    """First row without a video frame of a camera, and the reason."""
 
     row: int
     reason: str
@@ -68,44 +66,44 @@ class VideoEnd(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointSpecs:
-    """Facts about the robot's numbers [D]; limits and velocities are NaN where they are not known."""
+    """Properties of the robot's dimensions [D]; limits and velocities are NaN if unknown."""
 
     names: tuple[str, ...]
-    groups: tuple[str, ...]  # of each number
+    groups: tuple[str, ...]  # group of each dimension
     grippers: Bools
-    bases: Bools  # speeds, no places
+    bases: Bools  # dimensions that are speeds, not positions
     lower: Float64
     upper: Float64
     velocity: Float64
 
     @property
     def position_mask(self) -> Bools:
-        """Those that are places of joints: neither grippers nor speeds."""
+        """Dimensions that are positions of joints: neither grippers nor speeds."""
         return ~(self.grippers | self.bases)
 
 
 class EpisodeSource(ABC):
-    """One episode as it lies on disk. What is damaged beyond its rows is a RecordingError of `blocks`."""
+    """One episode as it is stored. Damage beyond its rows is raised as RecordingError by `blocks`."""
 
     name: str
     fps: float
-    frames: int | None  # rows that were promised; None where nobody did
-    started: str  # the clock among `Block.clocks` that ages and gaps are measured on, "" for none
+    frames: int | None  # expected number of rows; None if it is unknown
+    started: str  # clock in `Block.clocks` from which ages and gaps are measured, "" for none
     vectors: Mapping[str, Vector]
-    cameras: Mapping[str, tuple[int, int] | None]  # (height, width) as declared, by camera
-    ends: Mapping[str, VideoEnd]  # of the videos that were lost, by camera
-    schema: Mapping[str, Any]  # of a collection: may hold max_skew_s, min_length_s
-    remarks: Sequence[tuple[str, Severity, str]]  # kind, severity and sentence of what its documents say
-    drawn: bool = False  # its pictures are those of a simulated bench
+    cameras: Mapping[str, tuple[int, int] | None]  # declared (height, width) by camera
+    ends: Mapping[str, VideoEnd]  # by camera, of videos that were lost
+    schema: Mapping[str, Any]  # a collection's requirements: may contain max_skew_s, min_length_s
+    remarks: Sequence[tuple[str, Severity, str]]  # kind, severity and sentence of findings in its documents
+    drawn: bool = False  # whether its pictures are rendered by a simulated bench
 
     @abstractmethod
     def blocks(self) -> Iterator[Block]:
-        """The rows, in order; raises RecordingError where they cannot be read on."""
+        """Yield the rows in order. Raises RecordingError if they cannot be read further."""
 
     @abstractmethod
     def open_frames(self, camera: str, sampling: int) -> FrameStream:
-        """The pictures of one camera; raises RecordingError where they cannot be opened."""
+        """Open the pictures of one camera. Raises RecordingError if that fails."""
 
     @abstractmethod
     def joints(self) -> tuple[JointSpecs | None, str]:
-        """The robot's numbers, and why their limits are not known, "" where they are; None: no state or action."""
+        """Return the robot's dimensions (None without state or action), and why limits are unknown ("" if known)."""

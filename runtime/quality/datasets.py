@@ -1,4 +1,4 @@
-"""Episodes of LeRobot datasets as a source of checks, ours and those of others."""
+"""Episodes of LeRobot datasets, our own and third-party ones, as a source of the checks."""
 
 from __future__ import annotations
 
@@ -22,18 +22,22 @@ from runtime.quality.block import BLOCK_ROWS, Block, Bools, EpisodeSource, Joint
 from runtime.quality.joints import known_joints, unknown_joints
 from runtime.quality.luma import FrameStream, StoredFrameStream, VideoFrameStream
 
-STATES = ("observation.state", "observation.qpos")  # the first that there is
+STATES = ("observation.state", "observation.qpos")  # names of the state column, in order of preference
 ACTION = "action"
 CAPTURE, REPEATED, LOST = "capture_time.", "repeated.", "lost."
-_POSES = ("eef_state", "eef_action")  # ours: of others nobody knows what stands for an orientation
-_SPARSE = ("joint_velocity", "joint_effort")  # NaN in a row where the robot gave none
+_POSES = (
+    "eef_state",
+    "eef_action",
+)  # our columns; in other datasets the representation of orientations is unknown
+_SPARSE = ("joint_velocity", "joint_effort")  # NaN in a row without a measurement
 _INDEX = "frame_index"
 
 
 class DatasetSource(EpisodeSource):
-    """Episode `index` of a dataset; `state` names the column of measured joints, the usual ones where it is "".
+    """Episode `index` of a dataset.
 
-    `robot` is whose joints these are, in its order; "" where only the dataset knows.
+    `state` names the column of measured joints, "" for the usual ones. `robot` is the robot of these joints, in its
+    order; "" if only the dataset knows it.
     """
 
     def __init__(self, dataset: Dataset, index: int, state: str = "", robot: str = "") -> None:
@@ -49,7 +53,7 @@ class DatasetSource(EpisodeSource):
         self.fps = dataset.fps
         self.frames = self._entry.length
         self.remarks = ()
-        self.ends = {}  # an episode whose video was lost is never published
+        self.ends = {}  # episodes with a lost video are never published
         self.schema: Mapping[str, Any] = {}
         self._keys = self._cameras()
         self.cameras = {camera: self._size(key) for camera, key in self._keys.items()}
@@ -57,7 +61,10 @@ class DatasetSource(EpisodeSource):
         self.started = "tick_time" if "tick_time" in self._features else ""
 
     def _found(self, state: str) -> str:
-        """The column of measured joints, "" where there is none; RecordingError where the one asked for is not."""
+        """Return the column of measured joints, "" without one.
+
+        Raises RecordingError if `state` is given and absent.
+        """
         if state and not (state in self._features and self._is_vector(state)):
             vectors = [name for name in self._features if self._is_vector(name)]
             raise RecordingError(
@@ -85,14 +92,14 @@ class DatasetSource(EpisodeSource):
         return Vector(width, told, role, name in _SPARSE)
 
     def _cameras(self) -> dict[str, str]:
-        """The feature of each camera's pictures, by the camera's key."""
+        """Return the picture feature of each camera, by camera key."""
         stored = [*layout.video_keys(self._features), *layout.image_keys(self._features)]
         return {key.removeprefix(video_key("")): key for key in stored}
 
     def _size(self, key: str) -> tuple[int, int] | None:
         try:
             return picture_size(self._features[key])[:2]
-        except RecordingError:  # it is not said
+        except RecordingError:  # the size is not declared
             return None
 
     def blocks(self) -> Iterator[Block]:
@@ -177,7 +184,7 @@ class DatasetSource(EpisodeSource):
 
 
 def _marks(columns: Mapping[str, Float64], prefix: str) -> dict[str, Bools]:
-    """Truths by camera, out of the columns of that prefix."""
+    """Return flags by camera from the columns with that prefix."""
     return {
         name.removeprefix(prefix): values == 1.0
         for name, values in columns.items()
@@ -186,21 +193,21 @@ def _marks(columns: Mapping[str, Float64], prefix: str) -> dict[str, Bools]:
 
 
 def _names(given: Any) -> tuple[str, ...]:
-    """The names of a feature's numbers, as a list or in a table of one."""
+    """Return the names of a feature's dimensions, from a list or a table with one list."""
     if isinstance(given, Mapping):
         given = next((value for value in given.values() if isinstance(value, list)), [])
     return tuple(map(str, given)) if isinstance(given, list) else ()
 
 
 def _scalars(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Numbers as float64 [N], also out of lists of one; NaN where there is none."""
+    """Return numbers as float64 [N], also from lists of length one; NaN for missing values."""
     while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
         column = pa.array([None if one is None or len(one) != 1 else one[0] for one in column.to_pylist()])
     return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64)
 
 
 def _lists(column: Any, vector: Vector) -> VectorColumn:
-    """Lists as float32 [N, W]; rows of another width are malformed and 0."""
+    """Return lists as float32 [N, W]; rows of another width are malformed and 0."""
     rows = len(column)
     missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
     values = np.zeros((rows, vector.width), np.float32)

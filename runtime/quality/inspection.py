@@ -1,4 +1,4 @@
-"""Looks an episode through: rows and pictures once, in step with each other, in memory that does not grow with it."""
+"""Checks of an episode: rows and pictures are read once, in step with each other, in constant memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from runtime.quality.values import ValueCheck
 
 
 def check_episode(folder: Path, settings: QualitySettings | None = None) -> Report:
-    """The report on the episode in a folder of ours; damage is a flag, RecordingError where there is no manifest."""
+    """Check the episode in one of our folders. Damage is a flag; raises RecordingError without a readable manifest."""
     return run_checks(JournalSource(folder), settings or QualitySettings())
 
 
@@ -33,13 +33,13 @@ def check_dataset_episode(
     state: str = "",
     robot: str = "",
 ) -> Report:
-    """The report on episode `index` of a LeRobot dataset; RecordingError where the dataset has no such episode."""
+    """Check episode `index` of a LeRobot dataset. Raises RecordingError if the dataset has no such episode."""
     opened = open_dataset(dataset) if isinstance(dataset, Path) else dataset
     return run_checks(DatasetSource(opened, index, state, robot), settings or QualitySettings())
 
 
 def run_checks(source: EpisodeSource, settings: QualitySettings) -> Report:
-    """All checks of one episode, wherever it comes from."""
+    """Run all checks on one episode from any source."""
     flags = FlagCollector(settings.most_flags)
     for kind, severity, sentence in source.remarks:
         flags.add(Flag(kind, severity, -1, -1, "", sentence))

@@ -1,4 +1,4 @@
-"""The robot's numbers as checks need them: groups, grippers, limits, where the description is there to tell."""
+"""The robot's dimensions for the checks: groups, grippers and limits, if its description is available."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import robots
 from robots import RobotError
 from runtime.quality.block import JointSpecs
 
-GRIPPER = "gripper"  # what such a number is called where no description says so
+GRIPPER = "gripper"  # part of a gripper's name, if no description identifies it
 _UNKNOWN = np.nan
 
 
 def known_joints(robot: str, names: Sequence[str]) -> JointSpecs:
-    """The numbers of a robot that is described here; RobotError where it is not, or its numbers have other names."""
+    """Return the dimensions of a described robot.
+
+    Raises RobotError if it is unknown or its dimensions have other names.
+    """
     described = robots.load_robot(robot, groups_of(names))
     if list(described.joint_names) != list(names):
         raise RobotError(f"{robot} has other numbers today: {', '.join(described.joint_names)}")
@@ -30,7 +33,7 @@ def known_joints(robot: str, names: Sequence[str]) -> JointSpecs:
 
 
 def unknown_joints(names: Sequence[str]) -> JointSpecs:
-    """Numbers of which only the names are known."""
+    """Return dimensions of which only the names are known."""
     unknown = np.full(len(names), _UNKNOWN)
     gripping = np.array([GRIPPER in name.lower() for name in names], np.bool_)
     groups = tuple(name.partition(".")[0] for name in names)
@@ -40,5 +43,5 @@ def unknown_joints(names: Sequence[str]) -> JointSpecs:
 
 
 def groups_of(names: Sequence[str]) -> list[str]:
-    """The groups that names as GROUP.JOINT are of, each once, in their order."""
+    """Return the groups of names in the form GROUP.JOINT, each once, in their order."""
     return list(dict.fromkeys(name.partition(".")[0] for name in names))

@@ -1,4 +1,4 @@
-"""Our own episodes as a source of checks; rows are read batch by batch, as they were written."""
+"""Our own episodes as a source of the checks; rows are read batch by batch."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from runtime.recording.sealing import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
 
 _ROLES = {"qpos": "state", "action": "action", "eef": "poses", "eef_action": "poses"}
-_SPARSE = ("qvel", "effort")  # of robots that give them now and then
+_SPARSE = ("qvel", "effort")  # columns that some robots fill only in some rows
 
 
 class JournalSource(EpisodeSource):
-    """The episode in a folder DATA/episodes/UUID; raises RecordingError where its manifest cannot be read."""
+    """Episode in a folder DATA/episodes/UUID. Raises RecordingError if its manifest cannot be read."""
 
     started = "tick_time"
 
@@ -54,7 +54,7 @@ class JournalSource(EpisodeSource):
         self.vectors = {name: self._vector(name) for name in ("qpos", "action", *self._layout.streams)}
 
     def _outcome(self) -> tuple[int | None, list[tuple[str, Severity, str]]]:
-        """Expected count of rows, and findings on how the recording ended."""
+        """Return the expected number of rows, and findings about the end of the recording."""
         path = self._folder / OUTCOME
         if not path.exists():
             return None, [("unfinished", "error", "it has no outcome: it is being recorded, or wants repair")]
@@ -63,7 +63,7 @@ class JournalSource(EpisodeSource):
         except RecordingError as error:
             return None, [("unfinished", "error", str(error))]
         remarks: list[tuple[str, Severity, str]] = []
-        if DIGESTS in outcome:  # else what cannot be read is found below
+        if DIGESTS in outcome:  # without digests, unreadable files are found later
             remarks += [("damaged", "error", damage.text) for damage in verify_episode(self._folder).damage]
         status, reason = outcome.get("status"), outcome.get("reason", "")
         if status == "failed":
@@ -156,7 +156,7 @@ class JournalSource(EpisodeSource):
 
 
 def fixed(column: Any, width: int) -> VectorColumn:
-    """A column of lists of one width as arrays; null rows are missing."""
+    """Return a column of lists of equal length as arrays; null rows are missing."""
     missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
     values = np.zeros((len(column), width), np.float32)
     values[~missing] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
@@ -164,12 +164,12 @@ def fixed(column: Any, width: int) -> VectorColumn:
 
 
 def numbers(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """A column of numbers as float64 [N], NaN where it is null."""
+    """Return a column of numbers as float64 [N], NaN for null."""
     return np.asarray(column.to_numpy(zero_copy_only=False), np.float64)
 
 
 def marks(batch: Any, name: str) -> Bools:
-    """A column of truths [N]."""
+    """Return a column of flags [N]."""
     return np.asarray(batch.column(name).fill_null(False).to_numpy(zero_copy_only=False), np.bool_)
 
 
@@ -183,7 +183,7 @@ def _next(batches: Any, path: Path, frames: int | None, first: int) -> Any:
 
 
 def _require(path: Path, given: Any, expected: Any) -> None:
-    """Every column that the manifest promises is there, and is what it says."""
+    """Check that each column of the manifest exists with its declared type. Raises RecordingError."""
     strange = [
         f"{field.name} is {given.field(field.name).type if field.name in given.names else 'absent'}, "
         f"must be {field.type}"

@@ -1,4 +1,4 @@
-"""Pictures that a camera gave and its video does not have: of some rows, or of all from one on."""
+"""Check for pictures that are missing in a camera's video: in some rows, or from one row on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from runtime.quality.settings import QualitySettings
 
 
 class LostFrames:
-    """Losses of one camera; rows beyond the end of its video are one flag."""
+    """Missing pictures of one camera; rows after the end of its video are one flag."""
 
     def __init__(
         self, camera: str, fps: float, settings: QualitySettings, flags: FlagCollector, end: VideoEnd | None
@@ -23,15 +23,15 @@ class LostFrames:
         self._runs = RunCollector(self._lost)
 
     def add(self, first: int, lost: Bools) -> None:
-        """The rows from `first` on whose picture is not in the video."""
+        """Add rows from `first` on; `lost` marks those whose picture is missing in the video."""
         self._runs.add(first, lost & ~self.past_end(first, len(lost)))
 
     def past_end(self, first: int, rows: int) -> Bools:
-        """Which of these rows [N] are past the end of the video."""
+        """Return which of these rows [N] are past the end of the video."""
         return np.arange(first, first + rows) >= (np.inf if self._end is None else self._end.row)
 
     def close(self, rows: int) -> None:
-        """The episode has ended with so many rows."""
+        """End the check; the episode has `rows` rows."""
         self._runs.close()
         if self._end is None:
             return

@@ -1,4 +1,4 @@
-"""Brightness of every picture of a video at low cost: decoded in order, of each every n-th pixel is looked at."""
+"""Brightness of every picture of a video at low cost: decoded in order, sampled at every n-th pixel."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.core.picture_bounds import open_video
 from runtime.core.types import Float32
 from runtime.datasets.pictures import ImageSequence, VideoSegment
 
-# Where the first plane is brightness, 8 bits a pixel; others are converted, which costs twice the time.
+# Formats whose first plane is brightness with 8 bits per pixel; others are converted, which takes twice as long.
 _PLANAR = frozenset({"yuv420p", "yuvj420p", "yuv422p", "yuvj422p", "yuv444p", "yuvj444p", "nv12", "gray"})
 _FULL = frozenset({"yuvj420p", "yuvj422p", "yuvj444p", "gray"})
 _JPEG = 2  # AVCOL_RANGE_JPEG
@@ -23,29 +23,32 @@ _JPEG = 2  # AVCOL_RANGE_JPEG
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LumaFrame:
-    """One picture: brightness float32 [h, w], 0 to 255; its full size; whether it is coded by itself; its time [s]."""
+    """Brightness of one picture.
+
+    `luma` is float32 [h, w] from 0 to 255, `height` and `width` are the full size, `key` is True for a key frame.
+    """
 
     luma: Float32
     height: int
     width: int
     key: bool
-    time: float | None  # since the episode's first picture should be shown; None where pictures have no times
+    time: float | None  # [s] since the episode's first picture is due; None if pictures have no times
 
 
 class FrameStream(Protocol):
-    """The pictures of an episode by one camera, each once and in order."""
+    """Pictures of one camera in an episode, each once and in order."""
 
     def __iter__(self) -> Iterator[LumaFrame]:
-        """Raises RecordingError at the picture that cannot be decoded."""
+        """Yield the pictures. Raises RecordingError at a picture that cannot be decoded."""
         ...
 
     def close(self) -> None:
-        """Release the file; safe to call twice."""
+        """Release the file. Safe to call twice."""
         ...
 
 
 class VideoFrameStream:
-    """The pictures of a video, or of a stretch of one."""
+    """Pictures of a video, or of a segment of one."""
 
     def __init__(self, path: Path, sampling: int, stretch: VideoSegment | None = None) -> None:
         if not path.is_file():
@@ -63,7 +66,7 @@ class VideoFrameStream:
 
     def __iter__(self) -> Iterator[LumaFrame]:
         stream = self._container.streams.video[0]
-        stream.thread_type = "NONE"  # whoever checks does so beside a robot
+        stream.thread_type = "NONE"  # checks may run on a machine that controls a robot
         start, end = 0.0, float("inf")
         number = 0
         try:
@@ -100,7 +103,7 @@ class VideoFrameStream:
 
 
 class StoredFrameStream:
-    """Pictures that are stored one by one; each is coded by itself."""
+    """Pictures that are stored individually; each counts as a key frame."""
 
     def __init__(self, pictures: ImageSequence, sampling: int) -> None:
         self._pictures = pictures

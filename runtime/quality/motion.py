@@ -1,4 +1,4 @@
-"""Checks of motion: standing at the start and the end, joints at their limits, and joints that do not follow."""
+"""Checks of motion: idle time at start and end, joints at their limits, joints that do not follow commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.quality.settings import QualitySettings
 
 
 class MotionCheck:
-    """Judges what the state and the action say of the robot, block by block; `add` says in which rows it moves."""
+    """Check of state and action, block by block; `add` returns in which rows the robot moves."""
 
     def __init__(
         self, source: EpisodeSource, joints: JointSpecs, settings: QualitySettings, flags: FlagCollector
@@ -40,7 +40,9 @@ class MotionCheck:
             for group in dict.fromkeys(joints.groups)
         }
         ranges = joints.upper - joints.lower
-        self._away = np.zeros(len(joints.names), np.bool_)  # whether it was commanded off its limits yet
+        self._away = np.zeros(
+            len(joints.names), np.bool_
+        )  # whether a joint has been commanded away from its limits
         self._margin = np.where(np.isfinite(ranges), ranges, np.nan) * settings.limit_margin
         self._at_limit = [RunCollector(self._saturated(dim)) for dim in range(len(joints.names))]
         self._outside = [RunCollector(self._beyond(dim)) for dim in range(len(joints.names))]
@@ -50,12 +52,12 @@ class MotionCheck:
 
     @property
     def lag_s(self) -> float | None:
-        """By how much the state follows the action [s]; None where that cannot be told."""
+        """Delay of the state after the action [s]; None if it cannot be determined."""
         lag = self._following.lag
         return None if lag is None else lag / self._fps
 
     def add(self, block: Block) -> Bools:
-        """Judge the next rows; whether the robot moves in each."""
+        """Check the next rows; return in which of them the robot moves [N]."""
         state = _usable(block, self._state)
         moving = self._moving(state)
         some: Bools = np.asarray(moving.any(axis=1))
@@ -78,7 +80,7 @@ class MotionCheck:
         return some
 
     def _moving(self, state: Float32) -> Bools:
-        """Which numbers [N, D] are elsewhere than `lag` rows before, or than at the start where it is nearer."""
+        """Return which dimensions [N, D] differ from `lag` rows before, or from the start if that is nearer."""
         rows = np.concatenate([self._past, state])
         places = np.arange(len(self._past), len(rows))
         before = np.maximum(places - self._lag, 0)
@@ -91,7 +93,7 @@ class MotionCheck:
     def _limits(self, first: int, action: Float32, moving: Bools) -> None:
         joints = self._joints
         near = (action <= joints.lower + self._margin) | (action >= joints.upper - self._margin)
-        # A joint that has rested at its limit from the start is where it belongs.
+        # A joint that has been at its limit since the start belongs there.
         came = np.logical_or.accumulate(np.concatenate([self._away[None], np.isfinite(action) & ~near]))
         self._away = came[-1]
         near &= came[1:]
@@ -108,7 +110,7 @@ class MotionCheck:
             self._outside[dim].add(first, marked, np.nan_to_num(excess[:, dim]))
 
     def close(self) -> None:
-        """The episode has ended."""
+        """End the checks."""
         for runs in (*self._at_limit, *self._outside):
             runs.close()
         self._following.close()
@@ -121,7 +123,7 @@ class MotionCheck:
             text = f"{frame_range(0, last)}: the robot never moves"
             self._flags.add(Flag("idle", "error", 0, last, self._state, text, self._rows / self._fps, None))
             return
-        # Motion is seen as soon as the robot is elsewhere, at most the lag after it began.
+        # Motion is detected as soon as positions differ, at most the lag after it began.
         head, tail = self._first_motion, last - self._last_motion
         for kind, frames, first, bound, what in (
             ("idle_head", head, 0, self._settings.idle_head_s, "before it moves"),
@@ -160,7 +162,7 @@ class MotionCheck:
 
 
 class _TrackingDelay:
-    """Nearness of each joint to its command within `wait` rows, and the delay in rows where it is nearest."""
+    """Error between action and measured state for delays of 0 to `wait` rows, and the delay at which it is smallest."""
 
     def __init__(
         self, wait: int, joints: JointSpecs, settings: QualitySettings, flags: FlagCollector, stream: str
@@ -171,7 +173,7 @@ class _TrackingDelay:
         self._flags = flags
         self._stream = stream
         self._judged = joints.position_mask
-        self._actions = np.empty((0, len(joints.names)), np.float32)  # rows whose time is not over
+        self._actions = np.empty((0, len(joints.names)), np.float32)  # rows whose waiting time has not passed
         self._states = np.empty((0, len(joints.names)), np.float32)
         self._runs = RunCollector(self._ended, apart=self._wait)
         self._worst: dict[int, int] = {}
@@ -181,14 +183,14 @@ class _TrackingDelay:
 
     @property
     def lag(self) -> int | None:
-        """The delay [rows] at which state and action are nearest; None where nothing moved, or nothing was judged."""
+        """Delay at which state and action are nearest [rows]; None if nothing moved or nothing was checked."""
         return int(np.argmin(self._sums)) if self._counted and self._moved else None
 
     def add(self, first: int, action: Float32, state: Float32) -> None:
         pending = len(self._actions)
         actions = np.concatenate([self._actions, action])
         states = np.concatenate([self._states, state])
-        whole = len(actions) - self._wait
+        whole = len(actions) - self._wait  # the last rows lack later states: checked with the next block
         if whole <= 0:
             self._actions, self._states = actions, states
             return
@@ -231,14 +233,14 @@ class _TrackingDelay:
 
 
 def _usable(block: Block, name: str) -> Float32:
-    """The column, NaN where a number is not known."""
+    """Return the column, NaN for unknown values."""
     numbers = block.vectors[name]
     known = ~(numbers.missing | numbers.malformed)
     return np.where(known[:, None] & np.isfinite(numbers.values), numbers.values, np.nan).astype(np.float32)
 
 
 def _idle_speeds(joints: JointSpecs, settings: QualitySettings) -> Float64:
-    """Changes per second [D] up to which a number stands."""
+    """Return the speeds per dimension [D] up to which it counts as idle."""
     travel = joints.upper - joints.lower
     travel = np.where(np.isfinite(travel) & (travel > 0), travel, 1.0)
     return np.where(joints.grippers, settings.idle_gripper * travel, settings.idle_speed)

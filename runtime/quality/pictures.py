@@ -1,4 +1,4 @@
-"""Checks of one camera's pictures: there, of their size, on time, neither black nor empty, and new."""
+"""Checks of one camera's pictures: present, of the declared size, on time, neither black nor uniform, and new."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from runtime.quality.luma import FrameStream, LumaFrame
 from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, Severity, frame_range
 from runtime.quality.settings import QualitySettings
 
-CHANGED = 10.0  # times `same`: a difference that only motion makes
+CHANGED = 10.0  # multiple of `same`: a change that only motion causes
 
 
 class ImageCheck:
-    """Decodes the pictures of one camera alongside its rows and judges them."""
+    """Check that decodes the pictures of one camera in step with its rows."""
 
     def __init__(
         self, source: EpisodeSource, camera: str, settings: QualitySettings, flags: FlagCollector
@@ -31,7 +31,7 @@ class ImageCheck:
         self._flags = flags
         self._film: FrameStream | None = None
         self._shots: Iterator[LumaFrame] = iter(())
-        self._shown = 0  # pictures that were taken
+        self._shown = 0  # number of pictures that were read
         self._before: Float32 | None = None
         self._repeats = _RepeatCheck(camera, self._fps, settings, flags, drawn=source.drawn)
         self._losses = LostFrames(camera, self._fps, settings, flags, end)
@@ -43,7 +43,7 @@ class ImageCheck:
         }
         self._strange: tuple[int, int] | None = None
         if end is not None and end.row == 0:
-            return  # there need not be a file
+            return  # there may be no file
         try:
             self._film = source.open_frames(camera, settings.sampling)
             self._shots = iter(self._film)
@@ -53,7 +53,7 @@ class ImageCheck:
     def add(
         self, first: int, moving: Bools, repeated: Bools | None = None, lost: Bools | None = None
     ) -> None:
-        """Judge the pictures of the next rows."""
+        """Check the pictures of the next rows."""
         rows = len(moving)
         nobody = np.zeros(rows, np.bool_)
         repeated, lost = nobody if repeated is None else repeated, nobody if lost is None else lost
@@ -103,7 +103,7 @@ class ImageCheck:
         return float(shot.luma.mean()), float(shot.luma.std()), change, off
 
     def close(self, rows: int, whole: bool) -> None:
-        """So many rows there were; `whole` where all of them could be read, so that more pictures would be too many."""
+        """End the checks; the episode has `rows` rows. `whole`: all were readable, so further pictures are surplus."""
         for runs in self._runs.values():
             runs.close()
         self._losses.close(rows)
@@ -158,11 +158,11 @@ class ImageCheck:
 
 
 class _RepeatCheck:
-    """Pictures that are the one before again: said so by the recorder, or seen so while the robot moved.
+    """Check for repeated pictures: marked by the recorder, or detected while the robot moves.
 
-    A picture that stays the same is no proof where the robot stands. One that is coded by itself after such as are
-    not differs from them also where it shows the same: it neither begins nor ends anything. A `drawn` picture is the
-    same wherever nothing moves in its sight: no camera has stopped.
+    An unchanged picture proves nothing while the robot is at rest. A key frame after other frames differs from them
+    even if the scene is unchanged: it neither begins nor ends a run. A `drawn` picture is unchanged whenever nothing
+    moves in its view, so it is not checked.
     """
 
     def __init__(
@@ -177,8 +177,8 @@ class _RepeatCheck:
         self._spans = {"repeated": [-1, -1], "skipped": [-1, -1]}
         self._said = RunCollector(self._no_new)
         self._seen = RunCollector(self._stands)
-        self._last: Float64 = np.full(2, np.nan)  # changes of the two pictures before
-        self._key = False  # whether the picture before was coded by itself
+        self._last: Float64 = np.full(2, np.nan)  # changes of the two previous pictures
+        self._key = False  # whether the previous picture was a key frame
 
     def add(
         self,
@@ -190,7 +190,7 @@ class _RepeatCheck:
         repeated: Bools,
         lost: Bools,
     ) -> None:
-        """`dull` pictures are black or empty, and `lost` ones repeated for want of another: both is said elsewhere."""
+        """Check rows; `dull` pictures (black or uniform) and repeats for `lost` pictures are reported elsewhere."""
         said = repeated | lost
         self._count("repeated", first, repeated & ~lost)
         self._said.add(first, repeated & ~lost)
@@ -234,7 +234,7 @@ class _RepeatCheck:
             if count:
                 many = share > self._settings.repeated_share
                 if what == "skipped" and not many:
-                    continue  # single ones prove nothing
+                    continue  # single repeats prove nothing
                 first, last = self._spans[what]
                 sentence = f"{count} of {shown} pictures of {self._camera} {text}"
                 severity: Severity = "warning" if many else "info"

@@ -1,4 +1,4 @@
-"""Report of the checks on an episode: flags with their frames, and its verdict of clean or not."""
+"""Report of the checks on an episode: flags with their frames, and whether it is clean."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ FORMAT = 1
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """One finding in the frames `first` to `last`, both included; -1 both where it is about no frame.
+    """One finding in the frames `first` to `last`, both included; both -1 if it concerns no frame.
 
-    `stream` is a column or a camera, "" for the episode. `value` is the worst that was found, `bound` what is
-    allowed, both in the unit that `text` names; None where the finding is no number.
+    `stream` is a column or a camera, "" for the episode. `value` is the worst value, `bound` the allowed one, both in
+    the unit that `text` names; None if the finding has no number.
     """
 
     kind: str
@@ -36,7 +36,7 @@ class Flag:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Counts of a kind's flags and of their frames, also beyond what a report lists."""
+    """Number of a kind's flags and of their frames, including those that the report omits."""
 
     flags: int
     frames: int
@@ -44,9 +44,9 @@ class Count:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """All findings on one episode. `unchecked` are sentences about what could not be judged, and why."""
+    """All findings on one episode. `unchecked` are sentences about checks that were impossible, and why."""
 
-    episode: str  # its uuid, or DATASET#index
+    episode: str  # uuid, or DATASET#index
     frames: int
     fps: float
     flags: tuple[Flag, ...]
@@ -56,17 +56,17 @@ class Report:
 
     @property
     def clean(self) -> bool:
-        """True if nothing but remarks was found."""
+        """True if there are no findings above "info"."""
         return self.worst in ("", "info")
 
     @property
     def worst(self) -> Severity | Literal[""]:
-        """The highest severity, "" where there is no flag."""
+        """Highest severity, "" without flags."""
         found = {flag.severity for flag in self.flags}
         return next((severity for severity in reversed(SEVERITIES) if severity in found), "")
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON; numbers that are not finite become null."""
+        """Return the report as JSON; numbers that are not finite become null."""
         return {
             "format": FORMAT,
             "episode": self.episode,
@@ -86,7 +86,7 @@ def _plain(value: Any) -> Any:
 
 
 class FlagCollector:
-    """Collects flags in constant memory: of each kind and stream at most `most` are kept, all are counted."""
+    """Collector of flags in constant memory: at most `most` per kind and stream are stored, all are counted."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -96,7 +96,7 @@ class FlagCollector:
         self.unchecked: list[str] = []
 
     def add(self, flag: Flag) -> None:
-        """Take one finding."""
+        """Add one finding."""
         place = (flag.kind, flag.stream)
         self._seen[place] += 1
         if self._seen[place] <= self._most:
@@ -106,7 +106,7 @@ class FlagCollector:
         self._counts[flag.kind] = Count(before.flags + 1, before.frames + frames)
 
     def report(self, episode: str, frames: int, fps: float, figures: Mapping[str, float | None]) -> Report:
-        """Report of the findings, worst first within the order of the frames."""
+        """Return the report, with the flags in the order of their frames, at the same frame the worst first."""
         order = sorted(
             self._kept,
             key=lambda flag: (flag.first, -SEVERITIES.index(flag.severity), flag.kind, flag.stream),
@@ -123,7 +123,7 @@ class FlagCollector:
 
 
 class FrameRun(NamedTuple):
-    """Consecutive frames that have something in common; `value` is the worst of them, at frame `at`."""
+    """Consecutive frames with the same finding; `value` is the worst of them, at frame `at`."""
 
     first: int
     last: int
@@ -136,9 +136,9 @@ class FrameRun(NamedTuple):
 
 
 class RunCollector:
-    """Joins marked frames of consecutive blocks into runs and gives each, once it has ended, to `ended`.
+    """Collector that joins marked frames of consecutive blocks into runs and passes each finished run to `ended`.
 
-    Runs that are at most `apart` unmarked frames apart are one.
+    Runs separated by at most `apart` unmarked frames are joined.
     """
 
     def __init__(self, ended: Callable[[FrameRun], None], apart: int = 0) -> None:
@@ -147,7 +147,7 @@ class RunCollector:
         self._open: FrameRun | None = None
 
     def add(self, first: int, marked: NDArray[np.bool_], values: ArrayLike | None = None) -> None:
-        """The frames from `first` on; `values` says how bad each is, larger is worse."""
+        """Add frames from `first` on; `values` are their badness (larger is worse)."""
         frames = np.flatnonzero(marked)
         if not len(frames):
             if self._open is not None and first + len(marked) - self._open.last > self._apart + 1:
@@ -169,18 +169,18 @@ class RunCollector:
         self._open = FrameRun(known.first, new.last, worse.value, worse.at)
 
     def close(self) -> None:
-        """The episode has ended."""
+        """End the open run, because the episode has ended."""
         if self._open is not None:
             known, self._open = self._open, None
             self._ended(known)
 
 
 def frame_range(first: int, last: int) -> str:
-    """Frames as a person names them."""
+    """Return frames as text, e.g. "frames 3 to 7"."""
     return f"frame {first}" if first == last else f"frames {first} to {last}"
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:
-    """Names in a sentence, at most some of them."""
+    """Return names as text, at most `most` of them."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

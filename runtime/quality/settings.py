@@ -1,4 +1,4 @@
-"""Faults of a recorded episode: every bound of the checks, with its reason."""
+"""Bounds of the checks of recorded episodes, each with its reason."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class QualitySettings(Settings):
 
 
 def read_settings(path: Path) -> QualitySettings:
-    """The bounds in a TOML file with keys of QualitySettings; RecordingError names file, key, given and allowed."""
+    """Read bounds from a TOML file with keys of QualitySettings. Raises RecordingError with the file and key."""
     try:
         content = bounded.load_toml(path, str(path))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Checks of time: rows that follow each other, clocks that go forwards, streams captured together and lately."""
+"""Checks of time: consecutive rows, increasing clocks, and streams captured together and recently."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from runtime.quality.block import Block, EpisodeSource
 from runtime.quality.report import Flag, FlagCollector, FrameRun, RunCollector, Severity, frame_range
 from runtime.quality.settings import QualitySettings
 
-JOINTS = ("joints", "eef")  # streams that are no cameras
+JOINTS = ("joints", "eef")  # streams that are not cameras
 
 
 class TimingCheck:
-    """Judges order, gaps, skew and ages, block by block."""
+    """Check of order, gaps, skew and ages, block by block."""
 
     def __init__(self, source: EpisodeSource, settings: QualitySettings, flags: FlagCollector) -> None:
         self._source = source
@@ -21,13 +21,13 @@ class TimingCheck:
         self._flags = flags
         given = source.schema.get("max_skew_s")
         self._skew = float(given) if isinstance(given, int | float) and given > 0 else settings.max_skew_s
-        self._before: dict[str, float] = {}  # the newest value of each clock and stream
+        self._before: dict[str, float] = {}  # newest value of each clock and stream
         self._index: int | None = None
         self._runs: dict[tuple[str, str], RunCollector] = {}
         self.largest_skew: float | None = None
 
     def add(self, block: Block) -> None:
-        """Judge the next rows."""
+        """Check the next rows."""
         if block.index is not None:
             self._numbered(block, block.index)
         for name, clock in block.clocks.items():
@@ -43,7 +43,7 @@ class TimingCheck:
             self._ages(block, block.clocks[self._source.started])
 
     def close(self) -> None:
-        """The episode has ended."""
+        """End the checks."""
         for runs in self._runs.values():
             runs.close()
 
@@ -77,7 +77,7 @@ class TimingCheck:
             self._mark("gap", name, block, gaps > bound + 1e-9, gaps)
 
     def _forwards(self, block: Block, name: str, times: Float64, *, again: bool) -> Float64:
-        """Steps [N] s from the last known time to each; one back is flagged, and none at all unless `again`."""
+        """Return the steps [N] [s] from the last known time; a negative step is flagged, and zero unless `again`."""
         known = np.isfinite(times)
         steps = np.full(len(times), np.nan)
         told = times[known]
@@ -90,7 +90,7 @@ class TimingCheck:
 
     def _grid(self, block: Block, stamps: Float64) -> None:
         off = np.abs(stamps - (block.first + np.arange(block.rows)) / self._source.fps)
-        # What float32 can hold counts as exact: it is how datasets store the column.
+        # Stamps may have float32 precision, as datasets store the column.
         bound = np.maximum(
             self._settings.timestamp_tolerance_s, np.spacing(np.abs(stamps).astype(np.float32))
         )

@@ -1,4 +1,4 @@
-"""Checks of numbers: there, of the declared width, finite, unit quaternions, and no jumps."""
+"""Checks of values: present, of the declared width, finite, unit quaternions, no jumps."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ MOVING = ("state", "action")
 
 
 class ValueCheck:
-    """Judges every column of vectors, block by block.
+    """Check of every column of vectors, block by block.
 
-    Numbers that are not finite count as 0 and are unknown to all other checks; their rows are flagged and stay.
+    Values that are not finite are treated as unknown by all other checks; their rows are flagged and stay.
     """
 
     def __init__(
@@ -31,12 +31,12 @@ class ValueCheck:
         ]
 
     def add(self, block: Block) -> None:
-        """Judge the next rows."""
+        """Check the next rows."""
         for column in self._columns:
             column.add(block.first, block.vectors[column.name])
 
     def close(self) -> None:
-        """The episode has ended."""
+        """End the checks."""
         for column in self._columns:
             column.close()
 
@@ -56,7 +56,7 @@ class _Column:
         self._fps = fps
         self._settings = settings
         self._flags = flags
-        self._broken: set[int] = set()  # dimensions of the open run of numbers that are not finite
+        self._broken: set[int] = set()  # dimensions that are not finite in the open run
         self._speeds = self._allowed(joints)
         self._before = np.full(vector.width, np.nan, np.float32)
         self._fastest = 0  # the dimension of the worst jump
@@ -70,7 +70,7 @@ class _Column:
         self._worst: dict[int, int] = {}
 
     def _allowed(self, joints: JointSpecs | None) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
-        """Allowed change of each number [1/s]; infinite where any change is right. None: it is not judged."""
+        """Return the allowed change of each dimension [1/s], inf if any is allowed; None: the column is not checked."""
         width, settings = self._vector.width, self._settings
         if self._vector.role == "poses":
             bound = np.full(width, np.inf)
@@ -92,7 +92,7 @@ class _Column:
         self._runs["dimensions"].add(first, numbers.malformed)
         if not broken.any():
             self._runs["not_finite"].add(first, broken)
-        for row in np.flatnonzero(broken):  # rare: one at a time, to say which numbers
+        for row in np.flatnonzero(broken):  # rare, so one row at a time, to name the dimensions
             self._runs["not_finite"].add(first + int(row), np.ones(1, np.bool_))
             self._broken |= set(np.flatnonzero(~finite[row]).tolist())
         usable = np.where(finite & there[:, None], numbers.values, np.nan).astype(np.float32)

@@ -1,4 +1,4 @@
-"""`python -m runtime.recording repair|show|export|scrub PATH`: mend after a crash, say what is there, export, scrub."""
+"""`python -m runtime.recording repair|show|export|scrub PATH`: repair after a crash, show, export, verify."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from runtime.recording.scrub import episodes_in, verify_episode
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where all is well, 1 where an episode is unreadable, damaged, or the disk fails.
+    """Run one command; return its exit code.
 
-    Of a scrub 1 is damage alone, 2 that something could not be looked at.
+    0 is success; 1 means that an episode is unreadable or damaged, or that the disk fails.
+
+    For scrub, 1 means damage, and 2 that an episode could not be read or marked.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -63,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _scrub(paths: Sequence[Path], as_json: bool) -> int:
-    """Every episode of `paths`; one that cannot be looked at, or marked, does not keep the others."""
+    """Verify every episode of `paths`; an episode that cannot be read or marked does not stop the others."""
     codes = {0}
     for path in paths:
         try:
@@ -75,7 +77,7 @@ def _scrub(paths: Sequence[Path], as_json: bool) -> int:
 
 
 def _scrubbed(folder: Path, as_json: bool) -> int:
-    """Tell and mark; the exit code that it comes to."""
+    """Print and mark the result for one episode; return its exit code."""
     damaged = False
     try:
         verdict = verify_episode(folder)
@@ -128,7 +130,7 @@ def _lines(episode: Episode) -> list[str]:
 
 
 def _export(paths: Sequence[Path], to: Path | None) -> int:
-    """Every episode of `paths`; one that fails does not keep the others."""
+    """Export every episode of `paths`; one that fails does not stop the others."""
     failed = 0
     for folder in (episode for path in paths for episode in episodes_in(path)):
         try:
@@ -140,7 +142,7 @@ def _export(paths: Sequence[Path], to: Path | None) -> int:
 
 
 def _data_of(folder: Path) -> Path:
-    """The data folder that DATA/episodes/<uuid> lies in."""
+    """Return the data folder of DATA/episodes/<uuid>. Raises RecordingError for an episode elsewhere."""
     episodes = folder.absolute().parent
     if episodes.name != "episodes":
         raise RecordingError(f"{folder} does not lie in DATA/episodes: say where to export to with --to DATA")
@@ -148,14 +150,14 @@ def _data_of(folder: Path) -> Path:
 
 
 def _stand_back() -> None:
-    """Run when nobody else wants to, and end with whoever started us."""
+    """Run at the lowest priority, and end together with the process that started this one."""
     os.nice(19)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     threading.Thread(target=_end_with_standard_input, daemon=True).start()
 
 
 def _end_with_standard_input() -> None:
-    """Whoever started us holds the other end; what is half written is only a draft."""
+    """End when standard input closes: the starting process holds the other end. A half-written file is only a draft."""
     while os.read(0, 4096):
         pass
     os._exit(1)

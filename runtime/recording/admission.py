@@ -1,4 +1,4 @@
-"""Admits records to the journal: checks them against the manifest and copies what their owner may reuse."""
+"""Admission of records to the journal: check against the manifest, and copies of arrays that their owner may reuse."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ _NONE: Mapping[str, UInt8 | None] = MappingProxyType({})
 
 
 def admit_row(layout: Layout, row: Row, expected: int) -> Row:
-    """A copy of `row` without pictures; RecordingError where it is not row `expected` or does not fit.
+    """Return a copy of `row` without pictures.
 
-    Vectors that the manifest does not list are left out, listed ones may be absent (null in the table).
+    Vectors that the manifest does not list are dropped; listed vectors may be absent (null in the table). Raises
+    RecordingError if it is not row `expected` or does not fit the manifest.
     """
     if row.index != expected:
         raise RecordingError(
@@ -42,7 +43,7 @@ def admit_row(layout: Layout, row: Row, expected: int) -> Row:
 
 
 def admit_tick(layout: Layout, tick: ExecutedTick) -> ExecutedTick:
-    """A copy of `tick`; RecordingError where a vector has another width or chunks and weights do not pair."""
+    """Return a copy of `tick`. Raises RecordingError for a wrong width, or if chunks and weights do not pair."""
     name = f"tick {tick.step}"
     if len(tick.chunk_ids) != len(tick.weights):
         raise RecordingError(
@@ -58,7 +59,7 @@ def admit_tick(layout: Layout, tick: ExecutedTick) -> ExecutedTick:
 
 
 def admit_chunk(chunk: RawChunk) -> RawChunk:
-    """A copy of `chunk`; RecordingError where its actions are not [H, W] with H target steps."""
+    """Return a copy of `chunk`. Raises RecordingError if its actions are not [H, W] with H target steps."""
     actions = np.array(chunk.actions, dtype=np.float32)
     targets = np.array(chunk.target_steps, dtype=np.int64)
     if actions.ndim != 2 or targets.shape != actions.shape[:1]:

@@ -1,4 +1,4 @@
-"""Pictures on their way to one encoder, and how far behind it may be: what it has no time for becomes a repeat."""
+"""Queue of pictures for one encoder with a bounded lag; a picture that does not fit becomes a repeat."""
 
 from __future__ import annotations
 
@@ -9,43 +9,45 @@ from typing import NamedTuple
 
 from runtime.core.types import UInt8
 
-RUN = 4  # repeats that wait together from here on are coded once and copied
-_GUESS_S = 0.03  # of the first frame, on a machine of which nothing is known; rows may come in a burst then
+RUN = 4  # from this many consecutive repeats on, a few are coded and the others copied
+_GUESS_S = (
+    0.03  # assumed coding time of a frame [s] before the first measurement, when rows may come in a burst
+)
 
 
 class Picture(NamedTuple):
-    """A picture RGB uint8 [H, W, 3] and when it was captured [s, monotonic; NaN where that is not known]."""
+    """A picture RGB uint8 [H, W, 3] and its capture time [s, monotonic; NaN if unknown]."""
 
     pixels: UInt8
     captured: float
 
 
 def encode_count(repeats: int) -> int:
-    """Count of frames to be coded for so many repeats in a row; the rest are copies.
+    """Return the number of frames to code for that many repeats in a row; the others are copies.
 
-    A run of copies alternates between two key frames and ends with the second, so that an odd one has a
-    repeat of its own before it.
+    A run of copies alternates between two key frames and ends with the second, so for an odd number one more repeat
+    is coded before it.
     """
     return repeats if repeats < RUN else 2 + repeats % 2
 
 
 class Pace:
-    """Present coding time of one frame [s]: slower at once, faster over some frames."""
+    """Present coding time of one frame [s]: an increase counts at once, a decrease over several frames."""
 
     def __init__(self) -> None:
         self.coding_s = _GUESS_S
 
     def update(self, codings: int, seconds: float) -> None:
-        """So many frames were coded in that time, waiting for a processor included."""
+        """Record that `codings` frames took `seconds`, including waiting for a processor."""
         each = seconds / codings
         self.coding_s = max(each, self.coding_s + 0.2 * (each - self.coding_s))
 
 
 class PictureQueue:
-    """Takes pictures as long as all that waits is coded within `max_lag_s`, as far as the pace says.
+    """Queue that accepts pictures as long as all its content can be coded within `max_lag_s` at the present pace.
 
-    At most `places` pictures are held, and repeats are only counted: however long a run of them is, coding it
-    takes no longer than three frames. What waits for nothing is taken however slow the encoder is.
+    At most `places` pictures are stored. Repeats are only counted: a run of any length costs at most three codings. An
+    empty queue accepts a picture however slow the encoder is.
     """
 
     def __init__(self, places: int, max_lag_s: float = math.inf) -> None:
@@ -53,12 +55,14 @@ class PictureQueue:
         self._max_lag_s = max_lag_s
         self._pace = Pace()
         self._held = 0
-        self._entries: deque[Picture | int] = deque()  # a picture, or how often to repeat the one before
+        self._entries: deque[Picture | int] = (
+            deque()
+        )  # a picture, or a number of repeats of the previous frame
         self._changed = threading.Condition()
         self._closed = False
 
     def put(self, picture: UInt8 | None, patience: float = 0.0, captured: float = math.nan) -> bool:
-        """Queue one frame; False where it became a repeat, as it could not be taken within `patience` seconds."""
+        """Queue one frame; return False if it became a repeat because it was not accepted within `patience` [s]."""
         with self._changed:
             if picture is not None and patience:
                 self._changed.wait_for(lambda: self._held < self._places or self._closed, patience)
@@ -73,7 +77,7 @@ class PictureQueue:
         return taken
 
     def take(self) -> Picture | int | None:
-        """The oldest entry, waiting for one; None once the queue is closed and empty."""
+        """Return the oldest entry, waiting for one; None when the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._entries or self._closed)
             if not self._entries:
@@ -90,7 +94,7 @@ class PictureQueue:
             self._pace.update(codings, seconds)
 
     def close(self, *, discard: bool = False) -> None:
-        """No more entries come; with `discard` those that wait are dropped."""
+        """Close the queue for new entries; with `discard`, drop the waiting entries."""
         with self._changed:
             self._closed = True
             if discard:
@@ -99,7 +103,7 @@ class PictureQueue:
             self._changed.notify_all()
 
     def waiting(self) -> int:
-        """Frames that were queued and not yet taken."""
+        """Return the number of frames in the queue."""
         with self._changed:
             return sum(entry if isinstance(entry, int) else 1 for entry in self._entries)
 

@@ -1,4 +1,4 @@
-"""A journal, and the records it takes: dataset rows, executed ticks, raw chunks."""
+"""Journal interface and its records: dataset rows, executed ticks, raw chunks."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ Status = Literal["finished", "interrupted", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Row `index` of the dataset grid: the observation assembled and the action sent at one control tick.
+    """Row `index` of the dataset grid: the observation and the action sent at one control tick.
 
-    Vectors as in runtime.core.types.Observation. `captured` holds capture times per stream on our monotonic clock.
-    `pictures` has one entry per recorded camera, RGB uint8; None repeats the previous picture (flagged).
+    Vectors as in `runtime.core.types.Observation`. `captured` has the capture time of each stream on our monotonic
+    clock [s]. `pictures` has one entry per recorded camera, RGB uint8 [H, W, 3]; None repeats the previous picture
+    and is flagged.
     """
 
     index: int
     step: int
     tick_time: float  # planned time of the tick, our monotonic clock [s]
-    sequence: int  # Observation.sequence
+    sequence: int  # `Observation.sequence`
     qpos: Float32
     action: Float32
     captured: Mapping[str, float]
@@ -44,66 +45,70 @@ class Row:
     effort: Float32 | None = None
     eef: Float32 | None = None
     eef_action: Float32 | None = None
-    eef_measured: bool = False  # eef came from the robot, not from forward kinematics
-    eef_action_reported: bool = False  # likewise eef_action, for this very action
+    eef_measured: bool = False  # eef was measured by the robot, not computed by forward kinematics
+    eef_action_reported: bool = False  # eef_action was reported by the robot for this action
     intervention: bool = False
-    stale: frozenset[str] = frozenset()  # cameras that have given no new picture for too long
-    lost: frozenset[str] = frozenset()  # cameras that gave one which could not be kept
-    bench: str | None = None  # what a simulated bench says, see bench_truth; None: as in the row before
+    stale: frozenset[str] = frozenset()  # cameras without a new picture for too long
+    lost: frozenset[str] = frozenset()  # cameras whose new picture could not be recorded
+    bench: str | None = (
+        None  # state of a simulated bench, see bench_truth; None: unchanged since the previous row
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class ExecutedTick:
-    """One control tick at full rate: what smoothing asked for, what safety let through, when it was sent."""
+    """One control tick at full rate: the smoothed action, the action after safety, and its send time."""
 
     step: int
     planned: float
     sent: float
     sequence: int
     control_source: ControlSource
-    qpos: Float32  # measured, as the tick saw it
-    smoothed: Float32 | None  # before safety; None where nothing was asked for
-    executed: Float32 | None  # what was sent; None where nothing was
+    qpos: Float32  # measured joints at the tick
+    smoothed: Float32 | None  # before safety; None without a target
+    executed: Float32 | None  # sent action; None if none was sent
     chunk_ids: tuple[int, ...] = ()
     weights: tuple[float, ...] = ()
-    changes: tuple[str, ...] = ()  # what safety changed, or why it refused
+    changes: tuple[str, ...] = ()  # changes by safety, or reasons of its refusal
     refused: bool = False
-    woke: float | None = None  # when the loop woke for the tick; None in lockstep
+    woke: float | None = None  # wake-up time of the loop; None in lockstep
 
 
 @dataclass(frozen=True, slots=True)
 class RawChunk:
-    """One answer of the policy, in the policy's own space, and where it fell on the timeline."""
+    """One chunk of the policy in the policy's own space, with its placement on the timeline."""
 
     chunk_id: int
     observation_step: int
-    arrival_step: int  # -1: it never arrived at the control loop
+    arrival_step: int  # -1: it never reached the control loop
     actions: Float32  # [H, W]
-    target_steps: NDArray[np.int64]  # [H] control step each row was meant for; -1: dropped
+    target_steps: NDArray[np.int64]  # [H] control step of each row; -1: dropped
     space: Space
     delay: int  # arrival_step - observation_step
-    mistimed: int = 0  # steps by which k_max shifted it
+    mistimed: int = 0  # [steps] by which k_max shifted it
     inference_ms: float = float("nan")
-    strategy: str = ""  # the kind that merged it
-    overlap: int = 0  # steps from the arrival on that were blended with what was planned before
+    strategy: str = ""  # kind of the strategy that merged it
+    overlap: int = 0  # [steps] from its arrival on that were blended with the previous plan
     ik_position_error: Float32 | None = (
-        None  # [H, arms] m, of the worst step made of each row; NaN where none was
+        None  # [H, arms] [m], largest of the steps made from each row; NaN if none
     )
-    ik_rotation_error: Float32 | None = None  # [H, arms] rad, likewise
-    ik_flags: UInt8 | None = None  # [H, arms] bits of kinematics.base.IkFlag, of all these steps
-    eef: str = ""  # "measured" or "fk": what the policy saw of poses, or its rows are relative to
+    ik_rotation_error: Float32 | None = None  # [H, arms] [rad], likewise
+    ik_flags: UInt8 | None = None  # [H, arms] bits of `kinematics.base.IkFlag`, of all these steps
+    eef: str = (
+        ""  # "measured" or "fk": origin of the poses that the policy received or that its rows refer to
+    )
 
 
 Record = Row | ExecutedTick | RawChunk
 
 
-IMPORTED = "imported"  # the kind of an episode that was recorded elsewhere, in whatever way
-VIDEO_LOST = "video_lost"  # the event of a camera whose video has ended; repair goes by it
+IMPORTED = "imported"  # kind of an episode that was recorded by other software
+VIDEO_LOST = "video_lost"  # kind of the event about a camera whose video has ended; repair reads it
 
 
 @dataclass(frozen=True, slots=True)
 class LostCamera:
-    """A camera whose video ends at row `row`, while all else is recorded on."""
+    """Camera whose video ends at row `row` while everything else is recorded on."""
 
     camera: str
     row: int
@@ -111,7 +116,7 @@ class LostCamera:
 
     @property
     def text(self) -> str:
-        """For a person."""
+        """Sentence for the operator."""
         return _VIDEO_ENDS(why=self.reason, row=self.row)
 
 
@@ -126,15 +131,18 @@ class Outcome:
 
 
 class Journal(ABC):
-    """Writes one episode while it happens, so that a kill at any moment loses at most the last second."""
+    """Writer of one episode while it happens. A kill at any moment loses at most the last second."""
 
     @abstractmethod
     def begin(self, manifest: Mapping[str, object]) -> None:
-        """Create the episode's folder with its manifest; raises RecordingError where that cannot be."""
+        """Create the episode's folder with its manifest. Raises RecordingError if that is impossible."""
 
     @abstractmethod
     def append(self, record: Record) -> None:
-        """Take one record; waits for no encoder and no longer than a write; raises RecordingError."""
+        """Record one row, tick or chunk, without waiting for an encoder or longer than one write.
+
+        Raises RecordingError.
+        """
 
     @abstractmethod
     def append_event(self, event: Mapping[str, object]) -> None:
@@ -142,8 +150,8 @@ class Journal(ABC):
 
     @abstractmethod
     def pop_lost_cameras(self) -> Sequence[LostCamera]:
-        """Cameras that this episode, or the one that ended last, has lost since the last call."""
+        """Return cameras that this episode, or the one that ended last, has lost since the last call."""
 
     @abstractmethod
     def end(self, outcome: Outcome) -> None:
-        """Drain, close every file, and rename the outcome into place last."""
+        """Write everything that waits, close every file, and put the outcome in place last."""

@@ -1,4 +1,4 @@
-"""What a simulated bench says of itself, row by row: where its things lie and which milestones are reached."""
+"""Recorded ground truth of a simulated bench, by row: positions of its objects and reached milestones."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from runtime.core.errors import RecordingError
 
 JUDGED = "milestones"
 _KEPT = ("blocks", "plate", JUDGED)
-_DECIMALS = 4  # a tenth of a millimetre: what lies still says the same in every row
+_DECIMALS = 4  # 0.1 mm, so that objects at rest yield the same text in every row
 
 
 def truth_text(truth: Mapping[str, Any]) -> str:
-    """The part of a bench's truth that is recorded, as JSON; "" where it says nothing of it."""
+    """Return the recorded part of a bench's ground truth as JSON; "" if there is none."""
     kept = {key: _rounded(truth[key]) for key in _KEPT if key in truth}
     return json.dumps(kept, separators=(",", ":")) if kept else ""
 
 
 def truth_changes(rows: Any) -> list[tuple[int, dict[str, Any]]]:
-    """(row, what the bench said from there on) of the column `bench` of rows.arrow; RecordingError for no such JSON.
+    """Return (row, ground truth from that row on) for each change in the column `bench` of rows.arrow.
 
-    Empty where no bench said anything, as on every real one, in episodes from before there was the column and in those
-    of datasets, which have none.
+    Empty for real benches, for episodes older than the column, and for those of datasets, which lack it. Raises
+    RecordingError for text that is not JSON.
     """
     if "bench" not in rows.column_names:
         return []

@@ -1,6 +1,6 @@
-"""The video encoders that a recording may use: their presets, and how each is made to keep nothing back.
+"""Video encoders for recordings: presets, and options that make each write frames without delay.
 
-A frame has to reach the file at once and in the order of the rows: no B-frames, no look-ahead, closed groups.
+A frame must reach the file at once and in the order of the rows: no B-frames, no look-ahead, closed groups.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, Literal
 CodecName = Literal["libx264", "libx265", "h264_nvenc"]
 PIXELS = "yuv420p"
 _X26 = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
-# x264's look-ahead would halve the size of still scenes, and keep each frame for as many periods; without force-cfr it
-# keeps one more to learn its duration. x265 without it keeps none.
+# x264's look-ahead would halve the size of still scenes, but delay each frame by as many periods; without force-cfr it
+# delays one more frame to learn its duration. x265 without look-ahead delays none.
 _X264_AT_ONCE = "scenecut=0:bframes=0:open-gop=0:rc-lookahead=0:mbtree=0:force-cfr=1"
 _X265_AT_ONCE = (
     "scenecut=0:bframes=0:open-gop=0:rc-lookahead=0:cutree=0:frame-threads=1:pools=none:wpp=0:log-level=error"
@@ -23,13 +23,13 @@ _X265_AT_ONCE = (
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """One encoder: `coded` is the format it writes."""
+    """One encoder; `coded` is the format that it writes."""
 
     coded: str
     presets: tuple[str, ...]
     preset: str
     crf: int
-    tag: str | None = None  # where browsers want another one than the muxer's
+    tag: str | None = None  # codec tag, if browsers need another one than the muxer's
 
 
 CODECS: Mapping[str, Codec] = {
@@ -40,7 +40,7 @@ CODECS: Mapping[str, Codec] = {
 
 
 def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
-    """Options of the encoder."""
+    """Return the encoder's options."""
     chosen = {"preset": preset, "crf": str(crf), "forced-idr": "1"}
     if name == "libx264":
         return {**chosen, "x264-params": f"keyint={gop}:min-keyint=1:{_X264_AT_ONCE}"}
@@ -62,7 +62,7 @@ def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
 def configure_context(
     context: Any, name: str, size: tuple[int, int], rate: Fraction, told: Mapping[str, str], gop: int
 ) -> None:
-    """Make an encoder's context ready for pictures of (height, width) at `rate`."""
+    """Configure an encoder's context for pictures of `size` (height, width) at `rate`."""
     context.height, context.width = size
     context.pix_fmt = PIXELS
     context.time_base = 1 / rate

@@ -1,4 +1,4 @@
-"""Records to Arrow columns: one function per table, called once per batch."""
+"""Conversion of records to Arrow columns: one function per table, called once per batch."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from runtime.recording.layout import Layout
 
 
 class RecordedRow(NamedTuple):
-    """A row without its pictures, and the cameras whose frame repeats the one before.
+    """Row without its pictures, and the cameras whose frame repeats the previous one.
 
-    `lost` are those of them that gave a picture, which their video does not have.
+    `lost` are those among them whose picture exists but is missing in their video.
     """
 
     row: Row
@@ -27,7 +27,7 @@ class RecordedRow(NamedTuple):
 
 
 def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, Any]:
-    """The columns of rows.arrow."""
+    """Return the columns of rows.arrow."""
     rows = [record.row for record in records]
     columns: dict[str, Any] = {
         "index": [row.index for row in rows],
@@ -62,7 +62,7 @@ def rows_columns(layout: Layout, records: Sequence[RecordedRow]) -> dict[str, An
 
 
 def spread(times: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Spread of the capture times of the streams [S, N] in each row [s]; 0 where fewer than two are known."""
+    """Return the spread of the streams' capture times [S, N] in each row [s]; 0 if fewer than two are known."""
     known = np.isfinite(times)
     latest = np.where(known, times, -np.inf).max(axis=0, initial=-np.inf)
     earliest = np.where(known, times, np.inf).min(axis=0, initial=np.inf)
@@ -71,7 +71,7 @@ def spread(times: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, Any]:
-    """The columns of ticks.arrow."""
+    """Return the columns of ticks.arrow."""
     return {
         "step": [tick.step for tick in ticks],
         "planned": [tick.planned - layout.started for tick in ticks],
@@ -88,7 +88,7 @@ def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, An
 
 
 def smoothed_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, Any]:
-    """The columns of smoothed.arrow; every tick has `smoothed`."""
+    """Return the columns of smoothed.arrow, for ticks that all have `smoothed`."""
     return {
         "step": [tick.step for tick in ticks],
         "smoothed": _vectors([tick.smoothed for tick in ticks], layout.dim),
@@ -98,8 +98,8 @@ def smoothed_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str,
 
 
 def raw_columns(layout: Layout, chunks: Sequence[RawChunk]) -> dict[str, Any]:
-    """The columns of raw.arrow."""
-    del layout  # a chunk has the policy's own width
+    """Return the columns of raw.arrow."""
+    del layout  # the width comes from the chunks: the policy's own
     lengths = [len(chunk.actions) for chunk in chunks]
 
     def each(values: Sequence[object]) -> list[object]:
@@ -148,7 +148,7 @@ def _vectors(values: Sequence[Float32 | None], width: int) -> Any:
 
 
 def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> list[list[Any] | None]:
-    """A list per row of every chunk, null for chunks that have none."""
+    """Return a list per row of every chunk, None for chunks without values."""
     rows: list[list[Any] | None] = []
     for each, length in zip(figures, lengths, strict=True):
         rows += [None] * length if each is None else each.tolist()
@@ -156,5 +156,5 @@ def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> l
 
 
 def _leading(tick: ExecutedTick) -> int:
-    """The chunk with the largest weight, the newest of equals; -1 where there is none."""
+    """Return the chunk with the largest weight, the newest of equals; -1 if there is none."""
     return max(zip(tick.weights, tick.chunk_ids, strict=True), default=(0.0, -1))[1]

@@ -1,22 +1,20 @@
-"""SHA-256 of a file while it grows: of all of it, and of its pieces, so that damaged rows can be named."""
+"""SHA-256 of a growing file, as a whole and in pieces, so that damaged rows can be located."""
 
 from __future__ import annotations
 
 import hashlib
 from typing import Any
 
-FileDigest = dict[
-    str, Any
-]  # "bytes", "sha256", "pieces": "END ROWS SHA256" each, up to that byte and that row
+FileDigest = dict[str, Any]  # "bytes", "sha256", "pieces": each "END ROWS SHA256", up to that byte and row
 
 
 def rows_per_piece(fps: float) -> int:
-    """Of a video: a second of it, so that the list of a long one stays short."""
+    """Return the rows per piece of a video: one second, so that the list for a long video stays short."""
     return max(1, round(fps))
 
 
 class Digest:
-    """Of a file while it grows. What is added with rows ends a piece once it has `least` of them."""
+    """Digest of a growing file. A piece ends when it has at least `least` rows."""
 
     def __init__(self, least: int = 1) -> None:
         self._least = least
@@ -25,7 +23,7 @@ class Digest:
         self._pieces: list[str] = []
 
     def add(self, data: bytes | bytearray | memoryview, rows: int = 0) -> None:
-        """The next bytes of the file and how many rows or lines are in them; none: a header."""
+        """Add the next bytes of the file with their number of rows or lines; 0 for a header."""
         if not data:
             return
         self._whole.update(data)
@@ -36,7 +34,7 @@ class Digest:
             self._end_piece()
 
     def to_dict(self) -> FileDigest:
-        """As it stands in the outcome."""
+        """Return the digest in the form that the outcome contains."""
         if self._bytes > self._ended_bytes:
             self._end_piece()
         return {"bytes": self._bytes, "sha256": self._whole.hexdigest(), "pieces": list(self._pieces)}

@@ -1,4 +1,4 @@
-"""The encoder thread of one camera; what goes wrong with it costs this camera's video and nothing else."""
+"""Encoder thread of one camera; its failure costs this camera's video and nothing else."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from runtime.recording.video import FragmentedVideo
 
 
 class CameraEncoder:
-    """Encodes one camera's pictures on a thread of its own; `put` never waits for it unless told to."""
+    """Encoder of one camera's pictures on its own thread. `put` waits for it only if a patience is given."""
 
     def __init__(
         self, camera: str, path: Path, size: tuple[int, int], fps: float, settings: RecordingSettings
@@ -31,11 +31,11 @@ class CameraEncoder:
         self.failure: RecordingError | None = None
         self.file = AppendFile(path, rows_per_piece(fps))
         self._fps = fps
-        self._most_behind = max(2, round(settings.give_up_s * fps))  # frames
+        self._most_behind = max(2, round(settings.give_up_s * fps))  # [frames]
         self._abandoned = self._refused = self._all_coded = False
         self._captured: deque[float] = (
             deque()
-        )  # of the frames in the encoder [s, monotonic]; NaN for a repeat
+        )  # capture times of the frames in the encoder [s, monotonic]; NaN for a repeat
         self._muxed = DurationHistogram()
         self._queue = PictureQueue(settings.queue_frames, settings.max_lag_s)
         try:
@@ -53,19 +53,23 @@ class CameraEncoder:
 
     @property
     def frames(self) -> int:
-        """Frames encoded so far; all of them are in the file once the encoder has drained without failure."""
+        """Number of frames encoded so far; all are in the file once the encoder has drained without failure."""
         return self._video.frames
 
     @property
     def muxed_ms(self) -> dict[str, float] | None:
-        """From the capture of a picture until its packet went to the muxer; None where that is not known."""
+        """Time from capture until the packet went to the muxer [ms], as percentiles; None if unknown."""
         return self._muxed.milliseconds()
 
     def put(self, picture: UInt8 | None, patience: float = 0.0, captured: float = math.nan) -> bool:
-        """Queue the next row's picture, which must not change any more; False where it became a repeat.
+        """Queue the next row's picture, which must no longer change; return False if it became a repeat.
 
-        `captured` is when it was taken, on the monotonic clock of this machine. An encoder that has failed takes
-        nothing, and one that is too far behind fails.
+        A failed encoder accepts nothing, and an encoder that is too far behind fails.
+
+        Args:
+            picture: RGB uint8 [H, W, 3]; None repeats the previous one.
+            patience: Longest time to wait for a place in the queue [s].
+            captured: Capture time on this machine's monotonic clock [s].
         """
         if self.failure is not None:
             self._refused = True
@@ -78,16 +82,16 @@ class CameraEncoder:
         return taken
 
     def finish(self) -> None:
-        """Ask the thread to encode what waits and to end."""
+        """Request the thread to encode the waiting pictures and to end."""
         self._queue.close()
 
     def drain(self, deadline: float) -> bool:
-        """Wait for the thread's end until `deadline` (time.monotonic); False where it is still at work."""
+        """Wait for the end of the thread until `deadline` (time.monotonic); return False if it still runs."""
         self._thread.join(max(0.0, deadline - time.monotonic()))
         return not self._thread.is_alive()
 
     def save(self) -> None:
-        """Write what a full disk did not take of an ended video; DiskFullError where it still does not.
+        """Write the part of an ended video that a full disk refused. Raises DiskFullError if it refuses again.
 
         Pictures that were dropped meanwhile are lost, and remain a failure.
         """
@@ -97,7 +101,7 @@ class CameraEncoder:
                 self.failure = None
 
     def abandon(self) -> None:
-        """Give up on a thread that does not end; it writes no more than the frame it is at."""
+        """Abandon a thread that does not end; it writes at most its current frame."""
         self._abandoned = True
         waiting = self._queue.waiting()
         self._give_up(f"the encoder did not end in time, {waiting} frames not encoded into {self.path}")
@@ -122,7 +126,7 @@ class CameraEncoder:
                 self._video.close()
         except RecordingError as error:
             self.failure = self.failure or type(error)(f"camera {self.camera}: {error}")
-        except Exception as error:  # whatever it was: the recording has to say so, and whose it was
+        except Exception as error:  # any error: the recording must report it with the camera
             failure = RecordingError(f"camera {self.camera}: the encoder failed: {error!r}")
             self._salvage(failure)
             self.failure = self.failure or failure
@@ -130,7 +134,7 @@ class CameraEncoder:
             self._queue.close(discard=True)
 
     def _keep(self, entry: Picture | int) -> None:
-        """Code it; what a full disk does not take stays in memory, for the next write or the end."""
+        """Encode one entry; bytes that a full disk refuses stay in memory for the next write or the end."""
         try:
             self._encode(entry)
         except DiskFullError as error:
@@ -150,7 +154,7 @@ class CameraEncoder:
             self._muxed.add(self._video.muxed_at - self._captured.popleft())
 
     def _salvage(self, failure: RecordingError) -> None:
-        """Write the frames that the failed encoder still holds, where it can."""
+        """Write the frames that the failed encoder still has, if possible."""
         try:
             self._video.close()
         except Exception as error:

@@ -1,4 +1,4 @@
-"""The journal of an episode: rows, ticks, chunks, events and pictures into one folder, while they happen."""
+"""Journal of an episode: rows, ticks, chunks, events and pictures, written to one folder while they happen."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ from runtime.recording.summary import summarise
 from runtime.recording.tables import read_table, rows_schema
 from runtime.recording.writer import DiskWriter, ErrorLatch
 
-_LEAST_DISK_SECONDS = 1.0  # for the last writes
-_PATIENCE = 6.0  # times as long as a robot would wait: lockstep loses nothing to a busy machine
+_LEAST_DISK_SECONDS = 1.0  # time for the last writes [s]
+_PATIENCE = 6.0  # factor of the drain timeout in lockstep, which loses nothing to a busy machine
 
 
 class EpisodeJournal(Journal):
-    """Writes `root`/<uuid>/, one episode after the other; one thread appends.
+    """Journal that writes `root`/<uuid>/, one episode after the other; one thread appends.
 
-    A picture that is missing, or for which an encoder has no time, becomes a flagged repeat, so that `append` never
-    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a place and for the end of
-    encoders, as long as ones that do not end at all may be told from slow ones. An encoder that fails, or a file of
-    its own that cannot be written, costs the video of its camera: `losses` names it, and all else is recorded on.
-    Pictures are handed over, not copied: they must not change any more.
+    A picture that is missing, or that an encoder has no time for, becomes a flagged repeat, so that `append` never
+    waits for an encoder. With `patient` (lockstep has no deadline) it waits for a free place and for the end of
+    encoders, long enough to distinguish a slow encoder from one that never ends. An encoder that fails, or whose file
+    cannot be written, costs the video of its camera: `pop_lost_cameras` names it, and everything else is recorded on.
+    Pictures are passed without a copy: they must no longer change.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class EpisodeJournal(Journal):
 
     @property
     def folder(self) -> Path | None:
-        """The folder of the episode that is being recorded."""
+        """Folder of the episode that is being recorded."""
         return self._recording.folder if self._recording else None
 
     def begin(self, manifest: Mapping[str, object]) -> None:
@@ -83,7 +83,7 @@ class EpisodeJournal(Journal):
             write_atomic(folder / MANIFEST, text)
             recording = _Recording(folder, layout, self._settings, self._patience)
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)  # it is ours and empty: no row was ever taken
+            shutil.rmtree(folder, ignore_errors=True)  # the folder is ours and has no rows yet
             raise
         self._recording = recording
         self._losses = []
@@ -101,11 +101,11 @@ class EpisodeJournal(Journal):
         return told
 
     def end(self, outcome: Outcome) -> None:
-        """Drain, close every file, and rename the outcome into place last.
+        """Write everything that waits, close every file, and put the outcome in place last.
 
-        The figures found (frames, duration_s, ...) win over `outcome.details`. An error of a thread makes the
-        status "failed"; it is raised, after everything else was saved, unless `append` has told it already. Where the
-        disk has no room for the end UnclosedError is raised: nothing is lost, and it can be tried again meanwhile.
+        Measured figures (frames, duration_s, ...) replace those of `outcome.details`. An error of a thread makes the
+        status "failed"; it is raised after everything else was saved, unless `append` has raised it already. Raises
+        UnclosedError if the disk has no room for the end: nothing is lost, and the end can be written again later.
         """
         recording, self._recording = self._begun(), None
         try:
@@ -133,9 +133,9 @@ def _create(root: Path, name: str) -> Path:
 
 
 def lock_folder(folder: Path) -> int | None:
-    """A descriptor that marks `folder` as being written until it is closed; None where another one does so.
+    """Return a descriptor that marks `folder` as being written until it is closed; None if another process does so.
 
-    The kernel lets go of it however its process ends.
+    The kernel releases the lock however the process ends.
     """
     try:
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -160,7 +160,7 @@ def _locked(folder: Path) -> int:
 
 
 class _Recording:
-    """One episode between begin and end."""
+    """One episode between `begin` and `end`."""
 
     def __init__(self, folder: Path, layout: Layout, settings: RecordingSettings, patience: float) -> None:
         self.folder = folder
@@ -168,7 +168,7 @@ class _Recording:
         self._settings = settings
         self._patience = patience
         self._rows = 0
-        self._newest = layout.started  # time of the newest row [s], on the clock that rows are on
+        self._newest = layout.started  # time of the newest row [s], on the clock of the rows
         self._faults = ErrorLatch()
         self._lost: dict[str, LostCamera] = {}
         self._told = 0
@@ -205,6 +205,7 @@ class _Recording:
             )
 
     def _append_row(self, row: Row) -> None:
+        # The check comes first: a refused row must not leave a frame in the videos.
         kept = admit_row(self._layout, row, self._rows)
         repeated = {
             camera
@@ -218,7 +219,7 @@ class _Recording:
         self._writer.add("rows", RecordedRow(kept, frozenset(repeated), frozenset(lost)), self._patience)
 
     def _capture_time(self, row: Row, camera: str) -> float:
-        """When the picture was captured; NaN in lockstep, whose clock is not that of the encoders."""
+        """Return the capture time of the picture; NaN in lockstep, whose clock is not that of the encoders."""
         return math.nan if self._patience else row.captured.get(camera, math.nan)
 
     def mark(self, event: Mapping[str, object]) -> None:
@@ -226,7 +227,7 @@ class _Recording:
         self._writer.add_line(to_json(event, "an event"))
 
     def pop_lost_cameras(self) -> list[LostCamera]:
-        """Cameras that have been lost since the last call."""
+        """Return the cameras that have been lost since the last call."""
         new = list(self._lost.values())[self._told :]
         self._told += len(new)
         return new
@@ -236,7 +237,7 @@ class _Recording:
         deadline = time.monotonic() + drain_s
         self._ending = True
         stuck = self._drain(deadline)
-        # Of its own, also where the encoders took all of theirs: without an outcome the episode waits for a repair.
+        # A deadline of its own, even if the encoders used theirs up: without an outcome the episode needs a repair.
         last = time.monotonic() + max(drain_s, _LEAST_DISK_SECONDS)
         ended = [encoder for encoder in self._encoders.values() if encoder not in stuck]
         if not self._writer.finish(
@@ -250,7 +251,7 @@ class _Recording:
         self._conclude(outcome, stuck)
 
     def _conclude(self, outcome: Outcome, stuck: Sequence[CameraEncoder]) -> None:
-        """Write the outcome; UnclosedError, with the folder still marked as being written, where there is no room."""
+        """Write the outcome. Raises UnclosedError, with the folder still locked, if the disk has no room."""
         full: DiskFullError | None = self._writer.full
         try:
             if full is None:
@@ -259,7 +260,7 @@ class _Recording:
         except DiskFullError as error:
             full = error
         finally:
-            if full is None and not stuck:  # a stuck encoder may still write: marked until our process ends
+            if full is None and not stuck:  # a stuck encoder may still write: locked until the process ends
                 os.close(self._lock)
         if full is not None:
             raise UnclosedError(str(full), lambda: self._conclude_again(outcome, stuck)) from full
@@ -271,13 +272,13 @@ class _Recording:
         self._conclude(outcome, stuck)
 
     def _look_at_losses(self) -> None:
-        """Pictures that a disk without room made an encoder drop are lost, also where there is room again."""
+        """Report encoders that dropped pictures because the disk was full, even if it has room again."""
         for encoder in self._encoders.values():
             if isinstance(encoder.failure, DiskFullError):
                 self._faults.report(encoder.failure)
 
     def _drain(self, deadline: float) -> list[CameraEncoder]:
-        """End all encoders; returns those that did not end in time."""
+        """End all encoders; return those that did not end in time."""
         for encoder in self._encoders.values():
             encoder.finish()
         stuck = [encoder for encoder in self._encoders.values() if not encoder.drain(deadline)]
@@ -313,7 +314,7 @@ class _Recording:
         }
 
     def _digests(self, stuck: Sequence[CameraEncoder]) -> dict[str, FileDigest]:
-        """Of what was written; of what has failed as it lies on the disk, and none of what may still be written."""
+        """Return the digests of the written files, after a fault as they are on disk; none of files still in use."""
         if self._faults.first is not None:
             digests = digests_of(self.folder, self._layout)
         else:
@@ -330,11 +331,11 @@ class _Recording:
         self._faults.raise_pending()
 
     def _look_at_encoders(self) -> None:
-        """A disk that is full ends the recording, any other failure the video of its camera."""
+        """End the recording if the disk is full; any other failure ends only the video of its camera."""
         for camera, encoder in self._encoders.items():
             failure = encoder.failure
             if isinstance(failure, DiskFullError):
-                if not self._ending:  # else what it holds is written with the rest
+                if not self._ending:  # at the end, its bytes are written with all others
                     self._faults.report(failure)
             elif failure is not None and camera not in self._lost:
                 loss = self._lost[camera] = LostCamera(camera, encoder.frames, str(failure))

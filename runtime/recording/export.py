@@ -26,28 +26,28 @@ FORMAT = 1
 NO_PROMPT = "no-prompt"
 _STREAMS = ("ticks", "smoothed", "raw")
 _FILES = ("manifest.json", *(f"{name}.arrow" for name in _STREAMS))
-_NAME_BYTES = 120  # of a folder's name; file systems take 255
+_NAME_BYTES = 120  # longest folder name [bytes]; file systems allow 255
 _ROWS_TOGETHER = 1 << 16
 _VECTOR = pa.list_(pa.float32())
 
 SCHEMA = pa.schema(
     [
         pa.field("stream", pa.string(), nullable=False),  # raw, smoothed, executed
-        pa.field("step", pa.int64()),  # control step that the row is about; raw: null where it was dropped
-        pa.field("time", pa.float64()),  # when that step was planned [s since manifest.started_monotonic]
-        pa.field("sent", pa.float64()),  # executed: when it was sent, on the same clock
-        pa.field("woke", pa.float64()),  # executed: when the loop woke for it; null in lockstep
-        pa.field("chunk_id", pa.int64()),  # raw: of the row; else the chunk with the largest weight
+        pa.field("step", pa.int64()),  # control step of the row; raw: null if it was dropped
+        pa.field("time", pa.float64()),  # planned time of that step [s since manifest.started_monotonic]
+        pa.field("sent", pa.float64()),  # executed: send time on the same clock
+        pa.field("woke", pa.float64()),  # executed: wake-up time of the loop; null in lockstep
+        pa.field("chunk_id", pa.int64()),  # raw: the row's chunk; else the chunk with the largest weight
         pa.field("observation_step", pa.int64()),  # raw
-        pa.field("arrival_step", pa.int64()),  # raw: null where it never reached the control loop
-        pa.field("index", pa.int64()),  # raw: row of its chunk
-        pa.field("target_step", pa.int64()),  # raw: as `step`
+        pa.field("arrival_step", pa.int64()),  # raw: null if it never reached the control loop
+        pa.field("index", pa.int64()),  # raw: row within its chunk
+        pa.field("target_step", pa.int64()),  # raw: same as `step`
         pa.field("delay", pa.int64()),  # raw: arrival - observation [steps]
         pa.field("mistimed", pa.int64()),  # raw: steps by which k_max shifted the chunk
-        pa.field("overlap", pa.int64()),  # raw: steps of the chunk that were blended with what was planned
-        pa.field("strategy", pa.string()),  # raw: the kind that merged it
+        pa.field("overlap", pa.int64()),  # raw: steps that were blended with the previous plan
+        pa.field("strategy", pa.string()),  # raw: kind of the strategy that merged it
         pa.field("inference_ms", pa.float64()),  # raw
-        pa.field("space", pa.string()),  # raw: joint or eef; the other streams are joints
+        pa.field("space", pa.string()),  # raw: joint or eef; other streams are joints
         pa.field("ik_position_error", _VECTOR),  # raw: by arm [m], null for joints
         pa.field("ik_rotation_error", _VECTOR),  # raw: by arm [rad], null for joints
         pa.field(
@@ -55,13 +55,13 @@ SCHEMA = pa.schema(
         ),  # raw: by arm, bits: missed 1, limit 2, velocity 4, singular 8
         pa.field(
             "eef_source", pa.string()
-        ),  # raw: poses that the policy saw were measured or fk; null: it saw none
-        pa.field("chunk_ids", pa.list_(pa.int64())),  # smoothed: what made the step; 0 is the held target
+        ),  # raw: origin of the policy's poses, measured or fk; null: it received none
+        pa.field("chunk_ids", pa.list_(pa.int64())),  # smoothed: chunks of the step; 0 is the held target
         pa.field("weights", pa.list_(pa.float64())),  # smoothed
-        pa.field("action", _VECTOR),  # null where nothing was sent
-        pa.field("measured", _VECTOR),  # executed: the joints that the tick saw
+        pa.field("action", _VECTOR),  # null if nothing was sent
+        pa.field("measured", _VECTOR),  # executed: measured joints at the tick
         pa.field("control_source", pa.string()),  # executed
-        pa.field("changes", pa.list_(pa.string())),  # executed: what safety changed, or why it refused
+        pa.field("changes", pa.list_(pa.string())),  # executed: changes by safety, or reasons of its refusal
         pa.field("refused", pa.bool_()),  # executed
     ]
 )
@@ -69,7 +69,7 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Sources of an export."""
+    """Content of an export: manifest, outcome and tables."""
 
     manifest: Mapping[str, object]
     outcome: Mapping[str, object]
@@ -79,10 +79,10 @@ class _Run:
 
 
 def write_export(folder: Path, root: Path) -> Path:
-    """Write the episode in `folder` to its place below `root`; what is there already and whole stays.
+    """Export the episode in `folder` to its path below `root`; an up-to-date export stays as it is. Return the path.
 
-    Any number of processes may do so at once. Raises RecordingError where the episode has no outcome yet, is
-    damaged, or the disk does not take it.
+    Any number of processes may do so at once. Raises RecordingError if the episode has no outcome yet, is damaged, or
+    the disk refuses the file.
     """
     manifest = read_json(folder / "manifest.json")
     if not (folder / "outcome.json").exists():
@@ -96,19 +96,19 @@ def write_export(folder: Path, root: Path) -> Path:
 
 
 def export_table(folder: Path) -> bytes:
-    """The table of the episode in `folder` as a parquet file; raises RecordingError where it is damaged."""
+    """Return the table of the episode in `folder` as a parquet file. Raises RecordingError if it is damaged."""
     return _content(_read(folder, read_json(folder / "manifest.json")))
 
 
 def export_path(manifest: Mapping[str, object], root: Path) -> Path:
-    """Path of the export of that manifest's run; RecordingError where it has no uuid of its own."""
+    """Return the path of the export of that manifest's run. Raises RecordingError if it lacks a valid uuid."""
     prompt, mode, strategy = (manifest.get(key) for key in ("task", "mode", "strategy"))
     run = Layout.from_manifest(manifest).uuid
     return root / FOLDER / slug(prompt, NO_PROMPT) / slug(mode) / slug(strategy) / f"{run}.parquet"
 
 
 def is_exported(folder: Path, path: Path) -> bool:
-    """True if `path` was written after the episode in `folder` had ended, or was repaired."""
+    """Return True if `path` was written after the episode in `folder` had ended or was repaired."""
     try:
         return path.stat().st_mtime_ns >= (folder / "outcome.json").stat().st_mtime_ns
     except FileNotFoundError:
@@ -118,9 +118,9 @@ def is_exported(folder: Path, path: Path) -> bool:
 
 
 def slug(text: object, empty: str = "unknown") -> str:
-    """`text` as the name of one folder: letters and digits of any script, the rest as single hyphens.
+    """Return `text` as the name of one folder: letters and digits of any script, everything else as single hyphens.
 
-    What loses anything by that, or is too long, gets a part of its hash, so that two texts never share a name.
+    A name that loses information or is too long gets a part of the text's hash, so that two texts never share a name.
     """
     words = text if isinstance(text, str) else ""
     if not words.strip():
@@ -140,7 +140,7 @@ def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:
 
 
 def _content(run: _Run) -> bytes:
-    """The parquet file; each stream begins a row group, so that a reader of one skips the others."""
+    """Return the parquet file; each stream begins a row group, so that a reader of one can skip the others."""
     schema = SCHEMA.with_metadata(_metadata(run))
     sink = pa.BufferOutputStream()
     try:
@@ -224,7 +224,7 @@ def _executed(run: _Run) -> dict[str, Any]:
 
 
 def _null_if_negative(numbers: Any) -> Any:
-    """Null in place of -1, which stands for none."""
+    """Replace -1, which means none, by null."""
     return pc.if_else(pc.less(numbers, 0), None, numbers)
 
 
@@ -237,7 +237,7 @@ def _owners(run: _Run, steps: Any) -> Any:
 
 
 def _at_steps(ticks: Any, column: str, steps: Any) -> Any:
-    """That column of the ticks of these steps; null for a step that never was."""
+    """Return that column of the ticks of the given steps; null for a step without a tick."""
     known, wanted = ticks["step"].to_numpy(), steps.to_numpy()
     places = np.searchsorted(known, wanted)
     found = places < len(known)

@@ -1,4 +1,4 @@
-"""Files that survive a kill: append-only ones without half writes, and documents renamed into place."""
+"""Files that survive a kill: append-only files without partial writes, and documents renamed into place."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _OTHERS = {errno.EFBIG: "file too large"}
 
 
 class DiskFullError(RecordingError):
-    """Nothing more can be written, to whichever file of an episode."""
+    """Error of a full disk: no file of an episode can be written."""
 
 
 class UnclosedError(DiskFullError):
-    """The end of an episode found no room; `again` writes what is left of it, or raises this error anew."""
+    """Error of an episode's end that did not fit on the disk; call `again` to write the rest. It may raise anew."""
 
     def __init__(self, why: str, again: Callable[[], None]) -> None:
         super().__init__(why)
@@ -35,10 +35,10 @@ class UnclosedError(DiskFullError):
 
 
 class AppendFile:
-    """A file that only grows, by whole writes: one that fails midway is cut away again.
+    """File that only grows, by whole writes: a write that fails midway is cut off again.
 
-    One thread writes; another one may sync at the same time. Errors of the disk become RecordingError. Its digest has
-    pieces of at least `least` rows.
+    One thread writes; another may sync at the same time. Disk errors become RecordingError. Its digest has pieces of
+    at least `least` rows.
     """
 
     def __init__(self, path: Path, least: int = 1) -> None:
@@ -53,25 +53,25 @@ class AppendFile:
 
     @property
     def digest(self) -> FileDigest:
-        """Of what was written; to be asked for once nothing more is."""
+        """Digest of the written bytes; read it after the last write."""
         return self._digest.to_dict()
 
     def write(self, data: bytes | bytearray | memoryview, rows: int = 0) -> None:
-        """Append all of `data`, which has so many rows or lines, or nothing."""
+        """Append all of `data`, which has `rows` rows or lines, or nothing. Raises RecordingError."""
         view = memoryview(data)
         written = 0
         try:
             while written < len(view):
                 written += os.write(self._descriptor, view[written:])
         except OSError as error:
-            if written:
+            if written:  # part of a record would hide all later records from a reader
                 self._cut()
             raise disk_error("writing", self.path, error) from error
         self.size += written
         self._digest.add(data, rows)
 
     def sync(self) -> None:
-        """Wait until what was written is on the disk; at once where nothing is new."""
+        """Wait until the written bytes are on the disk; returns at once if nothing is new."""
         size = self.size
         if size == self._synced:
             return
@@ -94,7 +94,7 @@ class AppendFile:
 
 
 def disk_error(doing: str, path: Path, error: OSError) -> RecordingError:
-    """The error for a person: what failed, on which file, why, and how much room there is."""
+    """Return the error with its cause, the file and the free space; DiskFullError if the disk or quota is full."""
     full = _FULL.get(error.errno or 0)
     what = full or _OTHERS.get(error.errno or 0, "disk error")
     reason = error.strerror or str(error)
@@ -107,7 +107,7 @@ def disk_error(doing: str, path: Path, error: OSError) -> RecordingError:
 
 
 def require_room(folder: Path, wanted: int) -> None:
-    """Raise RecordingError where the disk of `folder` has less than `wanted` bytes left for us."""
+    """Raise RecordingError if the disk of `folder` has less than `wanted` bytes free."""
     try:
         free = shutil.disk_usage(_existing(folder)).free
     except OSError as error:
@@ -120,14 +120,15 @@ def require_room(folder: Path, wanted: int) -> None:
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Put `data` at `path` so that there is the old file or all of the new one, also after a power cut.
+    """Write `data` to `path` so that, even after a power cut, either the old or the whole new file is there.
 
-    Any number of processes may do so at once: the last one's stays.
+    Any number of processes may do so at once; the last one wins.
     """
     draft = path.with_name(f".{path.name}.draft")
     try:
         with _drafted(draft) as file:
             try:
+                # Content, then name, then folder entry: in this order a power cut leaves the old or the whole new file.
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
@@ -142,18 +143,18 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 @contextmanager
 def _drafted(draft: Path) -> Iterator[BinaryIO]:
-    """The draft, empty and ours alone; what a kill left of one is taken over."""
+    """Yield the draft file, empty and locked; a draft left by a kill is reused."""
     while True:
         with open(draft, "ab") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
-            if _is_at(file, draft):
+            if _is_at(file, draft):  # else another writer has renamed it between our open and our lock
                 file.truncate(0)
                 yield file
                 return
 
 
 def _is_at(file: BinaryIO, path: Path) -> bool:
-    """True if `path` is still its name: another writer may have put its own file in place."""
+    """Return True if `path` still names this file: another writer may have replaced it."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:
@@ -162,9 +163,9 @@ def _is_at(file: BinaryIO, path: Path) -> bool:
 
 @contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Nobody else who asks for it works in `folder` meanwhile; it is made where it is not there.
+    """Exclude other users of this lock from `folder`, which is created if it is absent.
 
-    The kernel lets go however we end. Raises RecordingError.
+    The kernel releases the lock however the process ends. Raises RecordingError.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -179,7 +180,7 @@ def exclusive(folder: Path) -> Iterator[None]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names inside `folder` durable."""
+    """Make the names in `folder` durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -188,7 +189,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def to_json(value: Mapping[str, object], name: str, *, indent: int | None = None) -> bytes:
-    """`value` as JSON; numpy values become plain ones, numbers that are not finite become null."""
+    """Return `value` as JSON; numpy values become plain values, numbers that are not finite become null."""
     try:
         return json.dumps(_to_builtin(value), indent=indent, ensure_ascii=False, allow_nan=False).encode()
     except (TypeError, ValueError, UnicodeEncodeError) as error:
@@ -196,7 +197,7 @@ def to_json(value: Mapping[str, object], name: str, *, indent: int | None = None
 
 
 def read_json(path: Path) -> dict[str, object]:
-    """The JSON object in `path`; RecordingError where it is absent, torn or something else."""
+    """Return the JSON object in `path`. Raises RecordingError if it is absent, torn or not an object."""
     try:
         value = json.loads(path.read_bytes())
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Reading fragmented MP4 whose end may be torn: where the whole fragments end, and how many frames decode."""
+"""Reading of fragmented MP4 with a possibly torn end: end of the whole fragments, number of decodable frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LONG = struct.Struct(">Q")
 
 
 def whole_bytes(path: Path) -> int:
-    """Bytes up to the end of the last whole fragment (moof and its mdat); 0 where even the header is torn.
+    """Return the bytes up to the end of the last whole fragment (moof and its mdat); 0 if the header is torn.
 
     Boxes as in ISO/IEC 14496-12, section 4.2.
     """
@@ -35,7 +35,7 @@ def whole_bytes(path: Path) -> int:
 
 
 def fragments(path: Path) -> Iterator[tuple[bytes, int]]:
-    """The file in parts, each with its frames: the header, the fragments, and whatever follows the last whole one."""
+    """Yield the parts of the file with their frames: header, fragments, rest after the last whole one."""
     with open(path, "rb") as file:
         total = file.seek(0, 2)
         begin = end = 0
@@ -54,7 +54,7 @@ def _part(file: BinaryIO, begin: int, end: int) -> tuple[bytes, int]:
 
 
 def frames_in(data: bytes | bytearray) -> int:
-    """Frames of the whole fragments in `data`: the sample counts of their runs (ISO/IEC 14496-12, section 8.8.8)."""
+    """Return the frames of the whole fragments in `data`, from their run boxes (ISO/IEC 14496-12, section 8.8.8)."""
     return _samples(io.BytesIO(data), 0, len(data))
 
 
@@ -72,10 +72,10 @@ def _samples(file: BinaryIO, position: int, total: int) -> int:
 
 
 def count_frames(path: Path) -> int:
-    """Frames that decode from the start of the file up to its torn tail; 0 where nothing does.
+    """Return the number of frames that decode from the start of the file to its torn end; 0 if none does.
 
-    All packets are counted; those of the last two groups of pictures, which alone can have suffered from a
-    kill or a power cut, are also decoded.
+    All packets are counted. Only the last two groups of pictures can have suffered from a kill or a power cut, so only
+    these are decoded.
     """
     try:
         if whole_bytes(path) == 0:
@@ -90,7 +90,7 @@ def count_frames(path: Path) -> int:
 
 def _count(container: Any) -> int:
     stream = next(iter(container.streams.video), None)
-    if stream is None or stream.codec_context is None:  # a header whose tables are gone
+    if stream is None or stream.codec_context is None:  # a header with lost tables
         return 0
     before = 0
     groups: list[list[Any]] = []
@@ -128,7 +128,7 @@ def _decodable(context: Any, packets: list[Any]) -> int:
 
 
 def _box(file: BinaryIO, position: int, total: int) -> tuple[bytes, int] | None:
-    """Kind and end of the box at `position`; None where it is not whole."""
+    """Return kind and end of the box at `position`; None if it is incomplete."""
     file.seek(position)
     header = file.read(_HEADER.size)
     if len(header) < _HEADER.size:

@@ -6,20 +6,20 @@ import math
 
 import numpy as np
 
-_LEAST, _MOST = 1e-4, 1e5  # [s]; what is outside counts as this
+_LEAST, _MOST = 1e-4, 1e5  # [s]; durations outside count as these
 _STEP = math.log(1.01)
 _BUCKETS = math.ceil(math.log(_MOST / _LEAST) / _STEP) + 1
 
 
 class DurationHistogram:
-    """Counts durations [s]; numbers that are not finite do not count."""
+    """Histogram of durations [s]; numbers that are not finite are ignored."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BUCKETS, dtype=np.int64)
         self._longest = -math.inf
 
     def add(self, seconds: float) -> None:
-        """One more."""
+        """Add one duration [s]."""
         if not math.isfinite(seconds):
             return
         within = min(max(seconds, _LEAST), _MOST)
@@ -27,7 +27,7 @@ class DurationHistogram:
         self._longest = max(self._longest, seconds)
 
     def milliseconds(self) -> dict[str, float] | None:
-        """p50 and p99, to one per cent, and the exact max; None where nothing was counted."""
+        """Return p50 and p99 with an error of one per cent, and the exact maximum [ms]; None if it is empty."""
         total = int(self._counts.sum())
         if not total:
             return None
@@ -38,6 +38,6 @@ class DurationHistogram:
         }
 
     def _quantile(self, share: float, total: int) -> float:
-        """The middle of the bucket that holds it, no more than the longest."""
+        """Return the middle of the bucket with the quantile, at most the longest duration."""
         bucket = int(np.searchsorted(np.cumsum(self._counts), share * total))
         return min(_LEAST * math.exp((min(bucket, _BUCKETS - 1) + 0.5) * _STEP), self._longest)

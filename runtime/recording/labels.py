@@ -1,4 +1,4 @@
-"""Users' labels of collected episodes: DATA/labels/<uuid>.jsonl, one line each; the newest counts."""
+"""Users' labels of collected episodes: DATA/labels/<uuid>.jsonl, one line per label; the newest counts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FOLDER = "labels"
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """One line: `time` is Unix time [s]; `result` None where nobody has said yet; what is discarded stays so."""
+    """Label of an episode: `time` is Unix time [s]; `result` is None until a user has judged; discarding is final."""
 
     time: float
     by: str
@@ -27,7 +27,7 @@ class Label:
 
 
 def read_labels(data: Path, episode: str) -> list[Label]:
-    """All of an episode, the oldest first; a line that was torn by a kill, or is none, is left out."""
+    """Return all labels of an episode, oldest first; torn or invalid lines are skipped. Raises RecordingError."""
     try:
         content = _file(data, episode).read_text("utf-8", "replace")
     except FileNotFoundError:
@@ -38,13 +38,13 @@ def read_labels(data: Path, episode: str) -> list[Label]:
 
 
 def latest_label(data: Path, episode: str) -> Label | None:
-    """The one that counts."""
+    """Return the newest label, which counts, or None."""
     said = read_labels(data, episode)
     return said[-1] if said else None
 
 
 def append_label(data: Path, episode: str, label: Label) -> None:
-    """Write one line, which is on the disk when this returns; RecordingError where it cannot be."""
+    """Write one label durably. Raises RecordingError if the disk fails."""
     path = _file(data, episode)
     line = json.dumps(asdict(label), ensure_ascii=False).encode() + b"\n"
     try:

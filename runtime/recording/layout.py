@@ -1,4 +1,4 @@
-"""A manifest's promises about an episode: the widths of its vectors, its cameras, its columns."""
+"""Layout of an episode as its manifest declares it: widths of vectors, cameras, columns."""
 
 from __future__ import annotations
 
@@ -18,26 +18,29 @@ _Kind = TypeVar("_Kind")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The part of a manifest that decides how the files look; `cameras` maps a key to (height, width) of its video."""
+    """Part of a manifest that determines the form of the files.
+
+    `cameras` maps a key to the (height, width) of its video.
+    """
 
     uuid: str
     fps: float
     dim: int
     eef_dim: int
-    started: float  # our monotonic clock [s]; the tables count from here
+    started: float  # start on our monotonic clock [s]; times in the tables count from it
     cameras: Mapping[str, tuple[int, int]]
-    streams: tuple[str, ...]  # those of VECTOR_STREAMS that are recorded
+    streams: tuple[str, ...]  # recorded members of VECTOR_STREAMS
     capture_streams: tuple[str, ...]
-    pictures: Mapping[str, tuple[int, int]]  # as `cameras`, of the pictures before they are scaled
-    max_skew_s: float  # a row whose streams were captured farther apart is flagged; inf: none is
+    pictures: Mapping[str, tuple[int, int]]  # like `cameras`, before scaling
+    max_skew_s: float  # a row with a larger spread of capture times is flagged; inf: none
 
     def width(self, vector: str) -> int:
-        """Numbers in the vector of that name."""
+        """Return the width of the vector `vector`."""
         return self.eef_dim if vector in ("eef", "eef_action") else self.dim
 
     @classmethod
     def from_manifest(cls, manifest: Mapping[str, object]) -> Layout:
-        """Read it from a manifest; RecordingError names the key that is missing or wrong."""
+        """Read the layout from a manifest. Raises RecordingError with the key that is missing or wrong."""
         if manifest.get("format", FORMAT) != FORMAT:
             raise _wrong("format", manifest["format"], str(FORMAT))
         robot = _require_key(manifest, "robot", dict)
@@ -118,13 +121,13 @@ def _camera(key: str, size: object) -> tuple[int, int]:
 
 
 def _captured(size: Mapping[str, object]) -> tuple[int, int]:
-    """Height and width of a camera's pictures: those of its video where it is not scaled."""
+    """Return height and width of a camera's pictures; those of its video if it is not scaled."""
     names = ("captured_height", "captured_width") if "captured_height" in size else ("height", "width")
     return _count(size, names[0]), _count(size, names[1])
 
 
 def simulated(manifest: Mapping[str, Any]) -> bool:
-    """Whether the deployment that an episode was recorded with declares its bench simulated: its pictures are drawn."""
+    """Return True if the episode's deployment declares a simulated bench, whose pictures are rendered."""
     configuration = manifest.get("configuration")
     transport = configuration.get("transport") if isinstance(configuration, Mapping) else None
     return isinstance(transport, Mapping) and transport.get("simulated") is True

@@ -1,4 +1,4 @@
-"""The marks of damaged recordings, DATA/quarantine/<uuid>.json, and what it takes for one to go."""
+"""Marks of damaged recordings, DATA/quarantine/<uuid>.json, and the condition for their removal."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ FOLDER = "quarantine"
 
 @dataclass(frozen=True, slots=True)
 class DamageMark:
-    """Finding: `damage` as in Verdict.document; `seal` of the outcome then, "" for none, None: not known."""
+    """Damage found in a recording.
+
+    `damage` has the form of `IntegrityCheck.to_dict`. `seal` is that of the outcome when the damage was found; "" if
+    it had none, None if it is unknown.
+    """
 
     damage: list[dict[str, Any]]
     seal: str | None
 
     def is_resolved_by(self, verdict: IntegrityCheck) -> bool:
-        """True if the same recording is whole again: not another one that was sealed since."""
+        """Return True if the same recording is intact again, and not one that was sealed anew since."""
         if verdict.state == "sound":
             return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
         files = {one["file"] for one in self.damage}
@@ -32,18 +36,18 @@ class DamageMark:
 
 
 def mark_file(data: Path, uuid: str) -> Path:
-    """Of one recording."""
+    """Return the path of a recording's mark."""
     return data / FOLDER / f"{uuid}.json"
 
 
 def data_of(folder: Path) -> Path | None:
-    """The data folder that DATA/episodes/<uuid> lies in; None where it lies elsewhere."""
+    """Return the data folder of DATA/episodes/<uuid>; None for an episode elsewhere."""
     episodes = folder.absolute().parent
     return episodes.parent if episodes.name == "episodes" else None
 
 
 def read_mark(data: Path, uuid: str) -> DamageMark | None:
-    """That of a recording; None where there is none. One that is damaged itself says nothing: without damage."""
+    """Return the mark of a recording or None. A mark that is itself unreadable is returned without damage."""
     path = mark_file(data, uuid)
     if not path.exists():
         return None
@@ -58,7 +62,7 @@ def read_mark(data: Path, uuid: str) -> DamageMark | None:
 
 
 def known_damage(verdict: IntegrityCheck) -> tuple[Damage, ...]:
-    """The damage that an earlier look found, and that what was found now does not resolve."""
+    """Return damage found by an earlier check that `verdict` does not resolve."""
     data = data_of(verdict.path)
     mark = read_mark(data, verdict.path.name) if data else None
     if mark is None or mark.is_resolved_by(verdict):
@@ -73,7 +77,7 @@ def _damage(told: Mapping[str, Any]) -> Damage:
 
 
 def _is_damage_table(one: object) -> bool:
-    """True if it is a table of Verdict.document."""
+    """Return True if it has the form of a damage in `IntegrityCheck.to_dict`."""
     if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
         return False
     words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
@@ -81,6 +85,6 @@ def _is_damage_table(one: object) -> bool:
 
 
 def _are_spans(value: object, kind: type) -> bool:
-    """True if it is a list of [first, last] pairs."""
+    """Return True if it is a list of [first, last] pairs."""
     spans = value if isinstance(value, list) else [None]
     return all(isinstance(span, list) and [type(end) for end in span] == [kind, kind] for span in spans)

@@ -1,7 +1,7 @@
-"""Pictures as an encoder takes them: brightness at full size, colour at half of it, limited range of ITU-R BT.601.
+"""YUV planes for the encoders: luma at full size, chroma at half, limited range of ITU-R BT.601.
 
-OpenCV does in 0.3 ms what takes swscale 1 ms (640x480): the picture is not copied first. Its own colours are those of
-every second pixel, so they are made here of the mean of the four pixels that each stands for.
+OpenCV needs 0.3 ms where swscale needs 1 ms (640x480), because the picture is not copied first. OpenCV's own chroma is
+that of every second pixel, so chroma is computed here from the mean of the four pixels that it covers.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from runtime.core.types import UInt8
 from runtime.recording.codecs import PIXELS
 
-# What cv2.transform adds up of red, green, blue and 1. It has a fast way for three rows; the first is not needed.
+# Weights of red, green, blue and 1 for cv2.transform. It has a fast path for three rows; the first is not needed.
 _COLOURS = np.array(
     [
         [0.0, 0.0, 0.0, 0.0],
@@ -26,7 +26,7 @@ _COLOURS = np.array(
 
 
 def to_yuv_planes(picture: UInt8, size: tuple[int, int]) -> av.VideoFrame:
-    """The picture, RGB uint8 [H, W, 3], scaled to `size` (height and width, both even) where it is of another one."""
+    """Convert a picture RGB uint8 [H, W, 3], scaled to `size` (height and width, both even) if it differs."""
     height, width = size
     rgb = np.ascontiguousarray(picture)
     if rgb.shape[:2] != size:
@@ -36,7 +36,7 @@ def to_yuv_planes(picture: UInt8, size: tuple[int, int]) -> av.VideoFrame:
     colours = cv2.transform(half, _COLOURS)
     for number, plane in enumerate(coded[height:].reshape(2, height // 2, width // 2), start=1):
         cv2.extractChannel(colours, number, plane)
-    # PyAV 18 takes a buffer of any other height for a lower picture; those are copied.
+    # PyAV 18 takes a buffer of other heights for a lower picture; those are copied.
     taken = av.VideoFrame.from_numpy_buffer if height % 4 == 0 else av.VideoFrame.from_ndarray
     frame = taken(coded, format=PIXELS)
     frame.colorspace, frame.color_range = Colorspace.ITU601, ColorRange.MPEG

@@ -1,4 +1,4 @@
-"""Which recordings are damaged, as the disk has it: DATA/quarantine/<uuid>.json; they stay as and where they are."""
+"""Marks of damaged recordings on disk, DATA/quarantine/<uuid>.json; the recordings themselves are not touched."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from runtime.recording.verdict import IntegrityCheck
 
 
 def update_mark(verdict: IntegrityCheck) -> None:
-    """Make the mark of an episode in DATA/episodes say what was found; one that is whole again loses it.
+    """Update the mark of an episode in DATA/episodes to a check; remove it if the episode is intact again.
 
-    It stays where the recording is whole by another seal than when it was marked, or has none any more: then nobody can
-    say that its damage is mended. Of an episode that lies elsewhere nothing is kept. RecordingError where the disk does
-    not take it.
+    The mark stays if the recording is now intact under another seal, or without one, because that does not show that
+    its damage was mended. Episodes elsewhere have no marks. Raises RecordingError if the disk fails.
     """
     data = data_of(verdict.path)
     if data is None or verdict.state == "open":
@@ -30,9 +29,9 @@ def update_mark(verdict: IntegrityCheck) -> None:
 
 
 def marked_damage(data: Path, uuid: str) -> list[dict[str, Any]]:
-    """Damage of an episode, a table per file as in Verdict.document; [] where nothing was found.
+    """Return the damage of an episode, one table per file as in `IntegrityCheck.to_dict`; [] if none is known.
 
-    An invalid mark counts as nothing found: the next scrub makes it anew.
+    An invalid mark counts as none: the next scrub writes it anew.
     """
     mark = read_mark(data, uuid)
     return mark.damage if mark else []
@@ -42,14 +41,14 @@ def _mark(data: Path, verdict: IntegrityCheck) -> None:
     path, damage = mark_file(data, verdict.path.name), verdict.to_dict()["damage"]
     with exclusive(path.parent):
         known = read_mark(data, verdict.path.name)
-        seal = (known.seal if known else None) or verdict.seal  # the first one: that of what was recorded
+        seal = (known.seal if known else None) or verdict.seal  # the first one: of the original recording
         if known is None or (known.damage, known.seal) != (damage, seal):
             told = {"uuid": verdict.path.name, "found": time.time(), "seal": seal, "damage": damage}
             write_atomic(path, to_json(told, "the mark", indent=1))
 
 
 def _take_back(data: Path, verdict: IntegrityCheck) -> None:
-    """Only after another look: somebody else may have found damage since the one that `verdict` is of."""
+    """Remove the mark after checking again: another process may have found damage since `verdict`."""
     path = mark_file(data, verdict.path.name)
     with exclusive(path.parent):
         mark = read_mark(data, verdict.path.name)

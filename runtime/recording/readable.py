@@ -1,4 +1,4 @@
-"""Damage of a recording without digests: what cannot be read, or only in part."""
+"""Damage of a recording without digests: files that cannot be read, or only in part."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ EVENTS = "events.jsonl"
 
 
 def find_unreadable(folder: Path) -> tuple[Damage, ...]:
-    """The files of the closed episode in `folder` that are torn, empty or absent.
+    """Return damage for files of the closed episode in `folder` that are torn, empty or absent.
 
-    Tables and events of one that failed may end anywhere: that is how it was recorded.
+    Tables and events of a failed episode may end anywhere: they were recorded like that.
     """
     try:
         episode = open_episode(folder)

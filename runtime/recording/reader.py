@@ -1,4 +1,4 @@
-"""Opens an episode's folder: manifest, outcome, tables and videos, cut to what belongs together."""
+"""Reading of an episode's folder: manifest, outcome, tables and videos, cut to their common length."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from runtime.recording.tables import SCHEMAS, read_table
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One episode as it lies on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
+    """One episode as it is on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
 
-    Its files are not verified against the digests of its outcome, which is left without them: runtime.recording.scrub.
+    Its files are not verified against the digests in its outcome, and `outcome` does not contain them; for a check see
+    runtime.recording.scrub.
 
-    `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`; it may have more,
-    and that of a camera that was lost has fewer: `shown`. Without an outcome the episode is being written or was cut
-    off: then `frames` only counts rows, and videos may still lack some of them.
+    `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`. A video may have
+    more frames, and that of a lost camera has fewer: see `shown`. Without an outcome the episode is being written or
+    was cut off: then `frames` only counts rows, and videos may have fewer frames.
     """
 
     path: Path
@@ -40,17 +41,17 @@ class Episode:
 
     @property
     def lost(self) -> Mapping[str, Mapping[str, Any]]:
-        """Cameras whose video ended before the episode did: `row`, the first without a picture, and `reason`."""
+        """Cameras whose video ended before the episode: `row`, the first without a picture, and `reason`."""
         lost = (self.outcome or {}).get("lost_cameras")
         return lost if isinstance(lost, Mapping) else {}
 
     def shown(self, camera: str) -> int:
-        """Count of rows, from the first, that have a frame of that camera."""
+        """Return the number of rows, from the first, that have a frame of that camera."""
         return min(self.frames, int(self.lost[camera]["row"])) if camera in self.lost else self.frames
 
 
 def open_episode(path: Path) -> Episode:
-    """Read the episode in folder `path`; RecordingError names the file that is absent or damaged."""
+    """Read the episode in folder `path`. Raises RecordingError with the file that is absent or damaged."""
     manifest = read_json(path / "manifest.json")
     layout = Layout.from_manifest(manifest)
     outcome = without_digests(read_outcome(path)) if (path / OUTCOME).exists() else None
@@ -75,14 +76,14 @@ def open_episode(path: Path) -> Episode:
 
 @dataclass(frozen=True, slots=True)
 class EventsRead:
-    """The whole lines of an event log, and how many were torn."""
+    """Whole lines of an event log, and the number of torn lines."""
 
     lines: tuple[bytes, ...]
     torn: int
 
 
 def read_events(path: Path) -> EventsRead:
-    """Every line that is one JSON object; an absent log has none."""
+    """Return every line that is one JSON object; an absent log has none. Raises RecordingError."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:

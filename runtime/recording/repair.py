@@ -1,4 +1,4 @@
-"""Completes an episode whose recorder was killed: cuts torn tails, makes lengths equal, writes an outcome."""
+"""Completion of an episode whose recorder was killed: cut torn ends, equalise lengths, write an outcome."""
 
 from __future__ import annotations
 
@@ -34,42 +34,46 @@ from runtime.recording.tables import SCHEMAS, read_table, write_table
 from runtime.recording.verdict import IntegrityCheck
 
 REASON = "the recorder ended without closing the episode"
-UNCUT = "rows.uncut.arrow"  # the rows as they were found, where any had to go
-PLAN = ".repair.json"  # how the episode was found, as long as its repair is under way
+UNCUT = "rows.uncut.arrow"  # rows as they were found, if some were cut
+PLAN = ".repair.json"  # state of the episode before its repair, while that is under way
 UNPROVABLE = "its outcome is lost, and with it whether its files are as they were recorded"
 
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
-    """Findings and actions of a repair.
+    """Findings and actions of a repair, with one of these values of `verdict`:
 
-    "complete": had an outcome, nothing done. "restored": has its outcome back from its copy; `problem` is
-    what had become of it. "damaged": had one, and `problem` is what is not as it was recorded; nothing done,
-    it cannot be mended. "repaired": has one now; `problem` is what cannot be known any more of one that had
-    been closed before. "recording": is being written right now, nothing done. "unreadable": no manifest to go
-    by, nothing done. "failed": `problem` stopped it.
+    "complete": it has an outcome, nothing was done.
+    "restored": its outcome was restored from the copy; `problem` is the damage that it had.
+    "damaged": it has an outcome that its files do not match (`problem`); it cannot be mended, nothing was done.
+    "repaired": it now has an outcome; `problem` names facts that are lost if it had been closed before.
+    "recording": it is being written, nothing was done.
+    "unreadable": it has no usable manifest, nothing was done.
+    "failed": stopped by `problem`.
     """
 
     path: Path
     verdict: Literal["complete", "restored", "damaged", "repaired", "recording", "unreadable", "failed"]
     problem: str = ""
-    frames: int = 0  # rows that have a frame in every video
+    frames: int = 0  # rows with a frame in every video
     rows_cut: int = 0  # whole rows without a frame in every video
     video_frames: Mapping[str, int] = field(default_factory=dict)
-    torn_bytes: int = 0  # cut from the tables and videos
-    torn_lines: int = 0  # cut from the events
-    lost: Mapping[str, str] = field(default_factory=dict)  # cameras whose video had ended before, and why
+    torn_bytes: int = 0  # bytes cut from tables and videos
+    torn_lines: int = 0  # lines cut from the events
+    lost: Mapping[str, str] = field(
+        default_factory=dict
+    )  # cameras whose video had ended before, with the reason
 
 
 def repair(path: Path) -> RepairReport:
-    """Complete the episode in folder `path` where it has no outcome; running it again changes nothing.
+    """Complete the episode in folder `path` if it has no outcome; running it again changes nothing.
 
-    One that had an outcome gets that back from its copy, where its files are as that says, and is left alone where they
-    are not, or where it is marked as damaged: what was changed is never sealed as what was recorded.
+    An episode that had an outcome gets it back from its copy if its files match. Otherwise, or if it is marked as
+    damaged, it is left alone: changed files are never sealed as if they had been recorded.
 
-    Rows without a frame in every video are cut, but for cameras whose video had ended before; the table as found stays
-    beside as rows.uncut.arrow. Videos are never re-encoded: only a torn fragment at their end is cut. RecordingError
-    where the disk fails.
+    Rows without a frame in every video are cut, except for cameras whose video had ended before; the table as found
+    stays as rows.uncut.arrow. Videos are never re-encoded: only a torn fragment at their end is cut. Raises
+    RecordingError if the disk fails.
     """
     if not path.is_dir():
         raise RecordingError(f"{path} is no folder of an episode")
@@ -85,7 +89,7 @@ def repair(path: Path) -> RepairReport:
 
 
 def repair_all(root: Path) -> list[RepairReport]:
-    """Repair every episode in `root` that has no outcome; one that fails does not keep the others."""
+    """Repair every episode in `root` without an outcome; one that fails does not stop the others."""
     folders = [folder for folder in sorted(root.iterdir()) if folder.is_dir()] if root.is_dir() else []
     return [_attempt(folder) for folder in folders if not (folder / OUTCOME).exists()]
 
@@ -109,7 +113,10 @@ def _judge(path: Path) -> RepairReport:
 
 
 def _closed(path: Path, found: IntegrityCheck) -> RepairReport:
-    """Nothing is mended but the outcome, from its copy, or that copy, where all other files are as they say."""
+    """Restore a missing or damaged outcome, or its copy, from the other one; mend nothing else.
+
+    This is done only if all other files match.
+    """
     restored = ""
     if found.state in ("open", "damaged") and (whole := _whole_outcome(path, found)):
         write_outcome(path, whole)
@@ -123,7 +130,7 @@ def _closed(path: Path, found: IntegrityCheck) -> RepairReport:
 
 
 def _whole_outcome(path: Path, found: IntegrityCheck) -> bytes | None:
-    """The one of its two files that is as it was sealed, where nothing but the other one is damaged; None else."""
+    """Return the intact one of the two outcome files if only the other one is damaged; else None."""
     if {one.file for one in found.damage} - {OUTCOME, OUTCOME_COPY}:
         return None
     whole = {}
@@ -147,23 +154,23 @@ def _complete(path: Path, layout: Layout) -> RepairReport:
         path, "repaired", found.unproven, frames, cut, videos, found.torn_bytes, found.torn_lines, lost
     )
     write_outcome(path, seal_outcome(_outcome(report, layout, found.ended), digests_of(path, layout)))
-    (path / PLAN).unlink()
+    (path / PLAN).unlink()  # last: a repair that is killed before continues from the stored state
     return report
 
 
 @dataclass(frozen=True, slots=True)
 class _FolderState:
-    """The episode as it lay there before anything was mended, for who goes on where a repair was killed."""
+    """Episode before its repair, stored so that a repair can continue after a kill."""
 
-    ended: float  # when it was last written [Unix s]
+    ended: float  # time of its last write [Unix s]
     rows: int
     torn_bytes: int
     torn_lines: int
-    unproven: str  # what nobody can say of it any more
+    unproven: str  # facts that can no longer be proven
 
 
 def _load_or_measure(path: Path, layout: Layout) -> _FolderState:
-    """As an earlier attempt wrote it down, else measured and written down now."""
+    """Return the state that an earlier attempt stored; else measure and store it now."""
     plan = path / PLAN
     if plan.exists():
         try:
@@ -186,7 +193,7 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 
 
 def _unproven(path: Path, closed: bool) -> str:
-    """Facts that cannot be known any more of an episode once closed, "" where nothing tells that it was."""
+    """Return a sentence on the lost facts of an episode that was closed; "" without a sign that it was."""
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None
     if table is not None and table.exists():
@@ -195,13 +202,13 @@ def _unproven(path: Path, closed: bool) -> str:
 
 
 def _torn(video: Path) -> int:
-    """Bytes behind the last whole fragment."""
+    """Return the number of bytes after the last whole fragment."""
     end = whole_bytes(video) if video.exists() else 0
     return video.stat().st_size - end if end else 0
 
 
 def _repair_videos(path: Path, layout: Layout) -> dict[str, int]:
-    """Frames per camera."""
+    """Cut torn ends of the videos; return the number of frames per camera."""
     frames = {}
     for camera in layout.cameras:
         video = path / f"{camera}.mp4"
@@ -214,7 +221,7 @@ def _repair_videos(path: Path, layout: Layout) -> dict[str, int]:
 
 
 def _repair_tables(path: Path, layout: Layout, videos: Sequence[int]) -> int:
-    """Common number of rows and frames in videos of so many."""
+    """Cut the rows to the shortest of `videos` and close all tables; return the common number of rows and frames."""
     frames = 0
     for name, schema in SCHEMAS.items():
         file = path / f"{name}.arrow"
@@ -238,7 +245,7 @@ def _keep_uncut(path: Path) -> None:
 
 
 def _repair_events(path: Path) -> dict[str, str]:
-    """The cameras whose video had ended, with what was said of it."""
+    """Remove torn lines; return the cameras whose video had ended, with the recorded reason."""
     log = path / "events.jsonl"
     events = read_events(log)
     if events.torn or not log.exists():

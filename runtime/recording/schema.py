@@ -1,4 +1,4 @@
-"""Content required of a demonstration by its manifest's `collection`; other episodes have all there is."""
+"""Content that a manifest's `collection` requires of a demonstration; other episodes record everything."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.core.types import Observation
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Which cameras and vectors are recorded; None for all. `reported`: actions are those that the node reports."""
+    """Recorded cameras and vectors, None for all. `reported`: actions are those that the node reports."""
 
     cameras: tuple[str, ...] | None = None
     columns: tuple[str, ...] | None = None
@@ -22,7 +22,7 @@ class Schema:
 
     @classmethod
     def from_manifest(cls, manifest: Mapping[str, Any]) -> Schema:
-        """That of a manifest, before media has completed it."""
+        """Read it from a manifest that media has not completed yet."""
         said = manifest.get("collection")
         if not said:
             return cls()
@@ -36,20 +36,20 @@ class Schema:
         )
 
     def recorded_cameras(self, cameras: Sequence[str]) -> tuple[str, ...]:
-        """Those of `cameras` that are recorded."""
+        """Return those of `cameras` that are recorded."""
         return tuple(key for key in cameras if self.cameras is None or key in self.cameras)
 
     def records_column(self, column: str) -> bool:
-        """True if that vector is recorded, where it is there."""
+        """Return True if that vector is recorded when it is available."""
         return self.columns is None or column in self.columns
 
     def streams(self, *, qvel: bool, effort: bool, posed: bool) -> dict[str, bool]:
-        """Which vectors beside joints and actions are recorded of a robot that has these; `posed`: it has arms."""
+        """Return which vectors, besides joints and actions, are recorded of a robot with these (`posed`: with arms)."""
         there = {"qvel": qvel, "effort": effort, "eef": posed, "eef_action": posed}
         return {name: has and self.records_column(name) for name, has in there.items()}
 
     def check(self, newest: Observation) -> None:
-        """RecordingError where the robot does not measure what every row must have."""
+        """Raise RecordingError if the robot does not measure a stream that every row must have."""
         missing = [name for name in self.required if getattr(newest, name) is None]
         if missing:
             raise RecordingError(

@@ -1,4 +1,4 @@
-"""Comparison of a recording with what was recorded: every file against the digests in its outcome."""
+"""Integrity check of a recording: every file against the digests in its outcome."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from runtime.recording.verdict import Damage, DamagedError, IntegrityCheck, Stat
 
 
 def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
-    """Read the files of the episode in `folder`, all or `files`; RecordingError where it is none, or closed to us."""
+    """Check the files of the episode in `folder`, all or only `files`.
+
+    Raises RecordingError if the folder is no episode or cannot be read.
+    """
     if not (folder / OUTCOME).exists():
         return _without_outcome(folder)
     try:
@@ -35,7 +38,7 @@ def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
 
 
 def _without_outcome(folder: Path) -> IntegrityCheck:
-    """Open, as far as anything here tells."""
+    """Return the check of an episode without an outcome: open, unless a copy or a mark shows that it was closed."""
     if (folder / OUTCOME_COPY).exists():
         found = _verify_by_copy(folder, Damage(OUTCOME, "is absent, and was there"))
         if found.seal and len(found.damage) == 1:
@@ -49,7 +52,7 @@ def _without_outcome(folder: Path) -> IntegrityCheck:
 
 
 def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
-    """That of an episode whose outcome is `lost`, and what the copy of that says of the other files."""
+    """Return the check of an episode whose outcome is lost or damaged, by its copy if that is whole."""
     if not (folder / OUTCOME_COPY).exists():
         return IntegrityCheck(folder, "damaged", (lost,))
     try:
@@ -65,7 +68,7 @@ def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
 def _compare_digests(
     folder: Path, outcome: Mapping[str, Any], files: Collection[str], second: bool = True
 ) -> IntegrityCheck:
-    """All files, or `files`, against their digests; all files include, if `second`, the copy of the outcome."""
+    """Compare all files, or `files`, with their digests; with `second` all files include the copy of the outcome."""
     manifest = _manifest(folder)
     digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
     found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
@@ -87,9 +90,7 @@ def _verify_copy(folder: Path) -> Damage | None:
 
 
 def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
-    """As `verify`; DamagedError where a file is not what was recorded, or was found not to be and nothing says that
-    this is mended.
-    """
+    """Verify the episode. Raises DamagedError if a file differs from its digest, or earlier damage is unresolved."""
     verdict = verify_episode(folder, files)
     if verdict.state in ("sound", "unsealed") and (damage := known_damage(verdict)):
         verdict = IntegrityCheck(folder, "damaged", damage, verdict.bytes, verdict.seal)
@@ -99,7 +100,10 @@ def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
 
 
 def episodes_in(path: Path) -> list[Path]:
-    """The folders of episodes that `path` is, or has in it or in its folder `episodes`; RecordingError for none."""
+    """Return the episode folders at `path`, in it or in its folder `episodes`.
+
+    Raises RecordingError if there are none.
+    """
     if not path.is_dir():
         raise RecordingError(f"{path} is no folder")
     if _is_episode(path):
@@ -126,13 +130,13 @@ def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> D
     except IsADirectoryError:
         return Damage(path.name, "is a folder")
     except OSError as error:
-        if error.errno == errno.EIO:  # of the disk itself; any other is ours to mend
+        if error.errno == errno.EIO:  # a failing disk is damage; other errors can be corrected
             return Damage(path.name, "cannot be read: the disk fails")
         raise disk_error("verifying", path, error) from error
 
 
 def _located(name: str, file: BinaryIO, digest: FileDigest, rate: float | None) -> Damage:
-    """Which pieces of the file are others; of a table or video whose header is, every row is in doubt."""
+    """Return the damage with the rows of the changed pieces; a changed header makes all rows doubtful."""
     size = file.seek(0, os.SEEK_END)
     what = (
         "is changed" if size == digest["bytes"] else f"has {size} bytes, was recorded with {digest['bytes']}"
@@ -167,7 +171,7 @@ def _joined(spans: list[tuple[int, int]], first: int, last: int) -> list[tuple[i
 
 
 def _manifest(folder: Path) -> Mapping[str, object]:
-    """For times alone: one that cannot be read is named by its digest."""
+    """Return the manifest, needed only for times; {} if it is unreadable, which its digest reports."""
     try:
         return read_json(folder / MANIFEST)
     except RecordingError:
@@ -175,7 +179,7 @@ def _manifest(folder: Path) -> Mapping[str, object]:
 
 
 def _rate(name: str, manifest: Mapping[str, object]) -> float | None:
-    """Rows of that file per second; None where they have no rate."""
+    """Return the rows per second of that file; None if its rows have no rate."""
     key = "control_rate" if name == "ticks.arrow" else "fps"
     timed = name.endswith(".mp4") or name.startswith(("rows.", "ticks."))
     value = manifest.get(key) if timed else None

@@ -1,4 +1,4 @@
-"""The outcome of an episode with the digests of its files, and its own: what it says can be verified at any time."""
+"""Outcome of an episode with the digests of its files and its own seal, so that it can be verified at any time."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ from runtime.recording.layout import Layout
 from runtime.recording.tables import SCHEMAS
 
 MANIFEST, OUTCOME = "manifest.json", "outcome.json"
-OUTCOME_COPY = (
-    "sealed.json"  # the outcome once more, byte by byte: what tells a lost one from none, and brings it back
-)
+OUTCOME_COPY = "sealed.json"  # exact copy of the outcome: proof that there was one, and its backup
 DIGESTS, SEAL, COPY = "digests", "seal", "copy"  # keys of the outcome
 _UNSEALED = b"0" * hashlib.sha256().digest_size * 2
 
 
 def digest_of(path: Path, layout: Layout) -> FileDigest:
-    """Of a file as it lies in the folder of an episode; RecordingError where it cannot be read."""
+    """Return the digest of a file in an episode's folder. Raises RecordingError if it cannot be read."""
     digest = Digest(rows_per_piece(layout.fps) if path.suffix == ".mp4" else 1)
     try:
         for data, rows in _parts(path):
@@ -36,7 +34,7 @@ def digest_of(path: Path, layout: Layout) -> FileDigest:
 
 
 def digests_of(folder: Path, layout: Layout) -> dict[str, FileDigest]:
-    """Of every file that an episode has, as they lie in `folder`."""
+    """Return the digests of every file of the episode in `folder`."""
     return {path.name: digest_of(path, layout) for path in sorted(folder.iterdir()) if _counts(path, layout)}
 
 
@@ -46,23 +44,24 @@ def _counts(path: Path, layout: Layout) -> bool:
 
 
 def seal_outcome(outcome: Mapping[str, object], digests: Mapping[str, FileDigest]) -> bytes:
-    """outcome.json: with the digests of the files, and last that of itself, taken with zeros in its place."""
+    """Return outcome.json with the digests of the files and its own digest, computed with zeros in its place."""
     whole = {**outcome, COPY: OUTCOME_COPY, DIGESTS: digests, SEAL: _UNSEALED.decode()}
     text = to_json(whole, "the outcome", indent=1)
+    # The seal is the last key, so its zeros are the last ones in the text.
     before, _, after = text.rpartition(_UNSEALED)
     return before + hashlib.sha256(text).hexdigest().encode() + after
 
 
 def write_outcome(folder: Path, text: bytes) -> None:
-    """Put the sealed outcome at its two places; with outcome.json, which comes last, the episode is closed."""
+    """Write the sealed outcome and its copy. outcome.json comes last: with it the episode is closed."""
     for name in (OUTCOME_COPY, OUTCOME):
         write_atomic(folder / name, text)
 
 
 def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
-    """The outcome of an episode; RecordingError where it is absent, torn, or not as it was sealed.
+    """Return the outcome of an episode. Raises RecordingError if it is absent, torn, or differs from its seal.
 
-    One from before there were digests has none, and no seal. `name` is that of either of its files.
+    Outcomes older than digests have neither digests nor seal. `name` is either of the two outcome files.
     """
     path = folder / name
     outcome = read_json(path)
@@ -77,12 +76,12 @@ def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
 
 
 def without_digests(outcome: Mapping[str, object]) -> dict[str, object]:
-    """An outcome without its digests, for who copies it to where they mean nothing."""
+    """Return an outcome without its digests, for copies elsewhere."""
     return {name: value for name, value in outcome.items() if name not in (COPY, DIGESTS, SEAL)}
 
 
 def _parts(path: Path) -> Iterator[tuple[bytes, int]]:
-    """The file in parts, and how many rows or lines each has, as its writer would have told."""
+    """Yield the parts of a file with their number of rows or lines, as its writer added them to the digest."""
     if path.suffix == ".mp4":
         yield from fragments(path)
     elif path.suffix == ".arrow":

@@ -1,4 +1,4 @@
-"""Settings of recordings: the encoder and its bounds, flags, and when the disk counts as full."""
+"""Settings of recordings: encoder and its bounds, flags, and the limit of free disk space."""
 
 from __future__ import annotations
 
@@ -80,11 +80,11 @@ class RecordingSettings(Settings):
         return CODECS[self.codec].crf if self.crf is None else self.crf
 
     def chosen_gop(self, fps: float) -> int:
-        """Most frames between two key frames at that rate."""
+        """Return the most frames between two key frames at that rate [Hz]."""
         return self.gop or max(1, min(_GOP, int(_GOP_SECONDS * fps)))
 
     def sizes(self, cameras: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, int]]:
-        """(height, width) of each video, of cameras of those (height, width)."""
+        """Return the (height, width) of each video for cameras of these (height, width)."""
         return {camera: self._size(camera, *size) for camera, size in cameras.items()}
 
     def _size(self, camera: str, height: int, width: int) -> tuple[int, int]:

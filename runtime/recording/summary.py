@@ -1,4 +1,4 @@
-"""Statements of an outcome about the rows of an episode, read back from its table."""
+"""Figures of an outcome about the rows of an episode, read back from its table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.core.errors import RecordingError
 from runtime.recording.columns import spread
 from runtime.recording.layout import Layout
 
-HELD = ("hold", "none")  # sources under which nobody asked the robot for anything
+HELD = ("hold", "none")  # sources of ticks in which no motion was requested
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,17 +23,17 @@ class Summary:
     """Figures over the first `frames` rows. `skew` is the spread of the capture times within a row [s]."""
 
     frames: int
-    duration_s: float  # held rows excluded
+    duration_s: float  # [s], without held rows
     held_rows: int
-    repeated: Mapping[str, int]  # per camera
-    lost: Mapping[str, int]  # per camera: those of `repeated` whose picture there was, but the video has not
-    stale: Mapping[str, int]  # per camera: rows whose picture is too old
+    repeated: Mapping[str, int]  # by camera
+    lost: Mapping[str, int]  # by camera: repeats for which there was a picture
+    stale: Mapping[str, int]  # by camera: rows with too old a picture
     skewed_rows: int
-    skew_mean_s: float | None  # None where no row has two known capture times
+    skew_mean_s: float | None  # None if no row has two known capture times
     skew_max_s: float | None
 
     def to_dict(self) -> dict[str, object]:
-        """As they stand in outcome.json."""
+        """Return the figures in the form of outcome.json."""
         return {
             "frames": self.frames,
             "duration_s": self.duration_s,
@@ -47,9 +47,9 @@ class Summary:
 
 
 def summarise(path: Path, layout: Layout, frames: int) -> Summary:
-    """Read the first `frames` rows of rows.arrow batch by batch, so that memory stays constant.
+    """Return the summary of the first `frames` rows, read batch by batch so that memory stays constant.
 
-    RecordingError where that many cannot be read.
+    Raises RecordingError if fewer rows can be read.
     """
     tally = _Tally(layout)
     try:
@@ -107,5 +107,5 @@ class _Tally:
 
 
 def _count_true(batch: Any, column: str) -> int:
-    """Rows that have the flag; 0 in a table from before there was one."""
+    """Return the number of rows with the flag; 0 if the table is older than the flag."""
     return int(batch.column(column).true_count) if column in batch.schema.names else 0

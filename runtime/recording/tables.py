@@ -1,4 +1,4 @@
-"""The tables of an episode: their Arrow schemas, a stream writer that a kill cannot spoil, and its reader."""
+"""Tables of an episode: Arrow schemas, a stream writer that survives a kill, and its reader."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ END_OF_STREAM = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow columnar format, "I
 
 
 def rows_schema(layout: Layout) -> Any:
-    """rows.arrow: one row per step of the dataset's grid; frame k of every video belongs to row k."""
+    """Return the schema of rows.arrow: one row per step of the dataset grid; row k has frame k of every video."""
     vectors = [pa.field(name, _vector(layout.width(name))) for name in layout.streams]
     captures = [pa.field(f"capture_time.{stream}", pa.float64()) for stream in layout.capture_streams]
     flags = [
@@ -51,7 +51,10 @@ def rows_schema(layout: Layout) -> Any:
 
 
 def ticks_schema(layout: Layout) -> Any:
-    """ticks.arrow, the executed stream: a row per control tick, `executed` null where nothing was sent."""
+    """Return the schema of ticks.arrow, the executed stream: one row per control tick.
+
+    `executed` is null if nothing was sent.
+    """
     return pa.schema(
         [
             pa.field("step", pa.int64()),
@@ -70,7 +73,7 @@ def ticks_schema(layout: Layout) -> Any:
 
 
 def smoothed_schema(layout: Layout) -> Any:
-    """smoothed.arrow: what the timeline asked for, where it did, with the chunks that made it."""
+    """Return the schema of smoothed.arrow: planned actions, with the chunks that made them, of ticks that have one."""
     return pa.schema(
         [
             pa.field("step", pa.int64()),
@@ -82,7 +85,7 @@ def smoothed_schema(layout: Layout) -> Any:
 
 
 def raw_schema(layout: Layout) -> Any:
-    """raw.arrow: one row per row of every chunk, in the policy's own space and width."""
+    """Return the schema of raw.arrow: one row per row of every chunk, in the policy's own space and width."""
     return pa.schema(
         [
             pa.field("chunk_id", pa.int64()),
@@ -113,8 +116,8 @@ SCHEMAS: Mapping[str, Callable[[Layout], Any]] = {
 }
 
 
-# Columns that tables did not have from the beginning, oldest first: null in those of older episodes.
-# A name that ends with a dot stands for those of all cameras.
+# Columns added later, oldest first; they are null in older episodes. A name that ends with a dot stands for the columns
+# of all cameras.
 ADDED = (
     frozenset({"strategy", "overlap", "woke"}),
     frozenset({"ik_position_error", "ik_rotation_error", "ik_flags", "eef_source"}),
@@ -124,7 +127,7 @@ ADDED = (
 
 
 def added(column: str) -> bool:
-    """True if older tables may lack that column."""
+    """Return True if older tables may lack that column."""
     return _among(column, frozenset[str]().union(*ADDED))
 
 
@@ -137,13 +140,13 @@ def _vector(width: int) -> Any:
 
 
 def _generations(schema: Any) -> list[Any]:
-    """The schema as it is, and as it was before each of the times when columns were added."""
+    """Return the present schema, and the schema before each addition of columns."""
     absent = [frozenset[str]().union(*ADDED[first:]) for first in range(len(ADDED) + 1)]
     return [pa.schema([field for field in schema if not _among(field.name, names)]) for names in absent]
 
 
 class TableWriter:
-    """One Arrow IPC stream: records wait in memory until `flush` turns them into one batch and one write.
+    """Arrow IPC stream: records wait in memory until `flush` turns them into one batch and one write.
 
     Any thread may add; one thread flushes, syncs and closes.
     """
@@ -164,15 +167,15 @@ class TableWriter:
 
     @property
     def waiting(self) -> int:
-        """Records that are only in memory."""
+        """Number of records that are only in memory."""
         return len(self._waiting)
 
     def add(self, record: object) -> None:
-        """Take one record; neither it nor its arrays may change any more."""
+        """Add one record; neither it nor its arrays may change afterwards."""
         self._waiting.append(record)
 
     def flush(self) -> None:
-        """Write what waits as one record batch; where that fails it is kept for the next attempt."""
+        """Write the waiting records as one batch; if that fails, the batch is kept for the next attempt."""
         if not self._unwritten:
             records = [self._waiting.popleft() for _ in range(len(self._waiting))]
             if records:
@@ -183,7 +186,7 @@ class TableWriter:
             self._unwritten = b""
 
     def finish(self) -> None:
-        """Write what waits and the mark of the stream's end; what failed is written by the next attempt."""
+        """Write the waiting records and the end mark of the stream; after a failure, call it again."""
         while self._unwritten or self._waiting:
             self.flush()
         if not self._ended:
@@ -202,19 +205,19 @@ def _array(values: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class TableRead:
-    """Readable part of a table: its whole batches, and what is wrong with the rest."""
+    """Readable part of a table: its whole batches, and the state of the rest."""
 
     table: Any  # pyarrow.Table
-    torn_bytes: int  # after the last whole batch, its end mark aside
-    closed: bool  # the end mark is there and nothing follows
+    torn_bytes: int  # bytes after the last whole batch, without the end mark
+    closed: bool  # the end mark is present and last
 
 
 def read_table(path: Path, schema: Any) -> TableRead:
-    """Read an Arrow stream up to its torn tail; an absent or headless file counts as empty.
+    """Read an Arrow stream up to its torn end; an absent file or one without a header counts as empty.
 
-    A batch also ends the table where its columns contradict themselves, or where `index` of rows.arrow does
-    not go on by ones: a power cut can leave zeros in place of data. Columns that older files lack are null.
-    RecordingError where the file cannot be read at all or has other columns than `schema`.
+    The table also ends at a batch whose columns contradict each other, or whose `index` in rows.arrow does not count
+    on: a power cut can leave zeros instead of data. Columns that older files lack are null. Raises RecordingError if
+    the file cannot be read at all or has other columns than `schema`.
     """
     try:
         data = path.read_bytes()
@@ -239,7 +242,7 @@ def read_table(path: Path, schema: Any) -> TableRead:
 
 
 def _completed(table: Any, schema: Any) -> Any:
-    """The table with nulls in the columns of `schema` that it lacks."""
+    """Return the table with null columns for those of `schema` that it lacks."""
     for field in schema:
         if field.name not in table.column_names:
             table = table.append_column(field, pa.nulls(table.num_rows, field.type))
@@ -268,6 +271,6 @@ def _difference(given: Any, expected: Any) -> str:
 
 
 def write_table(path: Path, table: Any) -> None:
-    """Put a whole, closed Arrow stream at `path`, atomically."""
+    """Write a whole, closed Arrow stream to `path`, atomically."""
     batches = [batch.serialize().to_pybytes() for batch in table.to_batches()]
     write_atomic(path, b"".join([table.schema.serialize().to_pybytes(), *batches, END_OF_STREAM]))

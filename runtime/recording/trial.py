@@ -1,4 +1,4 @@
-"""Trial on this machine of the video encoder that a deployment asks for: a few pictures are coded."""
+"""Test of a deployment's video encoder on this machine: a few pictures are coded."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from runtime.core.errors import ConfigurationError
 from runtime.recording.codecs import CODECS, PIXELS, configure_context, options
 from runtime.recording.settings import RecordingSettings
 
-_SIZE = (192, 256)  # height and width; hardware encoders refuse smaller ones
+_SIZE = (192, 256)  # height and width; hardware encoders refuse smaller pictures
 _PICTURES = 4
 
 
 def require_encoder(settings: RecordingSettings) -> None:
-    """ConfigurationError naming the encoder, and those that work, where this machine cannot code as it is asked to."""
+    """Raise ConfigurationError, with the usable encoders, if this machine cannot encode with these settings."""
     name = settings.codec
     try:
         _code(name, settings.chosen_preset, settings.chosen_crf, settings.gop or 1)
@@ -31,7 +31,7 @@ def require_encoder(settings: RecordingSettings) -> None:
 
 
 def is_encoder_usable(name: str) -> bool:
-    """True if this machine can use that encoder as it is by default."""
+    """Return True if this machine can use that encoder with its default settings."""
     codec = CODECS[name]
     try:
         _code(name, codec.preset, codec.crf, 1)

@@ -1,4 +1,4 @@
-"""Result of a look at the files of a recording, in words and as JSON."""
+"""Result of an integrity check of a recording, as sentences and as JSON."""
 
 from __future__ import annotations
 
@@ -17,18 +17,16 @@ State = Literal["sound", "damaged", "unsealed", "open"]
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Damage of one file of an episode, and its rows; of events.jsonl its lines."""
+    """Damage of one file of an episode and its rows (lines in events.jsonl)."""
 
     file: str
     description: str
-    rows: tuple[tuple[int, int], ...] = ()  # first and last, both included
-    times: tuple[
-        tuple[float, float], ...
-    ] = ()  # of these rows [s since the episode began], where that is known
+    rows: tuple[tuple[int, int], ...] = ()  # (first, last), both included
+    times: tuple[tuple[float, float], ...] = ()  # of these rows [s since the start of the episode], if known
 
     @property
     def text(self) -> str:
-        """For a person."""
+        """Sentence for the operator."""
         unit = "lines" if self.file.endswith(".jsonl") else "rows"
         spans = [f"{first} to {last}" for first, last in self.rows]
         times = [f"{first:.2f} to {last:.2f}" for first, last in self.times]
@@ -38,22 +36,23 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class IntegrityCheck:
-    """Of one episode. "unsealed": nobody can say whether its files are as they were written. "open": it has no outcome.
+    """Integrity check of one episode: "sound", "damaged", "unsealed" (no digests) or "open" (no outcome).
 
-    `seal` is that of its outcome, or of the copy of it where that is lost; "" where there is neither.
+    "unsealed" means that nothing proves whether its files are as they were written. `seal` is that of its outcome, or
+    of the copy if the outcome is lost; "" if there is neither.
     """
 
     path: Path
     state: State
     damage: tuple[Damage, ...] = ()
-    bytes: int = 0  # that were read
+    bytes: int = 0  # number of bytes read
     seal: str = ""
-    repaired: bool = False  # it was repair that sealed it: what was before that, it does not prove
-    why: str = ""  # of "unsealed" and "open", where there is more to be said
+    repaired: bool = False  # sealed by repair, so the seal proves nothing about the time before
+    why: str = ""  # details on "unsealed" and "open"
 
     @property
     def text(self) -> str:
-        """For a person."""
+        """Sentence for the operator."""
         said = {
             "sound": f"every file is as {'repair left it' if self.repaired else 'it was recorded'}",
             "unsealed": self.why or UNSEALED,
@@ -63,7 +62,7 @@ class IntegrityCheck:
         return said[self.state]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the result as JSON."""
         damage = [
             {
                 "file": one.file,
@@ -79,7 +78,7 @@ class IntegrityCheck:
 
 
 class DamagedError(RecordingError):
-    """A recording is not what was recorded."""
+    """Error about a recording that was changed after it was recorded."""
 
     def __init__(self, verdict: IntegrityCheck) -> None:
         self.verdict = verdict

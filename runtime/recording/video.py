@@ -1,4 +1,4 @@
-"""One fragmented file of coded video, written while it grows: frame k is the picture of row k."""
+"""Fragmented file of coded video that grows while it is written: frame k is the picture of row k."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from runtime.recording.fragments import frames_in
 from runtime.recording.planes import to_yuv_planes
 from runtime.recording.settings import RecordingSettings
 
-FRAGMENT_SECONDS = 0.2  # what a kill can take
+FRAGMENT_SECONDS = 0.2  # duration that a kill can lose
 _FRAGMENTS = "frag_keyframe+empty_moov+default_base_moof"
 
 
 class FragmentedVideo:
-    """Encodes RGB pictures one after the other, at pts k / fps; nothing of it is a thread.
+    """Encoder of RGB pictures in sequence, at pts k / fps, without threads of its own.
 
-    Every finished fragment reaches the file in one write, so that a file without its end, or on a full disk,
-    still ends with a whole fragment. Pictures of another size than `size` are scaled.
+    Every finished fragment reaches the file in one write, so that after a kill or on a full disk the file still ends
+    with a whole fragment. Pictures of another size than `size` are scaled.
     """
 
     def __init__(
         self, file: AppendFile, size: tuple[int, int], fps: float, settings: RecordingSettings
     ) -> None:
-        self.frames = 0  # encoded so far
-        self.muxed = 0  # of them, those whose packet went to the muxer
-        self.muxed_at = 0.0  # when the newest did [s, monotonic]
+        self.frames = 0  # number of encoded frames
+        self.muxed = 0  # number of frames whose packet went to the muxer
+        self.muxed_at = 0.0  # time of the newest such packet [s, monotonic]
         self._file = file
         self._muxed = _Muxed()
         self._rate = Fraction(fps).limit_denominator(1001)
@@ -54,7 +54,7 @@ class FragmentedVideo:
         self._store()
 
     def encode(self, picture: UInt8 | None) -> None:
-        """Append one frame: `picture` [H, W, 3], or the previous one (black at first) for None."""
+        """Append one frame: `picture` RGB uint8 [H, W, 3]; None repeats the previous one (black at first)."""
         if picture is not None:
             self._picture = to_yuv_planes(picture, self._size)
         self._mux(self._code(key=self._key_next))
@@ -62,9 +62,10 @@ class FragmentedVideo:
         self._store()
 
     def repeat(self, count: int) -> None:
-        """Append the previous picture `count` times; from RUN on all but three frames are copies, which cost nothing.
+        """Append the previous picture `count` times; from RUN on all but three frames are copies without coding cost.
 
-        A run of copies is two key frames in turn: two of the same one would be a single picture to a decoder.
+        A run of copies alternates between two key frames: a decoder would take copies of one frame for a single
+        picture.
         """
         plain = count if count < RUN else count % 2
         for _ in range(plain):
@@ -76,13 +77,13 @@ class FragmentedVideo:
             self._mux(packets)
         if all(len(packets) == 1 and packets[0].is_keyframe for packets in pair):
             self._copy([packets[0] for packets in pair], count - plain - 2)
-        else:  # an encoder that keeps frames back
+        else:  # an encoder that delays frames
             for _ in range(count - plain - 2):
                 self._mux(self._code(key=False))
         self._store()
 
     def close(self) -> None:
-        """End the file, whose descriptor stays open; again, write what the file did not take of its end."""
+        """End the file, whose descriptor stays open; call it again to write bytes that a full disk refused."""
         if not self._ended:
             self._mux(self._stream.encode(None))
             self._container.close()
@@ -98,7 +99,7 @@ class FragmentedVideo:
         return packets
 
     def _copy(self, pair: list[Any], count: int) -> None:
-        """`count` (even) copies of two key frames; what follows may refer to neither."""
+        """Mux `count` (even) copies of two key frames; the next frame must not refer to them."""
         contents = [bytes(packet) for packet in pair]
         for number in range(count):
             packet = av.Packet(contents[number % 2])
@@ -133,7 +134,7 @@ class FragmentedVideo:
 
 
 class _Muxed:
-    """Output of the muxer since the last write to the file; no `seek`, so that it never goes back."""
+    """Output of the muxer since the last write to the file. Without `seek`, so that the muxer never goes back."""
 
     def __init__(self) -> None:
         self.bytes = bytearray()

@@ -1,4 +1,4 @@
-"""The journal's own thread: it alone waits for the disk, writes what has gathered, and syncs every file."""
+"""Writer thread of the journal, the only one that waits for the disk: it writes and syncs all files."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, TableWriter
 
 MOST_WAITING = 16384  # records of one table in memory: 80 s of ticks at 200 Hz
-_MANY = 1024  # from here on the thread does not wait for its period to end
+_MANY = 1024  # from this many on, the thread does not wait for the end of its period
 
 
 class ErrorLatch:
-    """The first error of any thread of a recording; kept until the caller has been told."""
+    """First error of any thread of a recording, stored until it is raised to the caller."""
 
     def __init__(self) -> None:
         self.first: RecordingError | None = None
         self.told = False
 
     def report(self, error: RecordingError) -> None:
-        """Keep `error`, or note it on the one that came first."""
+        """Store `error`, or add it as a note to the first one."""
         if self.first is None:
             self.first = error
         elif error is not self.first:
             self.first.add_note(str(error))
 
     def clear_disk_full(self) -> None:
-        """A full disk that nobody was told of has cost nothing yet: what it did not take is still held."""
+        """Forget a full disk that was not raised yet: refused bytes are still in memory, so nothing is lost."""
         if isinstance(self.first, DiskFullError) and not self.told:
             self.first = None
 
     def raise_pending(self) -> None:
-        """Raise what was reported, every time."""
+        """Raise the stored error, at every call."""
         if self.first is not None:
             self.told = True
             raise RecordingError(str(self.first)) from self.first
 
 
 class DiskWriter:
-    """Tables and events of one episode, written and synced together with `others` every flush period."""
+    """Writer of the tables and events of one episode, synced together with `others` every flush period."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class DiskWriter:
         self._left: Sequence[AppendFile] = ()
         self._others: Sequence[Callable[[], None]] = ()
         self._saved = False
-        self.full: DiskFullError | None = None  # why the end could not be written yet
+        self.full: DiskFullError | None = None  # reason why the end could not be written yet
         self._tables: dict[str, TableWriter] = {}
         with ExitStack() as undo:
             self._events = AppendFile(folder / "events.jsonl")
@@ -82,7 +82,7 @@ class DiskWriter:
         self._thread.start()
 
     def add(self, table: str, record: object, patience: float = 0.0) -> None:
-        """Queue one record; RecordingError where the disk has not taken any for too long."""
+        """Queue one record; report a fault if too many records wait for the disk."""
         writer = self._tables[table]
         writer.add(record)
         if writer.waiting >= _MANY:
@@ -99,10 +99,10 @@ class DiskWriter:
         leave: Sequence[AppendFile] = (),
         others: Sequence[Callable[[], None]] = (),
     ) -> bool:
-        """Write and sync everything, what `others` have too, end the streams, close the files but those in `leave`.
+        """Write and sync everything, end the streams, close all files except those in `leave`.
 
-        False where the disk has not done so by `deadline` (time.monotonic). Where it has no room `full` says so, the
-        files stay open, and `save` tries again.
+        Return False if that was not finished by `deadline` (time.monotonic). If the disk is full, `full` is set, the
+        files stay open, and `save` tries again. `others` are further writes to do at the end.
         """
         self._left, self._others = leave, others
         self._closing.set()
@@ -111,7 +111,7 @@ class DiskWriter:
         return not self._thread.is_alive()
 
     def digests(self) -> dict[str, FileDigest]:
-        """Of its own files, by name, once it has finished."""
+        """Return the digests of its own files by name, after it has finished."""
         return {file.path.name: file.digest for file in self._own}
 
     def _wait_for_room(self, writer: TableWriter, patience: float) -> None:
@@ -126,7 +126,7 @@ class DiskWriter:
             )
 
     def _run(self) -> None:
-        self._attempt(lambda: sync_folder(self._folder))  # the names of all files that begin created
+        self._attempt(lambda: sync_folder(self._folder))  # make the names of the new files durable
         while not self._closing.is_set():
             self._wake.wait(self._settings.flush_period_s)
             self._wake.clear()
@@ -142,7 +142,7 @@ class DiskWriter:
         require_room(self._folder, self._settings.min_free_bytes)
 
     def save(self) -> None:
-        """Save what can be saved: one file that fails does not keep the others from being closed properly."""
+        """Save as much as possible: a file that fails does not prevent the others from being closed properly."""
         if self._saved:
             return
         self.full = None
@@ -160,14 +160,16 @@ class DiskWriter:
             file.sync()
 
     def _write_lines(self) -> None:
-        while self._unwritten_lines or self._lines:  # what was refused before, then what came since
+        while (
+            self._unwritten_lines or self._lines
+        ):  # first the lines that were refused before, then newer ones
             if not self._unwritten_lines:
                 self._unwritten_lines = b"".join(self._lines.popleft() for _ in range(len(self._lines)))
             self._events.write(self._unwritten_lines, self._unwritten_lines.count(b"\n"))
             self._unwritten_lines = b""
 
     def _attempt(self, work: Callable[[], None], last: bool = False) -> None:
-        """Report what goes wrong; at the last a disk without room is no loss yet."""
+        """Run `work` and report its error; with `last`, a full disk is stored in `full`: nothing is lost yet."""
         try:
             work()
         except RecordingError as error:
@@ -175,5 +177,5 @@ class DiskWriter:
                 self.full = self.full or error
             else:
                 self._faults.report(error)
-        except Exception as error:  # a record that no column takes, a descriptor that is gone: say so, go on
+        except Exception as error:  # unexpected errors, too, must be reported without ending the thread
             self._faults.report(RecordingError(f"episode {self._folder}: {error!r}"))

@@ -1,1 +1,1 @@
-"""One deployment with its robot, before anything is connected."""
+"""Deployment of a station with its robot, before anything is connected."""

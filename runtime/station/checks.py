@@ -1,4 +1,4 @@
-"""Checks that the parts of a deployment fit each other: run once, by whoever starts a station or looks at one."""
+"""Checks that the parts of a deployment fit each other, run once at the start of a station or preflight."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from runtime.station.spec import StationSpec, build_spec
 
 
 def check_deployment(resolved: Resolved) -> StationSpec:
-    """Check that the parts of a deployment fit each other; raises ConfigurationError or SetupError."""
+    """Check that the parts of a deployment fit each other. Raises ConfigurationError or SetupError."""
     settings, made = resolved.deployment, build_spec(resolved)
     robot = made.robot
     if settings.setup.pose not in robot.poses:
@@ -49,7 +49,7 @@ def check_deployment(resolved: Resolved) -> StationSpec:
 
 
 def _check_collection(made: StationSpec) -> None:
-    """A node that drives by itself must be one that can be told to, and to leave off, and says what it applied."""
+    """Check that a node which drives by itself can be started and stopped by us, and reports its actions."""
     wanted, capabilities = made.deployment.collection, made.capabilities
     if wanted is not None and wanted.source == "node" and not capabilities.drives_itself:
         kind = made.deployment.transport.kind
@@ -62,7 +62,7 @@ def _check_collection(made: StationSpec) -> None:
 
 
 def _check_publication(made: StationSpec) -> None:
-    """Poses are published only where the transport has such a command."""
+    """Check that the transport can publish the configured space and pose format."""
     wanted, capabilities = made.deployment.publication, made.capabilities
     kind = made.deployment.transport.kind
     if wanted.space not in capabilities.spaces:

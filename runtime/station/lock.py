@@ -1,4 +1,4 @@
-"""The lock that a station holds while it runs, so that there is one of each name in a data folder."""
+"""Lock of a running station, so that a data folder has only one of each name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from runtime.ipc.station_lock import Taken, take
 
 
 def acquire_station_lock(settings: Deployment) -> IO[str]:
-    """The lock of a station, for as long as it runs; SetupError names the process that has it, or why it cannot be."""
+    """Return the lock of a station, held until it is closed.
+
+    Raises SetupError with the process that has it, or the cause.
+    """
     try:
         return _locked(settings)
     except OSError as error:
@@ -18,7 +21,7 @@ def acquire_station_lock(settings: Deployment) -> IO[str]:
 
 
 def unwritable_error(settings: Deployment, error: OSError) -> SetupError:
-    """Error for a station whose folder cannot be written."""
+    """Return the error about a station folder that cannot be written."""
     return SetupError(
         f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "
         "data_dir"

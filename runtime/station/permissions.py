@@ -1,6 +1,6 @@
-"""Permissions of commands: whose tables they may bring along, and what of the station's own these may name.
+"""Permissions of commands: who may bring tables along, and which files and variables these may name.
 
-The station's own account, which `ctl` and the control channel act for, may name whatever it can reach itself.
+The station's own account, used by `ctl` and the control channel, may name anything that it can access itself.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _RECORDINGS_OF_WEB = Pattern(
     "a table from the web may name the folder of a recording or of a dataset below {where}, and {listed}",
 )
 
-# Roles of who gives a command: a program of the station's account, a script on the channel.
+# Roles of commands from the station's own account: a local program, a script on the channel.
 OWN_ACCOUNT = (LOCAL, SCRIPT)
 ADMINISTRATOR = "admin"
 _WITH_TABLES = ("setup", "preflight", "policy_server")
@@ -50,9 +50,9 @@ _OF_ADMINISTRATORS = ("policy", "checkpoint")
 
 
 def require(command: Command, own: Resolved) -> None:
-    """RuntimeFault where who gives the command may not bring what it brings; `own` is the station's deployment.
+    """Raise RuntimeFault if the sender may not bring the tables of its command; `own` is the station's deployment.
 
-    Commands that stop are never looked at.
+    Commands that stop the robot are never refused.
     """
     if command.kind not in _WITH_TABLES or command.role in OWN_ACCOUNT:
         return
@@ -68,15 +68,15 @@ def require(command: Command, own: Resolved) -> None:
     if isinstance(table, Mapping):
         try:
             wanted = apply_changes(own, {"policy": table}, command.kind)
-        except ConfigurationError:  # told by who carries the command out, of a preflight in its report
+        except ConfigurationError:  # reported when the command is executed, or in the preflight's report
             return
         require_allowed_references(own.deployment, wanted.deployment)
 
 
 def require_allowed_references(own: Deployment, given: Deployment) -> None:
-    """ConfigurationError where the policy of `given` names a variable or a file that is not for others to name.
+    """Raise ConfigurationError if the policy of `given` names a variable or file that is not allowed.
 
-    What the deployment's own [policy] names stays allowed.
+    Names in the deployment's own [policy] stay allowed.
     """
     said = {(what, value) for _, what, value in find_host_references(own.policy)}
     for key, what, value in find_host_references(given.policy):
@@ -91,7 +91,7 @@ def _is_allowed(own: Deployment, what: HostReference, value: str) -> bool:
         ours = _is_inside(value, _recordings(own)) and _is_recording(value)
         return ours or _is_inside(value, own.security.files)
     listed = own.security.files if what is HostReference.FILE else ()
-    if value == "none":  # of ssh's configuration: none is read
+    if value == "none":  # ssh without a configuration file
         return True
     return _is_inside(value, (own.ssh_dir, *listed))
 
@@ -108,22 +108,22 @@ def _advice(own: Deployment, what: HostReference) -> str:
 
 
 def _recordings(own: Deployment) -> Iterable[Path]:
-    """The data folder, also where the lab has put a part of it on another disk."""
+    """Return the folders of recordings, including those that may be links to another disk."""
     return own.data, own.episodes_dir, own.data / "datasets"
 
 
 def _is_recording(value: str) -> bool:
-    """True for the folder of a recording or of a dataset: the data folder has other files, which nobody names."""
+    """Return True for the folder of a recording or dataset; other files in the data folder must not be named."""
     path = _resolved(value)
     return (path / "manifest.json").is_file() or (path / "meta" / "info.json").is_file()
 
 
 def _is_inside(value: str, allowed: Iterable[str | Path]) -> bool:
-    """True if a path leads to one of these files or below one of these folders, links and `..` followed."""
+    """Return True if the path is one of these files or below one of these folders, after resolving links and `..`."""
     try:
         path = _resolved(value)
         return any(path.is_relative_to(_resolved(one)) for one in allowed)
-    except (OSError, RuntimeError, ValueError):  # no path, or links in a circle
+    except (OSError, RuntimeError, ValueError):  # invalid path or circular links
         return False
 
 

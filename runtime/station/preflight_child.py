@@ -1,4 +1,4 @@
-"""Preflights in processes of their own: nothing that one meets can delay or end whoever wants it."""
+"""Preflights in child processes, so that none can delay or end the caller."""
 
 from __future__ import annotations
 
@@ -35,36 +35,36 @@ _UNREADABLE = fixed(
 )
 _SAID_NOTHING = Pattern("preflight.said_nothing", "its process ended with {code} and said nothing")
 
-_ROOM_S = 10.0  # beside the deadlines of the policy's own calls: kinematics, a slow machine
-_GRACE_S = 180.0  # beyond the deadline, for a process that may have kinematics to compile
-_KEPT = 20  # reports, of which the oldest is forgotten first
+_ROOM_S = 10.0  # [s] beside the policy's own deadlines: kinematics, a slow machine
+_GRACE_S = 180.0  # [s] after the deadline, for a process that compiles kinematics
+_KEPT = 20  # stored reports; the oldest is dropped first
 Spawn = Callable[[], "subprocess.Popen[bytes]"]
 
 
 @dataclass(slots=True)
 class PreflightRun:
-    """One preflight: under way as long as `told` is empty, then a report, or a `failure` without one."""
+    """One preflight: running until `over` is set, then with a report in `finished` or a `failure`."""
 
     id: str
     about: str
     child: subprocess.Popen[bytes]
-    ends: float  # on time.monotonic, when it is killed
+    ends: float  # time of the kill on time.monotonic [s]
     finished: dict[str, Any] = field(default_factory=dict)
     failure: str = ""
     over: threading.Event = field(default_factory=threading.Event)
 
     def end(self, why: str) -> None:
-        """Kill it; `why` is what is said instead of a report."""
+        """Kill the process; `why` replaces its report."""
         self.failure = why
         self.child.kill()
 
     def to_dict(self) -> dict[str, Any]:
-        """As an answer: `running`, `report` or null, and why there is none."""
+        """Return the answer to a query: `running`, `report` or null, and the failure."""
         return {"running": not self.over.is_set(), "report": self.finished or None, "failure": self.failure}
 
 
 class Preflights:
-    """One at a time; `look` is cheap, and returns each that has ended once. Not for several threads."""
+    """Preflights of a station, one at a time. Call `poll` regularly. Not for several threads."""
 
     def __init__(self, spawn: Spawn | None = None, now: Callable[[], float] = time.monotonic) -> None:
         self._spawn = spawn or _spawn_child
@@ -74,17 +74,18 @@ class Preflights:
 
     @property
     def current(self) -> str:
-        """Name of what is being looked at, "" where nothing is."""
+        """Subject of the running preflight, "" without one."""
         return self._flight.about if self._flight else ""
 
     def start(self, asked: PreflightRequest, resolved: Resolved) -> float:
-        """Begin; after how many seconds it is over at the latest, compiling included.
+        """Start a preflight; return the longest time until its end [s], compilation included.
 
-        RuntimeFault where another is under way, or its process cannot be started.
+        Whether the request is a valid deployment is not checked here but in the report.
 
-        What is asked for is not checked here: that it is no valid deployment is what the report says.
+        Raises:
+            RuntimeFault: Another preflight is running, or the process cannot be started.
         """
-        if asked.id in self._kept:  # asked again: the answer to the first one was lost
+        if asked.id in self._kept:  # a repeated request: the answer to the first was lost
             return max(0.0, self._kept[asked.id].ends - self._now())
         if self._flight is not None:
             raise RuntimeFault(_UNDER_WAY(about=self._flight.about))
@@ -103,7 +104,7 @@ class Preflights:
         return longest
 
     def poll(self) -> PreflightRun | None:
-        """The one that has ended since the last look; ends one whose time is over."""
+        """Return the preflight that has ended since the last call, once; kill one whose time is over."""
         flight = self._flight
         if flight is None:
             return None
@@ -115,18 +116,18 @@ class Preflights:
         return None
 
     def cancel(self, why: str) -> None:
-        """End what is under way, if anything is."""
+        """Kill the running preflight, if there is one."""
         if self._flight is not None and not self._flight.failure:
             self._flight.end(_CANCELLED(why=why))
 
     def report(self, id: str) -> dict[str, Any]:
-        """The preflight of that id, as by `PreflightRun.to_dict`; RuntimeFault where it is not known (any more)."""
+        """Return the state of a preflight as `PreflightRun.to_dict`. Raises RuntimeFault if its id is unknown."""
         if id not in self._kept:
             raise RuntimeFault(_UNKNOWN(identity=id, kept=_KEPT))
         return self._kept[id].to_dict()
 
     def close(self) -> None:
-        """End what is under way, and wait for it."""
+        """Kill the running preflight and wait for its end."""
         flight = self._flight
         if flight is not None:
             self.cancel(_STATION_ENDS)
@@ -134,7 +135,7 @@ class Preflights:
 
 
 def _deadline_for(resolved: Resolved, asked: PreflightRequest) -> float:
-    """Sum of the policy's own deadlines [s]; where it is no deployment, its process says so at once."""
+    """Return the sum of the policy's deadlines [s]; a default for an invalid deployment, which its process reports."""
     try:
         return default_deadline(apply_changes(resolved, asked.changes, "preflight").deployment)
     except RuntimeFault:
@@ -144,16 +145,16 @@ def _deadline_for(resolved: Resolved, asked: PreflightRequest) -> float:
 def _spawn_child() -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [sys.executable, "-m", "runtime.preflight", "--given"],
-        stdin=subprocess.PIPE,  # its end is ours
+        stdin=subprocess.PIPE,  # the child ends when we close it
         stdout=subprocess.PIPE,
-        env=without_web_secrets(os.environ),  # a worker's has the web's
+        env=without_web_secrets(os.environ),  # a worker's environment has the web's secrets
     )
 
 
 def run_preflight(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
-    """The report about what is asked as by `python -m runtime.preflight --given`; waits for it at most so long [s].
+    """Run a preflight as by `python -m runtime.preflight --given` and return its report, after at most `longest` [s].
 
-    RuntimeFault where its process ends without one.
+    Raises RuntimeFault if its process ends without a report.
     """
     child = _spawn_child()
     late = threading.Timer(longest, child.kill)
@@ -168,7 +169,7 @@ def run_preflight(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
 
 
 def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
-    """Whatever becomes of the child, the flight is over at its end."""
+    """Wait for the child; whatever happens to it, the preflight is over afterwards."""
     report: dict[str, Any] = {}
     failure: str = _UNREADABLE
     try:
@@ -180,16 +181,16 @@ def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
 
 
 def _told(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """The report of the child, and why there is none; returns when it has ended."""
+    """Return the child's report and why there is none; returns when the child has ended."""
     assert child.stdin is not None
     assert child.stdout is not None
-    with contextlib.suppress(BrokenPipeError):  # it has ended without listening; its code says so below
+    with contextlib.suppress(BrokenPipeError):  # it ended without reading; the exit code is reported below
         child.stdin.write(json.dumps(asked).encode() + b"\n")
         child.stdin.flush()
-    said = child.stdout.read()  # not communicate(), which would close its standard input
+    said = child.stdout.read()  # communicate() would close its standard input, which ends it
     code = child.wait()
     child.stdout.close()
-    with contextlib.suppress(BrokenPipeError):  # the same once more, for what was still in its buffer
+    with contextlib.suppress(BrokenPipeError):  # likewise, for bytes that were still buffered
         child.stdin.close()
     report = _report(said)
     return report, "" if report else _SAID_NOTHING(code=code)
@@ -204,12 +205,14 @@ def _report(said: bytes) -> dict[str, Any]:
 
 
 def default_deadline(settings: Deployment) -> float:
-    """Time that a preflight may take where none is given [s]: what the policy's own deadlines come to."""
+    """Return the default time for a preflight [s]: the sum of the policy's own deadlines and a reserve."""
     policy = settings.policy.model_dump()
-    return _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))  # it is asked twice
+    return (
+        _ROOM_S + _deadlines(policy) + float(policy.get("inference_deadline", 0.0))
+    )  # there are two requests
 
 
 def _deadlines(table: Mapping[str, Any]) -> float:
-    """The sum of all deadlines in a table and in those within it, such as that of a tunnel."""
+    """Return the sum of all deadlines in a table and its nested tables, e.g. that of a tunnel."""
     own = [float(value) for key, value in table.items() if key.endswith("_deadline") and value is not None]
     return sum(own) + sum(_deadlines(value) for value in table.values() if isinstance(value, Mapping))

@@ -1,4 +1,4 @@
-"""Starts a deployment again from the manifest of a run that it once made, and says what differs."""
+"""Start of a deployment again from the manifest of an earlier run, with a report of the differences."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from runtime.core.git_revision import revision
 from runtime.recording.files import read_json
 from runtime.station.run import installed_versions
 
-_LISTED = 8  # runs, or keys, that a sentence names
-_SHORT = 12  # characters of a hash
+_LISTED = 8  # most runs or keys in a sentence
+_SHORT = 12  # characters of a hash that are shown
 _UNKNOWN = "unknown"
 _DIRTY = " with changes"
 _ABSENT = object()
@@ -27,17 +27,17 @@ _ABSENT = object()
 
 @dataclass(frozen=True, slots=True)
 class Rerun:
-    """The deployment of an earlier run, and a line about that run and about each thing that differs."""
+    """Deployment of an earlier run, with lines about that run and each difference."""
 
     resolved: Resolved
     lines: tuple[str, ...]
 
 
 def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
-    """The deployment of the run in `data` whose uuid begins with `run`, with `key=value` assignments on top.
+    """Return the deployment of the run in `data` whose uuid begins with `run`, with `key=value` assignments on top.
 
-    What was asked for with the run (mode, simulated state, duration) is part of it. What it writes goes to
-    `data`. ConfigurationError says what is missing, was altered since, or is no setting any more.
+    It includes the options of that run (mode, simulated state, duration). New recordings go to `data`.
+    Raises ConfigurationError if something is missing, was changed since, or is no longer a setting.
     """
     folder = find_episode(run, data)
     try:
@@ -52,7 +52,7 @@ def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
 
 
 def find_episode(run: str, data: Path) -> Path:
-    """The folder of the one episode in `data` whose uuid begins with `run`."""
+    """Return the folder of the one episode in `data` whose uuid begins with `run`. Raises ConfigurationError."""
     episodes = data / "episodes"
     wanted = run.strip().lower()
     if not wanted or not set(wanted) <= set("0123456789abcdef-"):
@@ -73,7 +73,7 @@ def find_episode(run: str, data: Path) -> Path:
 
 
 def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """The stored configuration, which must be the one that its hash was made of."""
+    """Return the stored configuration after comparing it with its hash."""
     path = folder / "manifest.json"
     stored, digest = manifest.get("configuration"), manifest.get("configuration_hash")
     if not isinstance(stored, dict) or not stored:
@@ -90,13 +90,13 @@ def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _requested_settings(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> dict[str, Any]:
-    """The configuration with what the run itself was asked for; other modes (observe) are no runs."""
+    """Return the configuration with the options of the run itself; other modes (observe) are not runs."""
     run = tree.get("run")
     if isinstance(run, dict) and manifest.get("mode") != "observe":
         for key in ("mode", "sim_state", "duration_s"):
             if key in manifest and key in run:
                 run[key] = manifest[key]
-    for key in REMOVED_BUS_KEYS:  # says nothing of what was done
+    for key in REMOVED_BUS_KEYS:  # it has no effect on what was done
         tree.get("bus", {}).pop(key, None)
     if data_folder(tree.get("data_dir")) != data:
         tree["data_dir"] = str(data)
@@ -104,7 +104,7 @@ def _requested_settings(tree: dict[str, Any], manifest: Mapping[str, Any], data:
 
 
 def data_folder(given: str | Path | None = None) -> Path:
-    """The absolute data folder that is `given`, else $EVA_DATA_DIR, else ./data."""
+    """Return the absolute data folder: `given`, else $EVA_DATA_DIR, else ./data."""
     return Path(given or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
 
 
@@ -143,7 +143,7 @@ def _revisions(then: object) -> str:
 
 
 def _revision(given: object) -> str:
-    """Short revision; with uncommitted changes, which are not known, it never counts as the same."""
+    """Return the short revision; one with uncommitted changes never counts as equal."""
     if not isinstance(given, Mapping) or not given.get("commit"):
         return _UNKNOWN
     return _short(str(given["commit"])) + (_DIRTY if given.get("dirty") else "")
@@ -163,7 +163,7 @@ def _hashes(then: str, stored: Mapping[str, Any], now: Resolved) -> str:
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Every setting by its full key."""
+    """Return every setting by its full key."""
     found: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:

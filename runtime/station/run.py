@@ -1,4 +1,4 @@
-"""A run: from the moment it is asked for until its episode is on disk."""
+"""State of a run, from its request until its episode is on disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PACKAGES = ("eva-web", "numpy", "pyarrow", "av", "pyzmq", "msgpack")
 
 
 def installed_versions() -> dict[str, str]:
-    """Of Python, of us, and of what decides how a run comes out or how it is written down."""
+    """Return the versions of Python, of this package, and of libraries that affect runs or recordings."""
     return {"python": platform.python_version()} | {package: version(package) for package in _PACKAGES}
 
 
@@ -32,88 +32,88 @@ class Run:
     number: int
     uuid: str
     requested: float
-    duration_s: float | None = None  # after which it ends by itself
+    duration_s: float | None = None  # [s] after which it ends by itself
     mode: Mode = "continuous"
-    trial: bool = False  # it is one of a trial
-    is_approaching: bool = False  # a motion to the chunk that is shown
-    begun_at: float | None = None  # control follows
-    followed_at: float = -math.inf  # since when it does, without a hold between
+    trial: bool = False  # part of a trial
+    is_approaching: bool = False  # moving to the start of the proposal
+    begun_at: float | None = None  # control follows since then
+    followed_at: float = -math.inf  # since when control follows without a hold
     held_since: float | None = None
-    held: float = 0.0  # in total
-    command: str = ""  # uuid of the command that asked for it
-    opened: bool = False  # media is ready for it
-    unopened: bool = False  # its recording could not be opened: there is none, and it never began
-    waiting: bool = False  # begins when what it needs is loaded
-    unrecorded: str = ""  # why its recording ended before it did
-    counted: Mapping[str, Any] = field(default_factory=dict)  # control's figures when it was asked for
+    held: float = 0.0  # total time on hold [s]
+    command: str = ""  # uuid of the command that requested it
+    opened: bool = False  # media is ready
+    unopened: bool = False  # its recording could not be opened, so it never began
+    waiting: bool = False  # begins when everything that it needs is loaded
+    unrecorded: str = ""  # reason why its recording ended early
+    counted: Mapping[str, Any] = field(default_factory=dict)  # control's counters when it was requested
     reached: dict[str, float] = field(default_factory=dict)  # milestones of a simulated bench [s of the run]
 
     def figures(self, now: Mapping[str, Any]) -> dict[str, Any]:
-        """Control's figures `now`, with what it counts counted from the beginning of this run.
+        """Return control's figures `now`, with its counters relative to the start of this run.
 
-        A control that was restarted meanwhile counts from its own beginning.
+        If control was restarted meanwhile, they are relative to that restart.
         """
         since = {key: now[key] - self.counted.get(key, 0) for key in _COUNTS}
         return {**now, **({} if min(since.values()) < 0 else since)}
 
     @property
     def never_began_data(self) -> dict[str, Any]:
-        """Data for the client of a run that ended before control followed; {} where it began."""
+        """Data for the client about a run that ended before control followed; {} if it did."""
         if self.begun_at is not None:
             return {}
         return {"unbegun": {"command": self.command, "episode": self.uuid, "unopened": self.unopened}}
 
     def open(self) -> None:
-        """Media is ready for it."""
+        """Record that media is ready."""
         self.opened = True
 
     def fail_to_open(self) -> None:
-        """Its recording could not be opened, and it must not begin without one."""
+        """Record that its recording could not be opened, so that it must not begin."""
         self.unopened = True
 
     def stop_recording(self, why: str) -> None:
-        """It goes on without its recording, which could not be opened or has ended."""
+        """Record that it continues without its recording, which could not be opened or has ended."""
         self.unrecorded = why
 
     def wait(self) -> None:
-        """It begins when what it needs is loaded."""
+        """Let it begin later, when everything that it needs is loaded."""
         self.waiting = True
 
     def approach(self) -> None:
-        """The robot goes to where the chunk that is shown begins."""
+        """Record that the robot moves to the start of the proposal."""
         self.is_approaching = True
 
     def arrive(self) -> None:
-        """The robot is there, or does something else."""
+        """Record that this motion has ended."""
         self.is_approaching = False
 
     def begin(self, now: float) -> None:
-        """Control follows: its clock starts."""
+        """Start its clock: control follows."""
         self.waiting = False
         self.begun_at, self.held_since, self.held = now, None, 0.0
         self.followed_at = now
 
     def hold(self, now: float) -> None:
-        """Its clock is paused; one that waits begins when it is resumed."""
+        """Pause its clock; a waiting run begins when it is resumed."""
         self.waiting = False
         if self.held_since is None:
             self.held_since = now
 
     def resume(self, now: float) -> None:
-        """Its clock goes on."""
+        """Continue its clock."""
         if self.held_since is not None:
             self.held += now - self.held_since
             self.held_since = None
             self.followed_at = now
 
     def elapsed(self, now: float) -> float:
-        """Time it has run, without the time it was held."""
+        """Return the time it has run [s], without holds."""
         if self.begun_at is None:
             return 0.0
         return (now if self.held_since is None else self.held_since) - self.begun_at - self.held
 
     def status(self, now: float) -> dict[str, Any]:
-        """Which run it is, how long it has run and been held [s], and its limit."""
+        """Return its number, uuid, running and held time [s], and its limit [s]."""
         held = self.held + (now - self.held_since if self.held_since is not None else 0.0)
         return {
             "number": self.number,
@@ -126,19 +126,17 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Entries of every manifest about the station as last set up; `spec` is the one in force since then."""
+    """Entries of every manifest about the station as last set up; `spec` is in force since then."""
 
     spec: StationSpec
     boot: str
-    checkpoint: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # as the one who asked for the set-up named it
-    bench: Mapping[str, Any] = field(default_factory=dict)  # how a simulated one was asked to be laid out
+    checkpoint: Mapping[str, Any] = field(default_factory=dict)  # as named in the request of the set-up
+    bench: Mapping[str, Any] = field(default_factory=dict)  # requested layout of a simulated bench
     versions: dict[str, str] = field(default_factory=installed_versions)
-    git: Mapping[str, Any] = field(default_factory=revision)  # {} where the runtime runs from no checkout
+    git: Mapping[str, Any] = field(default_factory=revision)  # {} without a git checkout
 
     def manifest(self, mode: str, info: PolicyInfo | None, sim_state: str = "") -> dict[str, Any]:
-        """The manifest of a new episode, without what only media knows; `sim_state` where the mode is sim."""
+        """Return the manifest of a new episode, without entries of media; `sim_state` is used in mode "sim" only."""
         settings = self.spec.deployment
         return {
             "uuid": str(uuid.uuid4()),

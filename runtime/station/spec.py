@@ -1,4 +1,4 @@
-"""A deployment with its robot: what is known of a station before anything is connected."""
+"""Station spec: a deployment with its robot, known before anything is connected."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from runtime.safety.limits import Limits
 from runtime.transports.base import Capabilities
 
 CAPABILITIES = TypeAdapter(Capabilities)
-"""To and from JSON: a transport that looks for its middleware to say them is asked once, by the supervisor."""
+"""Conversion of capabilities to and from JSON, because only the supervisor queries the transport for them."""
 
 
 @dataclass(frozen=True, slots=True)
 class StationSpec:
-    """A deployment with its robot, and what is known of both before anything is connected: values alone.
+    """Deployment with its robot and everything known of both before connecting; plain values.
 
-    `collecting`: it is set up to collect, so that what is asked is the leader of its [collection].
+    `collecting`: it is set up to collect, so that the policy is the leader of its [collection].
     """
 
     resolved: Resolved
     robot: Robot
-    capabilities: Capabilities  # of its transport
+    capabilities: Capabilities  # of the transport
     cameras: tuple[str, ...]  # keys of its own cameras, and of the robot's that its transport delivers
     collecting: bool = False
 
@@ -45,12 +45,12 @@ class StationSpec:
 
     @property
     def rate(self) -> float:
-        """Control ticks per second."""
+        """Control rate [Hz]."""
         return self.deployment.control.rate or self.robot.control_rate
 
     @property
     def fps(self) -> float:
-        """Rows of the dataset grid per second."""
+        """Rows of the dataset grid per second [Hz]."""
         return self.deployment.recording.fps or self.rate
 
     @property
@@ -77,13 +77,13 @@ class StationSpec:
 
     @property
     def dims(self) -> DimensionKinds:
-        """Dimensions that do not blend as numbers do: grippers that switch, angles without limits."""
+        """Dimensions that cannot be blended like numbers: binary grippers, angles without limits."""
         endless = np.flatnonzero(np.isinf(self.robot.lower) & np.isinf(self.robot.upper))
         return DimensionKinds(self.robot.binary_dims, tuple(endless.tolist()))
 
 
 def delivered_cameras(settings: Deployment, robot: Robot) -> tuple[str, ...]:
-    """Keys of the cameras that the transport delivers: the robot's, unless it names fewer."""
+    """Return the keys of the cameras that the transport delivers: the robot's, unless it names fewer."""
     named = getattr(variants("runtime.transports")[settings.transport.kind], "cameras", None)
     if named is None:
         return tuple(camera.key for camera in robot.cameras)
@@ -92,9 +92,13 @@ def delivered_cameras(settings: Deployment, robot: Robot) -> tuple[str, ...]:
 
 
 def build_spec(resolved: Resolved, capabilities: Capabilities | None = None) -> StationSpec:
-    """A deployment with its robot, whose parts are known to fit each other; ConfigurationError for no such robot.
+    """Return the spec of a deployment whose parts are known to fit each other.
 
-    Its transport is asked for its `capabilities` where they are not given; SetupError where it lacks what it needs.
+    The transport is queried for `capabilities` if they are not given.
+
+    Raises:
+        ConfigurationError: There is no such robot.
+        SetupError: The transport lacks a package that it needs.
     """
     settings = resolved.deployment
     try:
@@ -114,9 +118,9 @@ def build_spec(resolved: Resolved, capabilities: Capabilities | None = None) -> 
 
 
 def load_checked_spec(path: str, capabilities: str, unread: Collection[str] = ()) -> StationSpec:
-    """The plan that a supervisor has checked: the resolved deployment in a file, its capabilities in JSON.
+    """Load the spec that a supervisor has checked: the resolved deployment from a file, capabilities as JSON.
 
-    Tables of the packages `unread` stay as they are written, and none of their kinds is loaded.
+    Tables of the packages in `unread` stay plain tables, and modules of their kinds are not loaded.
     """
     resolved = loader.resolve_deployment(json.loads(Path(path).read_text("utf-8")), {}, path, unread)
     return build_spec(resolved, CAPABILITIES.validate_json(capabilities))

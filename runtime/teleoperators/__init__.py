@@ -1,6 +1,6 @@
-"""Devices that the operator holds to drive the robot: one module per way to hear of them."""
+"""Leaders, i.e. devices that a person moves to drive the robot: one module per link."""
 
-# Each kind with its module, which is imported where a deployment names it.
+# Module of each kind. It is imported only if a deployment names it.
 KINDS = {
     "ros1": "runtime.teleoperators.ros1",
     "ros2": "runtime.teleoperators.ros2",

@@ -1,4 +1,4 @@
-"""A leader: a device that the operator moves, and whose joints the robot is to follow."""
+"""Leader interface: a device that the operator moves and whose joints the robot follows."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
     from robots import Robot
 
-_RATE_WINDOW = 40  # arrivals
-_SILENT_S = 2.0  # after which there is no rate any more
+_RATE_WINDOW = 40  # number of arrivals
+_SILENT_S = 2.0  # [s]; after that the rate is 0
 
 
 @dataclass(frozen=True, slots=True)
 class LeaderPose:
-    """Pose of the leader: `joints` float64 [D] in the robot's order and units, NaN for joints it lacks."""
+    """Pose of the leader: `joints` float64 [D] in the robot's order and units, NaN for joints that it lacks."""
 
     joints: Float64
-    arrived: float  # our monotonic clock [s]
+    arrived: float  # arrival on our monotonic clock [s]
 
 
 class Leader(ABC):
-    """One leader; its messages come on a thread of their own, whoever asks gets the newest at once."""
+    """One leader. A thread receives its messages; readers get the newest pose without waiting."""
 
     def __init__(self, robot: Robot, clock: Clock) -> None:
         self._robot = robot
@@ -45,19 +45,19 @@ class Leader(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """Kind and place of the leader, for sentences."""
+        """Kind and address of the leader, for messages."""
 
     @abstractmethod
     def connect(self) -> None:
-        """Begin to listen; a leader that is not there yet is found by itself. Raises RuntimeFault."""
+        """Start to listen; a leader that starts later is found by itself. Raises RuntimeFault."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stop listening; safe to call twice."""
+        """Stop listening. Safe to call twice."""
 
     @property
     def latest_pose(self) -> LeaderPose | None:
-        """Newest pose of the leader; None where it has given none since it was connected."""
+        """Newest pose of the leader; None before its first since `connect`."""
         with self._lock:
             return self._newest
 
@@ -72,7 +72,7 @@ class Leader(ABC):
 
     @property
     def problem(self) -> str:
-        """Why its newest message could not be used, "" where it could."""
+        """Reason why its newest message could not be used, "" if it could."""
         with self._lock:
             return self._refused
 
@@ -92,7 +92,10 @@ class Leader(ABC):
 
 
 def joints_from_state(state: Mapping[str, object], robot: Robot) -> Float64:
-    """Joints [D] of the groups in `state`, NaN for those that are absent; CodecError names what does not fit."""
+    """Return the joints [D] of the groups in `state`, NaN for absent groups.
+
+    Raises CodecError if they do not fit the robot.
+    """
     known = [group.name for group in robot.groups]
     unknown = [str(name) for name in state if name not in known]
     if unknown or not state:

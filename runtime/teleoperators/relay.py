@@ -1,6 +1,6 @@
-"""A leader as a source of actions: where it is becomes a few equal rows, asked for like any policy's.
+"""Leader as a policy: its pose becomes a chunk of equal rows, requested like any policy's.
 
-So that what a person wants takes the same way as what a policy wants: timeline, locks, safety, record.
+A person's motion thereby uses the same path as a policy's: timeline, locks, safety and recording.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ _NODE_DRIVES = fixed(
 )
 
 FollowMode = Literal["absolute", "relative"]
-_FOUND_S = 5.0  # for a leader to say something when the station is set up
-_LOOK_S = 0.02
-_SPARE_ROWS = 2  # beyond the age limit: silence is told by its age, not by starvation
+_FOUND_S = 5.0  # time for the leader's first message at set-up [s]
+_LOOK_S = 0.02  # polling period [s]
+_SPARE_ROWS = 2  # rows beyond the age limit: silence is reported by its age, not by starvation
 
 
 class LeaderPolicy(Policy):
-    """Follows a leader: to where it is ("absolute"), or by as much as it moved since the engagement ("relative").
+    """Policy that follows a leader: to its pose ("absolute"), or by its motion since the engagement ("relative").
 
-    The engagement is the first question after a reset, or after the robot was held: what the leader did meanwhile is
-    not caught up. Grippers are absolute in either; joints of groups that the leader does not have stay where the robot
-    had them then. That is where they were told to be, if they stand within `steady_error` of it: from where they are
-    read, gravity would lower the arm at each engagement.
+    The engagement is the first request after a reset or a hold; earlier motion of the leader is not caught up.
+    Grippers are absolute in both modes. Joints of groups that the leader lacks stay as they were at the engagement:
+    at their commanded position if that is within `steady_error` of the measured one, because starting from the
+    measured position would let gravity lower the arm at each engagement.
     """
 
     uses_images = False
@@ -71,11 +71,11 @@ class LeaderPolicy(Policy):
         self._dim = robot.dim
         self._grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
         self._endless = tuple(np.flatnonzero(np.isinf(robot.lower) & np.isinf(robot.upper)).tolist())
-        self._last: Float64 | None = None  # where the leader was at the question before
+        self._last: Float64 | None = None  # joints of the leader at the previous request
         self._wanted: Float64 = np.zeros(robot.dim)
 
     def connect(self) -> PolicyInfo:
-        """Listen, and wait for the leader to say where it is; PolicyLostError where it does not."""
+        """Start to listen and wait for the leader's first pose. Raises PolicyLostError if none comes in time."""
         self.leader.connect()
         deadline = self._clock.now() + _FOUND_S
         while self.leader.latest_pose is None:
@@ -85,7 +85,7 @@ class LeaderPolicy(Policy):
         return PolicyInfo(self.leader.name, action_space="joint")
 
     def leader_problem(self) -> str:
-        """Why the leader cannot be followed just now, "" where it can."""
+        """Return why the leader cannot be followed now, "" if it can."""
         newest, why = self.leader.latest_pose, self.leader.problem
         because = _BECAUSE(why=why) if why else ""
         if newest is None:
@@ -96,7 +96,7 @@ class LeaderPolicy(Policy):
         return ""
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Rows float32 [H, D], all equal; PolicyLostError where the leader is silent for too long."""
+        """Return equal rows float32 [H, D]. Raises PolicyLostError if the leader is silent for too long."""
         if observation.qpos.shape != (self._dim,):
             raise PolicyError(_JOINTS_SHAPE(shape=list(observation.qpos.shape)))
         pose = self._pose()
@@ -106,9 +106,13 @@ class LeaderPolicy(Policy):
         return ActionChunk(np.tile(target, (self._rows, 1)).astype(np.float32))
 
     def first_goal(self, qpos: Float64, commanded: Float64 | None) -> Float64 | None:
-        """First goal of a robot at `qpos` that is told to be at `commanded` [D], None where it is told nothing.
+        """Return the joints [D] to approach before following starts.
 
-        None if the leader is silent, or leads from where it is.
+        None if the leader is silent, or following is relative.
+
+        Args:
+            qpos: Measured joints of the robot [D].
+            commanded: Commanded position [D], None if there is none.
         """
         if self.mode == "relative" or self.leader_problem():
             return None
@@ -133,18 +137,18 @@ class LeaderPolicy(Policy):
         has = ~np.isnan(joints)
         placed = has & (self._grippers if self.mode == "relative" else True)
         if last is not None:
-            # Step by step, so that an angle that wraps can be turned on and on.
+            # Incrementally, so that a joint without limits can be turned any number of times.
             moved = np.nan_to_num(difference(joints, last, self._endless))
             self._wanted = self._wanted + np.where(placed, 0.0, moved)
         self._wanted = np.where(placed, joints, self._wanted)
         return self._wanted
 
     def reset(self) -> None:
-        """The next question engages anew."""
+        """Engage anew at the next request."""
         self._last = None
 
     def resume(self) -> None:
-        """The robot was held, or not seen: so it does after that."""
+        """Engage anew: the robot was held, or there were no observations."""
         self.reset()
 
     def close(self) -> None:
@@ -152,7 +156,7 @@ class LeaderPolicy(Policy):
 
 
 class NodeDrivenPolicy(Policy):
-    """The robot's own node reads the leader and drives: nobody is asked here, what it applied is recorded."""
+    """Policy of a robot whose own node reads the leader and drives: nothing is requested, its actions are recorded."""
 
     is_queried = False
     uses_images = False
@@ -164,7 +168,7 @@ class NodeDrivenPolicy(Policy):
         raise PolicyError(_NODE_DRIVES)
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""

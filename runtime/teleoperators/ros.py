@@ -1,4 +1,4 @@
-"""A leader on ROS topics, whichever generation: a sensor_msgs/JointState for each group of the robot that it leads."""
+"""Leader on ROS topics of either generation: a sensor_msgs/JointState for each group of the robot that it leads."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class LeaderGroups(Settings):
 
 
 class RosLeader(Leader):
-    """Listens to a topic for each group, or to one for several.
+    """Leader with one topic per group, or one topic for several groups.
 
-    A pose is new when each topic has said something new, and as old as the oldest of them.
+    A pose is complete when each topic has sent something new, and as old as the oldest of these messages.
 
-    A message with the stamp of the one before says nothing new: a publisher that repeats itself is silent. Messages
-    without a stamp are all new.
+    A message with the stamp of its predecessor is not new: a publisher that only repeats itself counts as silent.
+    Messages without a stamp are always new.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class RosLeader(Leader):
 
     @property
     def problem(self) -> str:
-        """Why a message could not be used, else which topics say nothing new and why, "" where all do."""
+        """Reason why a message could not be used, else the topics that send nothing new and why; "" if all do."""
         if said := super().problem:
             return said
         waiting = [part.topic for group, part in self._parts.items() if group not in self._fresh]
@@ -112,8 +112,8 @@ class RosLeader(Leader):
         self._orders = {
             name: JointOrder(part, self._names, f"{TABLE}.groups") for name, part in self._parts.items()
         }
-        self._stamps: dict[str, int] = {}  # by topic
-        self._fresh: dict[str, tuple[Float64, float]] = {}  # by group: joints, and when they arrived
+        self._stamps: dict[str, int] = {}  # stamp of the newest message by topic
+        self._fresh: dict[str, tuple[Float64, float]] = {}  # by group: joints and their arrival time
 
     def _make_callback(self, heard: Subscription) -> Callable[[bytes], None]:
         topic = heard.topic.name

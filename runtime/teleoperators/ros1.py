@@ -1,4 +1,4 @@
-"""A leader on ROS 1 topics, through rospy in a process of its own."""
+"""Leader on ROS 1 topics, through rospy in a child process."""
 
 from __future__ import annotations
 
@@ -24,5 +24,5 @@ class Config(ros1.Link, LeaderGroups):
 
 
 def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
-    """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
+    """Create the leader, not yet connected. Raises ConfigurationError for a group or joint that the robot lacks."""
     return RosLeader(config, 1, robot, clock, _NEWEST, packed, lambda: ros1.middleware(config, NODE))

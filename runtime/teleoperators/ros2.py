@@ -1,4 +1,4 @@
-"""A leader on ROS 2 topics, over DDS without a ROS installation, or through rclpy."""
+"""Leader on ROS 2 topics, over DDS without a ROS installation, or through rclpy."""
 
 from __future__ import annotations
 
@@ -36,6 +36,6 @@ class Config(ros2.Link, LeaderGroups):
 
 
 def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
-    """The leader, not yet connected; ConfigurationError names a group or joint that is not the robot's."""
+    """Create the leader, not yet connected. Raises ConfigurationError for a group or joint that the robot lacks."""
     quality = config.qos.merged_over(SENSOR_QUALITY)
     return RosLeader(config, 2, robot, clock, quality, cdr, lambda: ros2.middleware(config, NODE))

@@ -1,7 +1,7 @@
-"""A leader over ZMQ: it publishes where it is, we subscribe; single frames, openpi arrays.
+"""Leader over ZMQ: it publishes its joints, we subscribe; single frames, openpi arrays.
 
-A message is a map: `t`, its own clock [s], and `state`, joints by the robot's groups, as an execution node says them.
-The wire has no authentication, so beyond this machine it must be asked for.
+A message is a map: `t`, its own clock [s], and `state`, joints by the robot's groups, in the form of an execution
+node. The protocol has no authentication, so an endpoint beyond this machine needs `insecure_link`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from runtime.transports.zmq import is_loopback
 if TYPE_CHECKING:
     from robots import Robot
 
-_WAKE_MS = 50  # how soon the reader notices that it is to end
+_WAKE_MS = 50  # time until the reader thread notices that it must end [ms]
 _REOPEN_S = 0.5
-_LIMIT = 64 * 1024  # bytes of a message
+_LIMIT = 64 * 1024  # [bytes] per message
 
 
 class Config(Settings):
@@ -52,14 +52,14 @@ class Config(Settings):
 
 
 def build(config: Config, robot: Robot, clock: Clock) -> ZmqLeader:
-    """The leader, not yet connected."""
+    """Create the leader, not yet connected."""
     return ZmqLeader(config.endpoint, robot, clock)
 
 
 class ZmqLeader(Leader):
-    """One SUB socket that keeps the newest message alone, read by a thread.
+    """SUB socket that keeps only the newest message, read by a thread.
 
-    A message whose `t` is that of the one before says nothing new: a publisher that repeats itself is silent.
+    A message with the `t` of its predecessor is not new: a publisher that only repeats itself counts as silent.
     """
 
     def __init__(self, endpoint: str, robot: Robot, clock: Clock) -> None:
@@ -100,7 +100,7 @@ class ZmqLeader(Leader):
         return node_link.open_socket(zmq.SUB, self._endpoint, options)
 
     def _read(self, socket: zmq.Socket[bytes] | None) -> None:
-        """The thread: nothing that happens in it may end it, because nobody else listens to the leader."""
+        """Run the reader thread. No error may end it, because nothing else listens to the leader."""
         while not self._ending.is_set():
             try:
                 if socket is None:
@@ -117,7 +117,7 @@ class ZmqLeader(Leader):
             socket.close()
 
     def handle_message(self, payload: bytes) -> None:
-        """Take one message; one that cannot be used is remembered as the reason for which nothing comes."""
+        """Process one message; an unusable message becomes the `problem` of the leader."""
         try:
             stamp, joints = self._parse(payload)
         except CodecError as error:

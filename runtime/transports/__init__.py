@@ -1,6 +1,6 @@
-"""One file per way to a robot. Each declares `Config`, `capabilities`, `source` and `sink`."""
+"""Transports, one module per kind of link to a robot. Each declares `Config`, `capabilities`, `source` and `sink`."""
 
-# Each kind with its module, which is imported where a deployment names it.
+# Module of each kind. It is imported only if a deployment names it.
 KINDS = {
     "dataset": "runtime.transports.dataset",
     "ros1": "runtime.transports.ros1",

@@ -1,4 +1,4 @@
-"""A transport: a source of observations (held by reception) and a sink for commands (held by control)."""
+"""Transport interface: a source of observations (used by reception) and a sink for commands (used by control)."""
 
 from __future__ import annotations
 
@@ -15,91 +15,86 @@ from runtime.ipc.messages import Event
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """Abilities of a transport; a deployment that asks for more is refused at set-up."""
+    """Abilities of a transport. A deployment that needs more is refused at set-up."""
 
-    moves_robot: bool  # commands reach something that can break: report-only safety is refused
-    is_finite: bool = False  # the source runs out (a recording)
+    moves_robot: bool  # commands reach real hardware, so report-only safety is refused
+    is_finite: bool = False  # the source ends (a recording)
     measures_eef: bool = False
-    spaces: frozenset[str] = frozenset(
-        {"joint"}
-    )  # command spaces it can publish; "eef" comes along with joints
-    poses: tuple[
-        PoseFormat, ...
-    ] = ()  # formats of poses that it takes where it publishes "eef"; any where empty
-    drives_itself: bool = (
-        False  # its robot reads a leader of its own when it is told to, and reports what it applied
-    )
-    resets_bench: bool = (
-        False  # declared simulated: it lays out its bench when told, and says the truth of it
-    )
+    spaces: frozenset[str] = frozenset({"joint"})  # command spaces that it publishes; "eef" includes "joint"
+    poses: tuple[PoseFormat, ...] = ()  # accepted pose formats for "eef"; empty: any
+    drives_itself: bool = False  # on request its node follows its own leader and reports the actions
+    resets_bench: bool = False  # a declared simulation: resets its bench and reports its ground truth
 
 
 class Source(ABC):
-    """Delivers observations, newest by arrival."""
+    """Source of observations; the newest one by arrival counts."""
 
     @abstractmethod
     def connect(self) -> None:
-        """Open what there is to open; raises TransportError with a sentence where that fails."""
+        """Open sockets, files or nodes. Raises TransportError with a sentence for the operator if that fails."""
 
     @abstractmethod
     def receive(self, timeout: float) -> Observation | None:
-        """The newest observation not yet delivered, waiting at most `timeout` seconds; None where there is none.
+        """Return the newest observation that was not delivered yet, or None after `timeout` [s] without one.
 
         A malformed message is counted in `faults()` and skipped; it never ends the caller's loop.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything; safe to call twice."""
+        """Release all resources. Safe to call twice."""
 
-    def begin_run(self) -> None:  # noqa: B027  # a live robot has nothing to do
-        """A run starts: a recording plays from its first frame."""
+    def begin_run(self) -> None:  # noqa: B027  # not abstract: a live robot needs nothing
+        """Start a run; a recording plays from its first frame."""
 
     def end_run(self) -> None:  # noqa: B027
-        """The run is over: a video shows its first picture again."""
+        """End the run; a video returns to its first picture."""
 
     def faults(self) -> dict[str, int]:
-        """Counts by name of what went wrong since connect, e.g. {"clock_backwards": 1, "malformed": 3}."""
+        """Return the count of each fault since `connect`, e.g. {"clock_backwards": 1, "malformed": 3}."""
         return {}
 
     def describe_fault(self, fault: str) -> str:
-        """The newest sentence about one of `faults`; "" where its name says all there is to say."""
+        """Return the newest sentence about one of `faults`, or "" if its name is sufficient."""
         return ""
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
-        """Health of each camera of the deployment's own; {} where all pictures come from the transport."""
+        """Return the health of cameras that the deployment opens itself; {} if all pictures come from the transport."""
         return {}
 
     def pop_events(self) -> list[Event]:
-        """Events since the last call of which the operator is told."""
+        """Return the events for the operator since the last call."""
         return []
 
 
 class Sink(ABC):
-    """Sends commands; never blocks the control tick."""
+    """Sink of commands that never blocks the control tick."""
 
     @abstractmethod
     def connect(self) -> None:
-        """Open what there is to open; raises TransportError with a sentence where that fails."""
+        """Open sockets or nodes. Raises TransportError with a sentence for the operator if that fails."""
 
     @abstractmethod
     def send(self, command: RobotCommand) -> None:
-        """Hand over one command without waiting for anybody."""
+        """Send one command without waiting for a peer."""
 
     def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
-        """Hand over a control word with its fields, without waiting; raises TransportError where it takes none.
+        """Send a control word with its fields, without waiting.
 
-        A word may be lost like a command: who needs it obeyed repeats it until the observations show that it was.
+        A control word may be lost like any command: repeat it until the observations show its effect.
+
+        Raises:
+            TransportError: This transport has no control words, or the word cannot be sent.
         """
         raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Places of commands that no peer takes, each with a sentence on why, or "" where nothing is known.
+        """Map each command topic without a subscriber to the reason, "" if unknown; {} if the transport cannot tell.
 
-        {} also where a transport cannot know. Asks no peer and waits for nothing; raises TransportError.
+        Sends no request and does not block. Raises TransportError.
         """
         return {}
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything; safe to call twice."""
+        """Release all resources. Safe to call twice."""

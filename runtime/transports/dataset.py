@@ -1,4 +1,4 @@
-"""A recorded episode as a robot: it plays at its own pace and nothing that is sent to it moves."""
+"""Recorded episode in place of a robot: it plays at its own rate, and commands move nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from runtime.datasets.pictures import ImageSequence
     from runtime.datasets.reader import RecordedEpisode
 
-TOLERANCE = 1e-6  # a frame counts as due this much early [s]: due times are sums of floats
+TOLERANCE = 1e-6  # a frame is due this much early [s]: due times are sums of floats
 
 
 class Config(Settings):
@@ -37,12 +37,12 @@ class Config(Settings):
 
 
 class DatasetSource(Source):
-    """Frame k of the episode, due at the start of the run plus k / fps on the given clock.
+    """Source that plays an episode: frame k is due at the start of the run plus k / fps on the given clock.
 
-    Before and between runs the first frame is delivered again and again, at most at the recording's rate, as if
-    the robot stood there now. A reader that comes late gets the newest frame due; those it missed are counted as
-    `skipped_frames`. The last frame says so, and nothing follows it. Row k comes with picture k of every
-    camera: pictures are decoded by frame number, the next ones while waiting for them to be due.
+    Before and between runs the first frame is delivered repeatedly, at most at the recording's rate, like a robot at
+    rest. A late reader receives the newest frame that is due; missed frames are counted as `skipped_frames`. The last
+    frame has `last` set, and no frame follows it. Row k comes with picture k of every camera: pictures are decoded by
+    frame number, and the next ones are decoded while waiting for their due time.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock) -> None:
@@ -53,12 +53,17 @@ class DatasetSource(Source):
         self._pictures: dict[str, ImageSequence] = {}
         self._sequence = 0
         self._skipped = 0
-        self._start: float | None = None  # of the run; None: before it
-        self._next = 0  # frames of the run delivered or skipped
+        self._start: float | None = None  # start time of the run; None outside runs
+        self._next = 0  # number of frames of the run that were delivered or skipped
         self._standing_due = float("-inf")
 
     def connect(self) -> None:
-        """Open the episode; raises TransportError, or SetupError where it does not fit the robot."""
+        """Open the episode and decode its first frame.
+
+        Raises:
+            TransportError: The dataset cannot be read.
+            SetupError: The widths of its columns do not fit the robot, or `start_frame` is beyond its end.
+        """
         from runtime.datasets.reader import open_dataset
 
         self.close()
@@ -103,12 +108,12 @@ class DatasetSource(Source):
             )
 
     def begin_run(self) -> None:
-        """Frame 0 of the run is due now."""
+        """Start the run: frame 0 is due now."""
         self._start = self._clock.now()
         self._next = 0
 
     def end_run(self) -> None:
-        """The robot stands where a run begins."""
+        """End the run: the first frame is delivered again."""
         self._start = None
         self._standing_due = float("-inf")
 
@@ -145,13 +150,13 @@ class DatasetSource(Source):
         return self._observation(episode, self._config.start_frame + frame, start + frame / episode.fps)
 
     def _wait(self, due: float, deadline: float) -> bool:
-        """Wait until `due` but not beyond `deadline`; whether it is due then."""
+        """Wait until `due`, at most until `deadline`; return True if `due` has been reached."""
         if self._clock.now() + TOLERANCE < due:
             self._clock.sleep_until(min(due, deadline))
         return self._clock.now() + TOLERANCE >= due
 
     def _prefetch(self, row: int) -> None:
-        """Use the time until `row` is due; what is broken is told when it is."""
+        """Decode `row` while waiting for it. Errors are reported when the row is due."""
         with suppress(RecordingError):
             self._decode(row)
 
@@ -164,7 +169,7 @@ class DatasetSource(Source):
         except RecordingError as error:
             raise TransportError(str(error)) from error
         arrived = self._clock.now()
-        captured = min(due, arrived)
+        captured = min(due, arrived)  # a frame may be due TOLERANCE early, but is never newer than now
         self._sequence += 1
         return Observation(
             sequence=self._sequence,
@@ -196,32 +201,32 @@ class DatasetSource(Source):
 
 
 class DatasetSink(Sink):
-    """Counts the commands and sends nothing."""
+    """Sink that counts the commands and sends nothing."""
 
     def __init__(self) -> None:
         self.commands = 0
 
     def connect(self) -> None:
-        """Nothing to open."""
+        """Do nothing."""
 
     def send(self, command: RobotCommand) -> None:
         """Count `command`."""
         self.commands += 1
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing."""
 
 
 def capabilities(config: Config) -> Capabilities:
-    """A recording moves nothing and ends; it measures poses where the mapping names their column."""
+    """Return the abilities of a recording: finite, moves nothing, measures poses if the mapping names their column."""
     return Capabilities(moves_robot=False, is_finite=True, measures_eef=config.mapping.eef is not None)
 
 
 def source(config: Config, robot: Robot, clock: Clock) -> DatasetSource:
-    """The episode as a source of observations."""
+    """Create the source that plays the episode."""
     return DatasetSource(config, robot, clock)
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> DatasetSink:
-    """A sink that moves nothing."""
+    """Create a sink that moves nothing."""
     return DatasetSink()

@@ -1,4 +1,4 @@
-"""Notices pictures that do not change: a node stamps its messages, not what each camera last took."""
+"""Detection of frozen cameras. A node stamps its messages, not the pictures, so an old picture seems new."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ import numpy as np
 
 from runtime.core.types import UInt8
 
-FROZEN_S = 0.5  # after which a camera counts as frozen; nothing is decided by it, a person is told
-_SAMPLED_ROWS = 16  # every so many rows are compared first: two pictures of a live camera differ there
+FROZEN_S = 0.5  # [s]; an older picture counts as frozen, which is only reported
+_SAMPLED_ROWS = 16  # every 16th row is compared first: enough to tell two pictures of a live camera apart
 
 
 class FrozenCameraDetector:
-    """Since when each camera shows what it shows; for the pictures of one source, in their order."""
+    """Detector of cameras whose picture does not change. Pass the pictures of one source, in their order."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, tuple[UInt8, float]] = {}  # by camera: picture, time of the first like it
+        self._newest: dict[str, tuple[UInt8, float]] = {}  # by camera: picture and first time
         self._frozen: set[str] = set()
 
     def captured(self, pictures: Mapping[str, UInt8], time: float) -> dict[str, float]:
-        """For each camera `time`, or where its picture is exactly the one before, the time of that."""
+        """Return when each picture first appeared: `time`, or earlier if it equals the previous one."""
         times = {}
         for camera, picture in pictures.items():
             before = self._newest.get(camera)
@@ -31,7 +31,7 @@ class FrozenCameraDetector:
         return times
 
     def newly_frozen(self, time: float) -> list[str]:
-        """Cameras that show the same for FROZEN_S at `time`; each is named once, until it moves again."""
+        """Return cameras whose picture is unchanged for over FROZEN_S at `time`; each once until it changes again."""
         frozen = {camera for camera, (_, since) in self._newest.items() if time - since > FROZEN_S}
         new = sorted(frozen - self._frozen)
         self._frozen |= frozen
@@ -39,7 +39,7 @@ class FrozenCameraDetector:
 
 
 def _equal(one: UInt8, other: UInt8) -> bool:
-    """Bit by bit; most pictures are told apart by a few rows."""
+    """Return True if two pictures are equal bit by bit; comparing a few rows first decides most cases."""
     if one.shape != other.shape:
         return False
     sampled = slice(None, None, _SAMPLED_ROWS)

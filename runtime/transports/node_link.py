@@ -1,4 +1,4 @@
-"""A socket to an execution node, with what both directions need of it."""
+"""ZMQ socket to an execution node, with the options that both directions need."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import zmq
 
-# A link that was cut without a word is given up after 4 s and made anew; else it is waited for up to 15 min.
+# A connection that was cut silently is dropped after 4 s and opened again; the kernel's default may be 15 min.
 _ALIVE = {
     zmq.LINGER: 0,
     zmq.TCP_KEEPALIVE: 1,
@@ -17,7 +17,7 @@ _ALIVE = {
 
 
 def open_socket(kind: int, endpoint: str, options: Mapping[int, int | bytes]) -> zmq.Socket[bytes]:
-    """A connected socket of that kind; raises ZMQError for an address that libzmq refuses."""
+    """Return a connected socket of the given ZMQ type. Raises ZMQError for an address that libzmq refuses."""
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
     try:
         for option, value in (*_ALIVE.items(), *options.items()):

@@ -1,4 +1,4 @@
-"""One message of an execution node: checked against the robot, or refused by name."""
+"""Messages of an execution node, checked against the robot and refused by a named fault."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Encoding = Literal["bgr", "rgb"]
-MESSAGE_LIMIT = 64 * 1024 * 1024  # bytes; three 1080p pictures are 19 MB
-TRUTH_LIMIT = 16 * 1024  # bytes; it goes into snapshots ten times a second
-DRIVE_FAULTS_LIMIT = 64  # of one message
-DRIVE_FAULT_LENGTH = 200
+MESSAGE_LIMIT = 64 * 1024 * 1024  # [bytes]; three 1080p pictures are 19 MB
+TRUTH_LIMIT = 16 * 1024  # [bytes]; it is part of snapshots, ten times a second
+DRIVE_FAULTS_LIMIT = 64  # number per message
+DRIVE_FAULT_LENGTH = 200  # [characters]
 Part = TypeVar("Part")
 _JSON: TypeAdapter[dict[str, JsonValue]] = TypeAdapter(
     dict[str, JsonValue], config=ConfigDict(strict=True, allow_inf_nan=False)
@@ -29,7 +29,7 @@ _JSON: TypeAdapter[dict[str, JsonValue]] = TypeAdapter(
 
 
 class MessageRefused(CodecError):
-    """A message that cannot be used; `fault` is the name under which it is counted."""
+    """Message that cannot be used; `fault` is the name under which it is counted."""
 
     def __init__(self, fault: str, text: str) -> None:
         super().__init__(text)
@@ -38,12 +38,12 @@ class MessageRefused(CodecError):
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """The node's statement of itself; the simulated one says all of it, older nodes the hil fields only."""
+    """Status that the node reports. The simulated node reports all fields, older nodes only the `hil_*` fields."""
 
-    holding: bool | None = None  # its own command deadline has passed; it holds position
-    refused: Mapping[str, int] = field(default_factory=dict)  # commands it refused, by reason
-    master: str | None = None  # whose commands it obeys
-    ack: int | None = None  # the number of the newest message of that master's that it has obeyed
+    holding: bool | None = None  # its command deadline has passed and it holds its position
+    refused: Mapping[str, int] = field(default_factory=dict)  # number of refused commands by reason
+    master: str | None = None  # id of the client that it obeys
+    ack: int | None = None  # sequence number of that client's newest message that it has obeyed
     hil_supported: bool = False
     hil_active: bool = False
     hil_error: str = ""
@@ -53,9 +53,8 @@ class NodeStatus:
 class NodeFrame:
     """One complete observation as sent: `stamp` in the node's own clock [s], pictures in its own `encoding`.
 
-    `truth` is what a simulated bench says of itself, as JSON. `drives` is {"enabled": bool, "faults": [str]}, None
-    where the node does not say. `remarks` are (fault, text) of optional parts that
-    were left out because they are unusable.
+    `truth` is the ground truth of a simulated bench, as JSON. `drives` is {"enabled": bool, "faults": [str]}, or None
+    if the node does not report it. `remarks` are (fault, text) of optional parts that were dropped as unusable.
     """
 
     stamp: float
@@ -73,7 +72,7 @@ class NodeFrame:
 
 
 class NodeMessages:
-    """Reads the node's messages for one robot; `disabled` cameras are neither required nor delivered."""
+    """Reader of the node's messages for one robot. Cameras in `disabled` are neither required nor delivered."""
 
     def __init__(self, robot: Robot, encoding: Encoding, disabled: frozenset[str], limit: int) -> None:
         self._robot = robot
@@ -83,7 +82,7 @@ class NodeMessages:
         self._limit = limit
 
     def read(self, payload: bytes | memoryview) -> NodeFrame:
-        """The frame of one message; raises MessageRefused where a part that control needs is missing."""
+        """Decode and check one message. Raises MessageRefused if a part that control needs is missing or wrong."""
         message = self._message(payload)
         remarks: list[tuple[str, str]] = []
         return NodeFrame(
@@ -138,7 +137,7 @@ class NodeMessages:
     def _optional(
         self, remarks: list[tuple[str, str]], name: str, read: Callable[[str, object], Part], given: object
     ) -> Part | None:
-        """The part as read, None where it is absent or unusable; the latter leaves a remark."""
+        """Return the part as read, or None if it is absent or unusable; an unusable part is added to `remarks`."""
         if given is None:
             return None
         try:
@@ -159,7 +158,7 @@ class NodeMessages:
     def _poses(self, name: str, given: object) -> Float32:
         vector = _vector(name, given, self._eef_width)
         norms = np.linalg.norm(vector.reshape(-1, EEF_WIDTH)[:, 3:7], axis=1)
-        if (np.abs(norms - 1.0) > 0.05).any():  # some nodes send zeros where they know no pose
+        if (np.abs(norms - 1.0) > 0.05).any():  # some nodes send zeros for an unknown pose
             raise MessageRefused(
                 "malformed", f"{name} has quaternions of length {norms.round(3).tolist()}; expected 1"
             )
@@ -207,7 +206,7 @@ def _picture(key: str, given: object) -> UInt8:
 
 
 def _truth(name: str, given: object) -> Mapping[str, Any]:
-    """A map of JSON that says at least which reset it is about, what was achieved since, and whether that is all."""
+    """Check the ground truth: JSON with the id of its reset, the milestones since then and the success."""
     try:
         truth: dict[str, Any] = _JSON.validate_python(given)
     except ValidationError as invalid:
@@ -228,7 +227,7 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
 
 
 def _drives(name: str, given: object) -> Mapping[str, Any]:
-    """State of the drives: enabled or not, and their faults; further keys are left out."""
+    """Return the state of the drives: enabled or not, and their faults; other keys are dropped."""
     if not isinstance(given, dict):
         raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map")
     enabled, faults = given.get("enabled"), given.get("faults", [])

@@ -1,4 +1,4 @@
-"""Settings of the half of an execution node's link that brings observations."""
+"""Settings of the receiving half of an execution node's link."""
 
 from __future__ import annotations
 

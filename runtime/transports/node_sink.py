@@ -1,4 +1,4 @@
-"""Commands to an execution node over ZMQ."""
+"""Sink of commands to an execution node over ZMQ."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from robots import Robot
 
 _QUEUED_COMMANDS = 2
-_QUEUED_BYTES = 8 * 1024  # with the kernel: what a node that stands still finds when it goes on
-# Words that any node may know. Their message has the form of a command, which older nodes insist on.
+_QUEUED_BYTES = 8 * 1024  # in the kernel: a node that was stopped finds at most this much when it continues
+# Control words that every node may know. Their messages have the fields of a command, which older nodes require.
 _FORMED = frozenset({"collect_start", "collect_stop", "hil_start", "hil_stop"})
 
 
 class NodeSink(Sink):
-    """One PUB socket; what cannot leave at once is dropped, and nothing waits for a node that is away.
+    """PUB socket for commands. A message that cannot be sent at once is dropped; nothing waits for an absent node.
 
-    Each says who sends it (`master`, one id per sink) and its number (`seq`); older nodes ignore both.
+    Each message names its sender (`master`, one id per sink) and its number (`seq`); older nodes ignore both.
     """
 
     def __init__(self, endpoint: str, robot: Robot, clock: Clock) -> None:
@@ -38,16 +38,16 @@ class NodeSink(Sink):
         self._clock = clock
         self._socket: zmq.Socket[bytes] | None = None
         self._sequence = 0
-        self._newest: Float32 = np.zeros(robot.dim, np.float32)  # the command sent last
+        self._newest: Float32 = np.zeros(robot.dim, np.float32)  # the last command that was sent
         self.master = uuid.uuid4().hex
 
     def connect(self) -> None:
-        """Open the socket; a node that is not there yet is found by itself when it comes."""
+        """Open the socket. ZMQ connects to the node as soon as it is there."""
         self.close()
         options: dict[int, int | bytes] = {
             zmq.SNDHWM: _QUEUED_COMMANDS,
             zmq.SNDBUF: _QUEUED_BYTES,
-            # Without this a node that comes back is given the commands of the moment it went away.
+            # Without this, ZMQ queues commands for an absent node and sends it the oldest when it comes back.
             zmq.IMMEDIATE: 1,
         }
         try:
@@ -56,7 +56,7 @@ class NodeSink(Sink):
             raise TransportError(f"cannot reach the node at {self._endpoint}: {error}") from error
 
     def send(self, command: RobotCommand) -> None:
-        """Hand over one absolute target; TransportError for a vector that no node may be given."""
+        """Send one absolute target. Raises TransportError for a wrong shape or numbers that are not finite."""
         action = np.asarray(command.action, dtype=np.float32)
         if action.shape != (self._dim,) or not np.isfinite(action).all():
             raise TransportError(
@@ -67,9 +67,10 @@ class NodeSink(Sink):
         self._newest = action
 
     def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
-        """Hand over the control word `word`: it stands where a command says its target, its fields beside it.
+        """Send the control word `word` as the target of a message, with `data` as further fields.
 
-        Words that older nodes know come with a vector, as those want it: the newest command, 0 where there was none.
+        Words that older nodes know also carry an action vector, which those nodes require: the newest command, or zeros
+        before the first.
         """
         taken = sorted({"t", "target", "action", "master", "seq"} & set(data))
         if taken or word in ("real", "sim"):
@@ -82,11 +83,11 @@ class NodeSink(Sink):
             raise TransportError(f"the link to {self._endpoint} is not connected; connect it before sending")
         self._sequence += 1
         message |= {"master": self.master, "seq": self._sequence}
-        with contextlib.suppress(zmq.Again):  # the newest command counts; the next one comes in a tick
+        with contextlib.suppress(zmq.Again):  # only the newest command counts; the next follows in a tick
             self._socket.send(msgpack_arrays.pack(message), zmq.NOBLOCK)
 
     def close(self) -> None:
-        """Close the socket; what has not left yet is forgotten."""
+        """Close the socket and drop messages that have not been sent."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

@@ -1,4 +1,4 @@
-"""Observations of an execution node over ZMQ: the newest by arrival, on our clock, every fault by name."""
+"""Observations of an execution node over ZMQ: the newest by arrival, on our clock, with counted faults."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ _FRAMES_LOST = fixed(
     "node.frames_lost",
     "the node's numbers have gaps: this machine, or the way, is too slow for it",
 )
-# Reasons of the nodes that are known; others say theirs in their own words.
+# Reasons of the known nodes; other reasons are shown as the node words them.
 _REFUSED = {
     "node_refused.stale": _REFUSED_LATE,
     "node_refused.limits": _REFUSED_LIMITS,
@@ -110,20 +110,20 @@ _REFUSED = {
     "node_refused.collecting": _REFUSED_COLLECTING,
 }
 _QUEUED_FRAMES = 4
-_WAKE_MS = 50  # how soon the reader notices that it is to end
+_WAKE_MS = 50  # time until the reader thread notices that it must end [ms]
 _REOPEN_S = 1.0
-_BACKWARDS_S = 0.1  # one socket keeps its messages in order, so an earlier stamp is another clock
+_BACKWARDS_S = 0.1  # [s]; one socket keeps the order, so an earlier stamp means another clock
 
 
 class NodeSource(Source):
-    """One SUB socket, emptied all the time by a thread of its own, so that no frame grows old in a queue.
+    """SUB socket that a thread empties continuously, so that no frame ages in a queue.
 
-    Newest is newest by arrival: a node that restarts has a smaller clock, and its frames count at once.
-    `Observation.sequence` counts the usable frames since connect, whatever the node's own numbers do. What
-    goes wrong in the thread is counted, and where the socket itself fails another one is opened.
+    Newest means newest by arrival: after a restart a node's clock is smaller, and its frames count at once.
+    `Observation.sequence` counts the usable frames since `connect`, independent of the node's own numbers. Errors in
+    the thread are counted; if the socket fails, the thread opens another.
     """
 
-    _told: str  # the reason for which no frame comes that was said last
+    _told: str  # last reported reason why no frame arrives
 
     def __init__(self, config: NodeSettings, robot: Robot, clock: Clock) -> None:
         self._endpoint = config.sub_endpoint
@@ -141,7 +141,10 @@ class NodeSource(Source):
         self._forget()
 
     def connect(self) -> None:
-        """Start to listen; a node that is not there yet is found by itself when it comes."""
+        """Start to listen.
+
+        ZMQ connects to the node as soon as it is there. Raises TransportError for a bad endpoint.
+        """
         self.close()
         self._forget()
         self._ending.clear()
@@ -153,33 +156,34 @@ class NodeSource(Source):
         self._thread.start()
 
     def receive(self, timeout: float) -> Observation | None:
-        """The newest complete frame not yet delivered, as RGB; None after `timeout` seconds without one."""
+        """Return the newest complete frame that was not delivered yet, as RGB; None after `timeout` [s] without one."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest is not None, timeout)
             newest, self._newest = self._newest, None
         return None if newest is None else _observation(*newest)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening and end the thread."""
         self._ending.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
 
     def faults(self) -> dict[str, int]:
-        """Refused messages by reason, `frames_lost` (gaps in the node's own numbers), jumps of the node's clock.
+        """Return the number of refused messages by reason, lost frames, and jumps of the node's clock.
 
+        `frames_lost` counts gaps in the node's own numbers.
         `frozen_<camera>` counts how often that camera's picture stayed the same for too long.
-        `truth_ignored` is 1 where a node that is not declared simulated says what only a simulated one can know.
-        `drives_unusable` counts messages whose drive state could not be read.
-        Commands that the node itself refused appear as `node_refused.<reason>`.
+        `truth_ignored` is 1 if a node that is not declared simulated sends the ground truth of a bench.
+        `drives_unusable` counts messages with an unreadable drive state.
+        `node_refused.<reason>` counts commands that the node itself refused.
         """
         with self._changed:
             refused = {f"node_refused.{reason}": n for reason, n in self._status.refused.items()}
             return dict(self._faults) | refused
 
     def describe_fault(self, fault: str) -> str:
-        """The newest sentence of a fault; of what the node refused, what that means."""
+        """Return the newest sentence about a fault; for refusals by the node, an explanation of its reason."""
         if fault == "node_refused.other_master":
             return _SEVERAL_CLIENTS(client=self._status.master)
         if fault in _REFUSED:
@@ -188,7 +192,7 @@ class NodeSource(Source):
             return self._sentences.get(fault, "")
 
     def pop_events(self) -> list[Event]:
-        """Why no usable frame comes, once for each reason."""
+        """Return one event for each new reason why no usable frame arrives."""
         now = self._clock.now()
         with self._changed:
             silent = now - self._usable_at
@@ -202,27 +206,27 @@ class NodeSource(Source):
 
     @property
     def last_fault(self) -> str:
-        """The sentence of the newest fault; empty where there was none."""
+        """Sentence about the newest fault; "" if there was none."""
         return self._last_fault
 
     @property
     def status(self) -> NodeStatus:
-        """The node's statement of itself in its newest usable message."""
+        """Status in the node's newest usable message."""
         return self._status
 
     def _forget(self) -> None:
         self._map = ClockMap(tolerance=_BACKWARDS_S)
-        self._stamp = -math.inf  # of the newest message
+        self._stamp = -math.inf  # stamp of the newest message
         self._freshness = FrozenCameraDetector()
         self._faults: Counter[str] = Counter()
-        self._sentences: dict[str, str] = {}  # by fault, the newest
+        self._sentences: dict[str, str] = {}  # newest sentence by fault
         self._last_fault = ""
         self._status = NodeStatus()
         self._count = 0
         self._peer_sequence: int | None = None
         self._newest = None
         self._usable_at = self._heard_at = self._clock.now()
-        self._refused: tuple[str, str] | None = None  # the newest message that was, and why
+        self._refused: tuple[str, str] | None = None  # fault and text of the newest refused message
         self._told = ""
 
     def _no_frame_reason(self, silent: float, refusal: str | None) -> str:
@@ -232,7 +236,7 @@ class NodeSource(Source):
         return _STOPPED(**told) if self._count else _NEVER_CAME(**told)
 
     def _open_subscriber(self) -> zmq.Socket[bytes]:
-        """A socket that hears the node; raises ZMQError."""
+        """Return a socket that receives from the node. Raises ZMQError."""
         options: dict[int, int | bytes] = {
             zmq.RCVHWM: _QUEUED_FRAMES,
             zmq.MAXMSGSIZE: MESSAGE_LIMIT,
@@ -241,7 +245,7 @@ class NodeSource(Source):
         return node_link.open_socket(zmq.SUB, self._endpoint, options)
 
     def _read(self, socket: zmq.Socket[bytes] | None) -> None:
-        """The thread: nothing that happens in it may end it, because nobody else listens to the node."""
+        """Run the reader thread. No error may end it, because nothing else listens to the node."""
         while not self._ending.is_set():
             try:
                 if socket is None:
@@ -256,12 +260,12 @@ class NodeSource(Source):
                 self._ending.wait(_REOPEN_S)
             except Exception as error:
                 self._count_internal_error(error)
-                self._ending.wait(_WAKE_MS / 1000)  # so that an error that stays does not spin
+                self._ending.wait(_WAKE_MS / 1000)  # a lasting error must not spin
         if socket is not None:
             socket.close()
 
     def _handle_messages(self, payloads: list[memoryview], arrived: float) -> None:
-        """Keep the newest usable message; a partial or broken one never displaces an older complete one."""
+        """Store the newest usable message; a partial or broken message never replaces an older complete one."""
         self._heard_at = arrived
         for payload in reversed(payloads):
             try:
@@ -274,7 +278,7 @@ class NodeSource(Source):
                     return
 
     def _store_frame(self, frame: NodeFrame, arrived: float) -> bool:
-        """Keep it for who receives; False where it is older than what came before it."""
+        """Store the frame for `receive`; return False if it is older than an earlier frame."""
         for fault, text in frame.remarks:
             self._count_fault(fault, text)
         if frame.truth is not None and not self._simulated:
@@ -298,13 +302,13 @@ class NodeSource(Source):
         return True
 
     def _ignore_truth(self) -> None:
-        """Said once: every message of such a node has it."""
+        """Count the fault only once: every message of such a node carries a ground truth."""
         if "truth_ignored" not in self._faults:
             text = _TRUTH_UNDECLARED
             self._count_fault("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, time: float) -> dict[str, float]:
-        """The time of each stream: the message's, but for pictures that are no new ones."""
+        """Return the capture time of each stream: the message's, but an earlier one for unchanged pictures."""
         times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
         if self._detect_frozen:
             times |= self._freshness.captured(frame.pictures, time)
@@ -313,9 +317,9 @@ class NodeSource(Source):
         return times
 
     def _mapped(self, stamp: float, arrived: float) -> float | None:
-        """The node's stamp on our clock, None where it is older than the newest: time never goes back.
+        """Return the node's stamp on our clock, or None if it is older than the newest: time never goes back.
 
-        Where the node's clock jumps, that is said and the map begins anew.
+        If the node's clock jumps, the jump is counted and the map starts anew.
         """
         restarts, leaps = self._map.restarts, self._map.leaps
         time = self._map.map(stamp, arrived)
@@ -342,15 +346,15 @@ class NodeSource(Source):
 
     def _count_internal_error(self, error: Exception) -> None:
         text = f"reading failed: {type(error).__name__}: {error}"
-        if not self._last_fault.endswith(text):  # once, not thirty times a second
+        if not self._last_fault.endswith(text):  # log once, not thirty times a second
             log.error("%s: %s", self._endpoint, text, exc_info=error)
         self._count_fault("reader_failed", text)
 
 
 def _drain(socket: zmq.Socket[bytes]) -> list[memoryview]:
-    """Everything that has arrived by now, oldest first; bounded, so that a flood cannot keep us here.
+    """Return all messages that have arrived, oldest first; bounded, so that a flood cannot block the thread.
 
-    Messages stay where ZMQ has received them: what is read of one is copied out of it anyway.
+    The messages stay in ZMQ's own buffers without a copy; decoding copies the parts that it needs.
     """
     payloads: list[memoryview] = []
     with contextlib.suppress(zmq.Again):
@@ -380,7 +384,7 @@ def _observation(
 
 
 def _bgr_to_rgb(bgr: UInt8) -> UInt8:
-    """RGB from BGR, ten times as fast as numpy would; imported here, as control locks all that it imports."""
+    """Convert BGR to RGB, ten times as fast as numpy. cv2 is imported here: control locks its imports into memory."""
     import cv2
 
     rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

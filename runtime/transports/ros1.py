@@ -1,7 +1,7 @@
-"""A robot's own ROS 1 topics through rospy, which runs in a process of its own, in the Python that has it.
+"""ROS 1 topics of a robot through rospy, which runs in a process of its own with the Python that has it.
 
-ROS 1 knows no protection: whoever reaches the master or a node can command the robot, so beyond this machine it must
-be asked for.
+ROS 1 has no protection: any peer that reaches the master or a node can command the robot. A master or an address
+beyond this machine therefore needs `insecure_link`.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from robots import Robot
 
 NODE = "eva_web"
-_NUMBERS = Quality(depth=50)  # queue_size: a driver at 200 Hz loses none while this machine is busy
+_NUMBERS = Quality(depth=50)  # queue_size: enough for a 200 Hz driver while this machine is busy
 _PICTURES = Quality(depth=1)
-REAL_TIME = True  # what is at its other end goes on by itself
+REAL_TIME = True  # the robot does not wait for us
 
 
 class Link(Settings):
     """Python and master of ROS 1, and the address of this machine."""
 
-    table: ClassVar[str] = "transport"  # of a deployment, for sentences
+    table: ClassVar[str] = "transport"  # the deployment's table, for messages
     python: str = Field(default="/usr/bin/python3", min_length=1)
     """The Python that has rospy; it needs nothing of ours."""
     master: str = "http://127.0.0.1:11311"
@@ -80,33 +80,33 @@ class Config(Link, RosSettings):
 
 
 def capabilities(config: Config) -> Capabilities:
-    """A robot hangs on it; SetupError where rospy is not installed."""
+    """Return the abilities of the transport, which commands a robot. Raises SetupError if rospy is not installed."""
     require(config.python)
     return config.capabilities
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
-    """Keys of the robot's cameras that this deployment has; ConfigurationError where any topic is not known."""
+    """Return the keys of the robot's cameras in this deployment. Raises ConfigurationError if a topic is unknown."""
     parts, _ = config.streams(robot, 1)
     return camera_keys(parts)
 
 
 def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
-    """The robot's topics as observations; ConfigurationError names a topic that is not known."""
+    """Create the source of observations from the robot's topics. Raises ConfigurationError if a topic is unknown."""
     parts, _ = config.streams(robot, 1)
     opener = lambda: middleware(config, f"{NODE}_source")  # noqa: E731
     return RosSource(robot, _heard(parts), config.acceptance_limits, clock, packed, opener)
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
-    """Commands to the robot's topics; ConfigurationError names a topic that is not known."""
+    """Create the sink of commands to the robot's topics. Raises ConfigurationError if a topic is unknown."""
     _, outlets = config.streams(robot, 1)
     opener = lambda: middleware(config, f"{NODE}_commands")  # noqa: E731
     return RosSink(robot, outlets, lambda _: COMMAND_QUALITY, clock, packed, opener)
 
 
 def middleware(config: Link, name: str) -> Middleware:
-    """A node, as soon as the master is there; SetupError where rospy is not installed."""
+    """Create a node, which registers as soon as the master is there. Raises SetupError if rospy is not installed."""
     return TcpRosMiddleware(RosEnvironment(config.python, config.master, config.address), name)
 
 
@@ -116,7 +116,7 @@ def _heard(parts: tuple[StreamSpec, ...]) -> tuple[Subscription, ...]:
 
 
 def _host(table: str, master: str) -> str:
-    """The host of a master's URI; ConfigurationError where it is none."""
+    """Return the host of a master's URI. Raises ConfigurationError if the URI is invalid."""
     try:
         parts = urlsplit(master)
         fits = parts.scheme == "http" and parts.hostname and parts.port and parts.path in ("", "/")

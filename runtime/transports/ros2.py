@@ -1,6 +1,7 @@
-"""A robot's own ROS 2 topics: over DDS without a ROS installation, or through rclpy where that is installed.
+"""ROS 2 topics of a robot: over DDS without a ROS installation, or through rclpy if that is installed.
 
-Anybody on the network of a DDS domain can command the robot, so beyond this machine it must be asked for.
+Any peer in the network of a DDS domain can command the robot. A network beyond this machine therefore needs
+`insecure_link`.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ if TYPE_CHECKING:
     from robots import Robot
 
 NODE = "eva_web"
-REAL_TIME = True  # what is at its other end goes on by itself
+REAL_TIME = True  # the robot does not wait for us
 
 
 class Link(Settings):
     """Which ROS 2, by which middleware, on which network."""
 
-    table: ClassVar[str] = "transport"  # of a deployment, for sentences
+    table: ClassVar[str] = "transport"  # the deployment's table, for messages
     middleware: Literal["dds", "rclpy"] = "dds"
     """"dds" needs no ROS but the extra ros2; "rclpy" needs a ROS 2 whose Python is the one that runs this."""
     domain: int = Field(default=0, ge=0, le=232)
@@ -72,19 +73,19 @@ class Config(Link, RosSettings):
 
 
 def capabilities(config: Config) -> Capabilities:
-    """A robot hangs on it; SetupError where the middleware is not installed."""
+    """Return the abilities of the transport, which commands a robot. Raises SetupError without the middleware."""
     (dds.require if config.middleware == "dds" else rcl.require)()
     return config.capabilities
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
-    """Keys of the robot's cameras that this deployment has; ConfigurationError where any topic is not known."""
+    """Return the keys of the robot's cameras in this deployment. Raises ConfigurationError if a topic is unknown."""
     parts, _ = _checked(config, robot)
     return camera_keys(parts)
 
 
 def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
-    """The robot's topics as observations; ConfigurationError names a topic that is not known."""
+    """Create the source of observations from the robot's topics. Raises ConfigurationError if a topic is unknown."""
     parts, _ = _checked(config, robot)
     heard = subscriptions(parts, _quality(config, SENSOR_QUALITY))
     return RosSource(
@@ -93,21 +94,21 @@ def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
-    """Commands to the robot's topics; ConfigurationError names a topic that is not known."""
+    """Create the sink of commands to the robot's topics. Raises ConfigurationError if a topic is unknown."""
     _, outlets = _checked(config, robot)
     quality = _quality(config, COMMAND_QUALITY)
     return RosSink(robot, outlets, quality, clock, cdr, lambda: middleware(config, f"{NODE}_commands"))
 
 
 def middleware(config: Link, name: str) -> Middleware:
-    """A node of the middleware that is chosen; SetupError where it is not installed."""
+    """Create a node of the chosen middleware. Raises SetupError if it is not installed."""
     if config.middleware == "rclpy":
         return rcl.RclMiddleware(config.domain, name)
     return dds.DdsMiddleware(config.domain, config.network, tuple(config.peers))
 
 
 def _checked(config: Config, robot: Robot) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:
-    """Topics that are listened to and those that are spoken on, the simulation's first."""
+    """Return the subscribed streams and the command topics, after checking the keys and durability of `qos`."""
     parts, outlets = config.streams(robot, 2)
     heard, told = {part.topic for part in parts}, {outlet.topic for outlet in outlets}
     unknown = sorted(set(config.qos) - heard - told)

@@ -1,6 +1,6 @@
-"""The ZMQ link to an execution node: the node binds, we connect; PUB/SUB, single frames, openpi arrays.
+"""ZMQ link to an execution node: the node binds, we connect; PUB/SUB, single frames, openpi arrays.
 
-The wire has no handshake, no authentication and no encryption, so beyond loopback it must be asked for.
+The protocol has no handshake, authentication or encryption, so endpoints beyond loopback need `insecure_link`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from runtime.transports.node_source import NodeSource
 if TYPE_CHECKING:
     from robots import Robot
 
-REAL_TIME = True  # what is at its other end goes on by itself
+REAL_TIME = True  # the node does not wait for us
 
 
 class Config(NodeSettings):
@@ -50,7 +50,7 @@ class Config(NodeSettings):
 
 
 def is_loopback(endpoint: str) -> bool:
-    """True if an endpoint cannot be reached from another machine."""
+    """Return True if the endpoint cannot be reached from another machine."""
     scheme, _, rest = endpoint.partition("://")
     if scheme in {"ipc", "inproc"}:
         return True
@@ -63,25 +63,25 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def _has_port(endpoint: str) -> bool:
-    """True if it ends in a port one can connect to; libzmq takes any number and then waits for ever."""
+    """Return True if the port is valid; libzmq accepts any number and then waits for ever."""
     port = endpoint.rpartition(":")[2]
     return port.isascii() and port.isdigit() and 0 < int(port) < 65536
 
 
 def capabilities(config: Config) -> Capabilities:
-    """A real robot may hang on it; poses are delivered where the node sends them."""
+    """Return the abilities of a node: it may command a real robot, and measures poses if it sends them."""
     return Capabilities(
         moves_robot=True, measures_eef=True, drives_itself=True, resets_bench=config.simulated
     )
 
 
 def cameras(config: Config, robot: Robot) -> tuple[str, ...]:
-    """Keys of the robot's cameras that this deployment has."""
+    """Return the keys of the robot's cameras in this deployment."""
     return tuple(camera.key for camera in robot.cameras if camera.key not in config.disabled_cameras)
 
 
 def source(config: Config, robot: Robot, clock: Clock) -> NodeSource:
-    """The observations of the node; ConfigurationError for a disabled camera that the robot does not have."""
+    """Create the source of the node's observations. Raises ConfigurationError for an unknown disabled camera."""
     known = [camera.key for camera in robot.cameras]
     unknown = [key for key in config.disabled_cameras if key not in known]
     if unknown:
@@ -92,5 +92,5 @@ def source(config: Config, robot: Robot, clock: Clock) -> NodeSource:
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> NodeSink:
-    """The commands to the node."""
+    """Create the sink of commands to the node."""
     return NodeSink(config.pub_endpoint, robot, clock)

@@ -1,1 +1,1 @@
-"""The RoboArena family of policy servers: what one wants, what it is sent, what its answers mean."""
+"""RoboArena family of policy servers: requirements, requests, meaning of the responses."""

@@ -1,4 +1,4 @@
-"""Rows of a RoboArena answer: joints or poses, targets or velocities, grippers as DROID counts them."""
+"""Rows of RoboArena responses: joints or poses, targets or velocities, grippers in DROID's convention."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ArenaActionSettings(Settings):
 
 
 class ArenaActions:
-    """Reads answers; ConfigurationError where a setting does not fit the robot."""
+    """Reader of responses. Raises ConfigurationError if a setting does not fit the robot."""
 
     def __init__(self, settings: ArenaActionSettings, convention: Convention, robot: Robot) -> None:
         self._settings = settings
@@ -67,7 +67,7 @@ class ArenaActions:
         self._parts: tuple[str, ...] = tuple(settings.action_keys or ())
 
     def configure(self, wants: ServerRequirements) -> None:
-        """Hold the server's words against the deployment's; ActionSpaceError with both sides."""
+        """Compare the server's requirements with the deployment. Raises ActionSpaceError with both sides."""
         settings = self._settings
         if wants.space != settings.action_space:
             raise ActionSpaceError(
@@ -82,7 +82,7 @@ class ArenaActions:
         self._parts = tuple(settings.action_keys or wants.parts)
 
     def chunk(self, reply: Any, timing: Mapping[str, float]) -> ActionChunk:
-        """From an answer's value: an array, a map with `actions`, or a map of named parts."""
+        """Return the chunk of a response: an array, a map with `actions`, or a map of named parts."""
         rows = parse_action_rows("actions", self._array(reply), self.width)
         if self.velocity:
             rows = self._steps_of_joints(rows) if self._poses is None else self._steps_of_poses(rows)
@@ -127,7 +127,7 @@ class ArenaActions:
 
 
 def _clip_norm(vectors: Float32) -> Float32:
-    """None longer than 1, its direction kept."""
+    """Shorten vectors that are longer than 1, preserving their direction."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     bounded: Float32 = vectors / np.maximum(lengths, np.float32(1.0))
     return bounded

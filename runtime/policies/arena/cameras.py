@@ -1,7 +1,7 @@
-"""Which camera goes into which slot of a RoboArena request: declared, never taken from an order.
+"""Assignment of cameras to the slots of a RoboArena request: declared, never derived from an order.
 
-Servers and most clients number the exterior cameras from 0, the client of the field from 1; a server that is sent
-the other numbering takes a picture for another view, or loses it, without an error.
+Servers and most clients number the exterior cameras from 0, the original client from 1. A server that receives the
+other numbering uses a picture for the wrong view, or drops it, without an error.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ _FIRST: dict[Numbering, int] = {"0-based": 0, "1-based": 1}
 
 
 class Cameras:
-    """Observation key = slot, of one robot; ConfigurationError where a camera is none or a slot is taken twice."""
+    """Slots of a robot's cameras by observation key.
+
+    Raises ConfigurationError for unknown cameras or repeated slots.
+    """
 
     def __init__(self, cameras: Mapping[str, Slot], numbering: Numbering, robot: Robot) -> None:
         known = [camera.key for camera in robot.cameras]
@@ -38,9 +41,9 @@ class Cameras:
         self._numbering: Numbering = numbering
 
     def assign(self, wants: ServerRequirements) -> dict[str, str]:
-        """Request key = observation key of what the server wants, in its order; the others are not sent.
+        """Return request key = observation key for the server's views, in its order; other cameras are not sent.
 
-        ContradictionError where it wants a view that no camera is declared for.
+        Raises ContradictionError if it needs a view for which no camera is declared.
         """
         found: dict[str, str] = {}
         for slot, key in _keys(wants, self._numbering):
@@ -56,7 +59,7 @@ class Cameras:
 
 
 def _keys(wants: ServerRequirements, numbering: Numbering) -> list[tuple[Slot, str]]:
-    """Slots and request keys in the order of the field's messages."""
+    """Return slots and request keys in the order of the protocol's messages."""
     slots: tuple[Slot, Slot] = ("first", "second")
     stereo: tuple[Slot, Slot] = ("first_stereo", "second_stereo")
     keys: list[tuple[Slot, str]] = []

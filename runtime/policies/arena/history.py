@@ -1,4 +1,4 @@
-"""History before a request: pictures of some moments before it, those that a policy was trained to see."""
+"""History of pictures before a request, at the moments that a policy was trained with."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Mapping
 
 from runtime.core.types import Observation, UInt8
 
-_ROOM = 8.0  # steps beyond the oldest that is shown: a request is about an observation that is not the newest any more
+_ROOM = 8.0  # spare steps before the oldest one used, because a request may be about an older observation
 
 Pictures = Mapping[str, UInt8]
 
 
 class History:
-    """Keeps the newest observations' pictures as they came; `steps` before a request are `rate` to a second.
+    """Pictures of the newest observations; `rate` steps before a request are one second.
 
-    It is looked at from the thread that asks the policy, and filled from another as well.
+    Read by the thread that queries the policy, and filled by other threads as well.
     """
 
     def __init__(self, steps: tuple[int, ...], rate: float) -> None:
@@ -25,7 +25,7 @@ class History:
         self._lock = threading.Lock()
 
     def add(self, observation: Observation) -> None:
-        """Keep its pictures; one that is no newer than the newest is kept already, or too late."""
+        """Add an observation's pictures, unless it is no newer than the newest one."""
         with self._lock:
             if self._kept and observation.arrived <= self._kept[-1][0]:
                 return
@@ -35,9 +35,10 @@ class History:
                 self._kept.popleft()
 
     def frames_before(self, observation: Observation) -> list[Pictures]:
-        """Pictures nearest to each of the steps before `observation`, in their order; never of after it.
+        """Return the pictures nearest to each of the steps before `observation`, in their order.
 
-        Where nothing as old was seen, the oldest; the observation is kept like any other.
+        Pictures of a later moment are never returned; steps before the oldest observation yield the oldest. The
+        observation itself is added like any other.
         """
         self.add(observation)
         with self._lock:
@@ -47,6 +48,6 @@ class History:
         return [min(seen, key=lambda one: abs(one[0] - moment))[1] for moment in moments]
 
     def reset(self) -> None:
-        """Nothing was seen yet."""
+        """Drop all pictures."""
         with self._lock:
             self._kept.clear()

@@ -1,4 +1,4 @@
-"""An observation as a RoboArena request: flat keys with slashes, pictures in the size that the server asks for."""
+"""RoboArena requests from observations: flat keys with slashes, pictures in the size that the server requires."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Steps = Annotated[int, Field(ge=0, le=64)]
-_FIELD_SIZE = (288, 512)  # to which the field's client brings every picture first
+_FIELD_SIZE = (288, 512)  # (height, width) to which the original client first resizes every picture
 
 
 class ArenaRequestSettings(Settings):
@@ -77,7 +77,7 @@ class ArenaRequestSettings(Settings):
 
 
 class ArenaRequest:
-    """Builds requests; `agree` first with what the server wants. ConfigurationError where a setting does not fit."""
+    """Builder of requests; call `configure` first. Raises ConfigurationError if a setting does not fit the robot."""
 
     def __init__(self, settings: ArenaRequestSettings, robot: Robot) -> None:
         self._settings = settings
@@ -93,39 +93,39 @@ class ArenaRequest:
         self._seen: deque[dict[str, UInt8]] = deque(maxlen=settings.frames)
         steps = settings.frame_steps
         self._history = None if steps is None else History(tuple(steps), settings.frame_rate)
-        self._begun = False  # something was shown since it was forgotten
+        self._begun = False  # whether a request was built since `forget`
 
     @property
     def glances_s(self) -> float | None:
-        """Interval at which pictures are kept [s]; None if none are."""
+        """Period at which pictures are stored [s]; None if none are."""
         return None if self._history is None else 1.0 / self._settings.frame_rate
 
     def observe(self, observation: Observation) -> None:
-        """Keep its pictures, where a history is shown."""
+        """Store its pictures, if a history is sent."""
         if self._history is not None:
             self._history.add(observation)
 
     @property
     def sees_poses(self) -> bool:
-        """True if poses are shown."""
+        """True if poses are sent."""
         return self._poses is not None
 
     def configure(self, wants: ServerRequirements) -> None:
-        """Which pictures are sent from now on, and in which size; ContradictionError where a view is missing."""
+        """Set which pictures are sent, and in which size. Raises ContradictionError if a view is missing."""
         self._keys = self._cameras.assign(wants)
         own = self._settings.image_size
         self._size = wants.resolution if own is None else (own[0], own[1])
-        self.forget()  # another server's pictures may have been of another size
+        self.forget()  # pictures for another server may have another size
 
     def forget(self) -> None:
-        """No picture was shown yet."""
+        """Forget all pictures."""
         self._seen.clear()
         self._begun = False
         if self._history is not None:
             self._history.reset()
 
     def build(self, observation: Observation) -> dict[str, Any]:
-        """The request without session and endpoint; PolicyError where the observation lacks what belongs into it."""
+        """Return the request without session and endpoint. Raises PolicyError if the observation lacks a part."""
         if observation.qpos.shape != (self._dim,):
             raise PolicyError(f"the state has shape {list(observation.qpos.shape)}; expected [{self._dim}]")
         qpos = observation.qpos.astype(np.float64)

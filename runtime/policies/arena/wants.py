@@ -1,4 +1,4 @@
-"""Wants of a server of the RoboArena family: its first frame, checked."""
+"""Requirements of a RoboArena server, parsed from its first frame."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ _PIXELS = range(1, 4097)
 
 @dataclass(frozen=True, slots=True)
 class ServerRequirements:
-    """The server's configuration; `resolution` is (height, width), None where it asks for no resizing.
+    """Configuration of the server; `resolution` is (height, width), None without resizing.
 
-    The last three are extras of vLLM-Omni: rows of an answer, numbers of a row, names of its parts.
+    The last three are extras of vLLM-Omni: rows per response, values per row, names of its parts.
     """
 
     resolution: tuple[int, int] | None
@@ -40,7 +40,7 @@ class ServerRequirements:
 
 
 def parse_requirements(metadata: Mapping[str, Any]) -> ServerRequirements:
-    """From the metadata, with the defaults of the field's clients; PolicyError names what is wrong in them."""
+    """Parse the metadata, with the defaults of the original clients. Raises PolicyError with the wrong key."""
     if not any(name in metadata for name in _FIELDS):
         found = ", ".join(map(str, metadata)) or "nothing"
         raise WrongProtocolError(

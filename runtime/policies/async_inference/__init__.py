@@ -1,1 +1,1 @@
-"""Parts of LeRobot's asynchronous inference: its messages, its pickles without LeRobot, its tensors without torch."""
+"""Parts of LeRobot's asynchronous inference: messages, pickles without LeRobot, tensors without torch."""

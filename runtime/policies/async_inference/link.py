@@ -1,4 +1,4 @@
-"""A gRPC channel to LeRobot's policy server: every call has a deadline, and can be given up from another thread."""
+"""gRPC channel to LeRobot's policy server: every call has a deadline and can be aborted by another thread."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from runtime.policies.link import error_headline
 if TYPE_CHECKING:
     import grpc
 
-_LARGEST_MESSAGE = 4 * 1024 * 1024  # bytes that the server takes in one message
+_LARGEST_MESSAGE = 4 * 1024 * 1024  # [bytes]; largest message that the server accepts
 
 
 class Channel:
-    """One channel that can be opened again until it is aborted; for one thread at a time, except for `abort`.
+    """Channel that can be opened again until it is aborted. For one thread at a time, except `abort`.
 
-    Answers of more than `limit` bytes are refused. `dial` says where the url's host and port are connected to, where
-    that is elsewhere. ConfigurationError where gRPC is not installed.
+    Responses of more than `limit` bytes are refused. `dial` returns the host and port to connect to, if they differ
+    from the url's. Raises ConfigurationError if gRPC is not installed.
     """
 
     def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:
@@ -40,17 +40,17 @@ class Channel:
         self._connect_deadline = connect_deadline
         self._limit = limit
         self._channel: grpc.Channel | None = None
-        self._call: Any = None  # the one under way
-        self._turning = threading.Lock()  # of that: held for a moment
+        self._call: Any = None  # present call
+        self._turning = threading.Lock()  # protects the present call; held briefly
         self._aborted = False
 
     @property
     def is_open(self) -> bool:
-        """True if a channel is held; the peer may have gone since."""
+        """True if there is a channel; the peer may have left since."""
         return self._channel is not None
 
     def open(self) -> float:
-        """Make sure that somebody listens, and make a channel; what is left of the connect deadline [s]."""
+        """Check that a server listens, and open a channel; return the rest of the connect deadline [s]."""
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
         parts = urlsplit(self._url)
@@ -63,16 +63,19 @@ class Channel:
                 ("grpc.max_receive_message_length", self._limit),
                 ("grpc.max_send_message_length", _LARGEST_MESSAGE),
                 ("grpc.enable_http_proxy", 0),
-                ("grpc.enable_retries", 0),  # an observation that is sent twice is two
-                ("grpc.use_local_subchannel_pool", 1),  # a dropped connection is never used again
+                ("grpc.enable_retries", 0),  # a retry would send an observation twice
+                ("grpc.use_local_subchannel_pool", 1),  # a dropped connection is never reused
             ],
         )
         return max(0.0, deadline - time.monotonic())
 
     def call(self, method: str, request: bytes | Iterable[bytes], seconds: float) -> bytes:
-        """The answer to one message, or to several, as bytes; PolicyTimeout after `seconds`, PolicyGone, or its error.
+        """Send one message or several; return the response as bytes.
 
-        After any of these but an error of the server's own the channel is dropped.
+        Raises:
+            PolicyTimeout: No response within `seconds` [s]; the channel is dropped.
+            PolicyDisconnected: The server closed the connection; the channel is dropped.
+            ServerReportedError: The server's own code failed; it continues to serve.
         """
         channel = self._channel
         if channel is None:
@@ -97,14 +100,14 @@ class Channel:
         return answer
 
     def abort(self) -> None:
-        """From another thread: whoever waits here raises PolicyError, now and later."""
+        """Make calls that wait in another thread raise PolicyError, now and later."""
         with self._turning:
             self._aborted = True
             if self._call is not None:
                 self._call.cancel()
 
     def drop(self) -> None:
-        """End the channel and whatever is under way on it; safe to call twice."""
+        """Close the channel with its present call. Safe to call twice."""
         channel, self._channel = self._channel, None
         if channel is not None:
             channel.close()
@@ -114,10 +117,10 @@ class Channel:
             raise PolicyError(f"the connection to {self._url} was closed from our side")
 
     def _to_policy_error(self, error: Any, method: str, seconds: float) -> PolicyError:
-        """An error of gRPC as ours."""
+        """Convert an error of gRPC to a PolicyError."""
         code, details = error.code(), str(error.details())
         codes, name = _grpc().StatusCode, method.rpartition("/")[2]
-        if code is codes.UNKNOWN:  # the server's own code failed: it goes on serving
+        if code is codes.UNKNOWN:  # the server's own code failed; it continues to serve
             said = details.removeprefix("Exception calling application: ")
             return ServerReportedError(
                 f"the policy server at {self._url} reports an error in {name}: {error_headline(said)}"
@@ -151,7 +154,7 @@ class Channel:
 
 
 def _is_foreign(details: str) -> bool:
-    """True if gRPC was answered in another protocol."""
+    """Return True if the peer responded in another protocol."""
     return "Failed parsing HTTP/2" in details or "http1.x" in details
 
 

@@ -1,7 +1,7 @@
-"""The protobuf messages of LeRobot's service `transport.AsyncInference`, by hand: two fields are all there is.
+"""Protobuf messages of LeRobot's service `transport.AsyncInference`, coded by hand because there are only two fields.
 
-Observation is `transfer_state` = 1 (varint) and `data` = 2 (bytes); Actions and PolicySetup are `data` = 1; Empty is
-no bytes at all.
+Observation has `transfer_state` = 1 (varint) and `data` = 2 (bytes); Actions and PolicySetup have `data` = 1; Empty has
+no bytes.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ OBSERVE = "/transport.AsyncInference/SendObservations"
 ACT = "/transport.AsyncInference/GetActions"
 
 EMPTY = b""
-CHUNK = 2 * 1024 * 1024  # bytes of data per message
+CHUNK = 2 * 1024 * 1024  # [bytes] of data per message
 _BEGIN, _MIDDLE, _END = 1, 2, 3
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-_LONGEST_VARINT = 10  # bytes
+_LONGEST_VARINT = 10  # [bytes]
 
 
 def encode_observations(data: bytes, chunk: int = CHUNK) -> Iterator[bytes]:
-    """Observation messages that carry `data`, the last marked END, and of several the first BEGIN."""
+    """Yield Observation messages that carry `data`; the last is marked END, the first of several BEGIN."""
     starts = range(0, len(data), chunk)
     for start in starts:
         last = start == starts[-1]
@@ -32,12 +32,15 @@ def encode_observations(data: bytes, chunk: int = CHUNK) -> Iterator[bytes]:
 
 
 def encode_setup(data: bytes) -> bytes:
-    """A PolicySetup message."""
+    """Return a PolicySetup message."""
     return _field(1, data)
 
 
 def decode_actions(message: bytes) -> bytes:
-    """The data of an Actions message, b"" of an empty one; CodecError for broken protobuf. Other fields are skipped."""
+    """Return the data of an Actions message, b"" of an empty one; other fields are skipped.
+
+    Raises CodecError for invalid protobuf.
+    """
     place, data = 0, b""
     while place < len(message):
         tag, place = _varint(message, place)
@@ -69,7 +72,7 @@ def _field(number: int, data: bytes) -> bytes:
 
 
 def _varint(message: bytes, place: int) -> tuple[int, int]:
-    """A number and the place behind it."""
+    """Return a number and the position after it."""
     number = 0
     for index, byte in enumerate(message[place : place + _LONGEST_VARINT]):
         number |= (byte & 0x7F) << 7 * index

@@ -1,8 +1,8 @@
-"""Pickles as LeRobot's policy server exchanges them, without LeRobot and without running anything of the peer's.
+"""Pickles of LeRobot's policy server, without LeRobot and without executing anything of the peer.
 
-Written are instances of its classes, by name alone. Read are lists of its TimedAction: of the pickle machine only the
-instructions that these need exist here, a name stands for nothing but what a table of ours says, and every other name
-is refused. Source: lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
+Written are instances of its classes, by name alone. Read are lists of its TimedAction: only the pickle instructions
+that these need exist here, names are resolved by a table of ours, and every other name is refused. Source:
+lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PROTOCOL = 4
 
 @dataclass(frozen=True)
 class RemotePolicyConfig:
-    """Model that a server is to load. The order of the fields is that on the wire."""
+    """Model that a server is to load. The order of the fields is that of the message."""
 
     policy_type: str
     pretrained_name_or_path: str
@@ -46,7 +46,7 @@ class TimedObservation:
 
 @dataclass(frozen=True, slots=True)
 class TimedAction:
-    """One row of an answer."""
+    """One row of a response."""
 
     timestamp: float
     timestep: int
@@ -54,21 +54,21 @@ class TimedAction:
 
 
 def dump(value: RemotePolicyConfig | TimedObservation, module: str) -> bytes:
-    """`value` as the server's own class of the same name in `module` would be pickled."""
+    """Return the pickle of `value` as an instance of the server's class with the same name in `module`."""
     file = io.BytesIO()
     _Writer(file, module).dump(value)
     return file.getvalue()
 
 
 def load_actions(data: bytes, limit: int) -> list[TimedAction]:
-    """The actions in their order on the wire; CodecError names what is wrong or refused."""
+    """Return the actions in their transmitted order. Raises CodecError for invalid or refused content."""
     if len(data) > limit:
         raise CodecError(f"actions of {len(data)} bytes exceed the limit of {limit}")
     try:
         given = _Reader(io.BytesIO(data)).load()
     except CodecError:
         raise
-    except Exception as error:  # a broken pickle may raise anything, and has run nothing
+    except Exception as error:  # a broken pickle may raise any exception, but has executed nothing
         raise CodecError(
             f"{len(data)} bytes are no pickle of actions: {type(error).__name__}: {error}"
         ) from error
@@ -78,9 +78,9 @@ def load_actions(data: bytes, limit: int) -> list[TimedAction]:
 
 
 class _Writer(pickle._Pickler):
-    """Python's own, which finds a class by what it is; ours go by their names in the server's module."""
+    """Python's pickler, except that our classes are written by their names in the server's module."""
 
-    save: Callable[[Any], None]  # of Python's own, as the two below are
+    save: Callable[[Any], None]  # of Python's pickler, like the next two
     write: Callable[[bytes], None]
     memoize: Callable[[Any], None]
 
@@ -99,7 +99,7 @@ class _Writer(pickle._Pickler):
 
 
 class _Record:
-    """An instance of a class of the peer: the fields that it was given, and nothing that could act."""
+    """Instance of a peer's class: its fields, without behaviour."""
 
     __slots__ = ("fields",)
 
@@ -108,7 +108,7 @@ class _Record:
 
 
 class _Name:
-    """Stands for a name of the peer's code; what is made of it is made here. Nothing can be set on it."""
+    """Name of the peer's code, with our constructor for its instances. Its attributes cannot be changed."""
 
     __slots__ = ("make", "what")
     what: str
@@ -131,7 +131,7 @@ _NEEDED = (
 
 
 class Reader(pickle._Unpickler):
-    """A pickle machine that knows no instruction but those for plain data, and no name at all."""
+    """Pickle interpreter with instructions for plain data only; every name is refused."""
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = {
         code: pickle._Unpickler.dispatch[code] for code in (getattr(pickle, name)[0] for name in _NEEDED)
@@ -142,10 +142,10 @@ class Reader(pickle._Unpickler):
 
 
 class _Reader(Reader):
-    """Reads lists of TimedAction; its names live as long as one message."""
+    """Pickle interpreter for lists of TimedAction; its names live as long as one message."""
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(Reader.dispatch)
-    stack: list[Any]  # of the machine, as the two below are
+    stack: list[Any]  # of Python's unpickler, like the next one
     append: Callable[[Any], None]
 
     def __init__(self, file: io.BytesIO) -> None:
@@ -187,6 +187,7 @@ class _Reader(Reader):
             raise CodecError(f"a pickle that changes {type(made).__name__} is refused")
         made.fields = state
 
+    # These replace the instructions that call, create or change objects.
     dispatch[pickle.REDUCE[0]] = _reduce
     dispatch[pickle.NEWOBJ[0]] = _new
     dispatch[pickle.BUILD[0]] = _build

@@ -1,4 +1,4 @@
-"""An observation as LeRobot's policy server takes it, what it is told to load, and its answer as rows."""
+"""Requests to LeRobot's policy server, the model that it is to load, and its responses as rows."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from runtime.policies.rows import parse_action_rows
 if TYPE_CHECKING:
     from robots import Robot
 
-_RATE_TOLERANCE = 0.02  # of the rate: timestamps are wall clock in double precision
-_NATIVE = (480, 640)  # what a picture is declared as where its size is not; the server resizes whatever comes
+_RATE_TOLERANCE = 0.02  # relative; timestamps are wall clock in double precision
+_NATIVE = (480, 640)  # declared (height, width) of pictures without a size; the server resizes every picture
 
 
 class RequestSettings(ActionLayoutSettings):
@@ -58,7 +58,7 @@ class RequestSettings(ActionLayoutSettings):
 
 
 class AsyncRequest:
-    """Builds what goes out, and checks what comes back; ConfigurationError where maps do not fit the robot."""
+    """Builder of requests and checker of responses. Raises ConfigurationError if maps do not fit the robot."""
 
     def __init__(self, settings: RequestSettings, robot: Robot, control_rate: float) -> None:
         self._settings = settings
@@ -81,7 +81,7 @@ class AsyncRequest:
         self._layout = settings.layout(robot, {camera: camera for camera in settings.images.values()})
 
     def setup_message(self) -> bytes:
-        """The pickle of what to load and of what each observation will have."""
+        """Return the pickle with the model to load and the features of observations."""
         settings = self._settings
         height, width = settings.image_size or _NATIVE
         picture = {"dtype": "image", "shape": (height, width, 3), "names": ["height", "width", "channels"]}
@@ -104,7 +104,7 @@ class AsyncRequest:
         return dump(config, self._module)
 
     def build(self, observation: Observation, timestep: int) -> bytes:
-        """The pickle of an observation that has to be answered; PolicyError where something is missing in it."""
+        """Return the pickle of an observation with `must_go` set. Raises PolicyError if a part is missing."""
         shown = self._layout.build(self._grip.convert_observation(observation))
         values: dict[str, Any] = {
             name: float(shown["state"][place]) for name, place in zip(self._names, self._places, strict=True)
@@ -114,10 +114,11 @@ class AsyncRequest:
         return dump(TimedObservation(time.time(), timestep, values, must_go=True), self._module)
 
     def rows(self, given: Sequence[TimedAction], timestep: int) -> Float32:
-        """Rows [H, W] in the robot's order of the actions that answer the observation `timestep`.
+        """Return rows [H, W] in the robot's order from the actions that answer the observation `timestep`.
 
-        PolicyError for an answer to another one, gaps, and numbers that are no rows; ContradictionError where they are
-        meant for another rate.
+        Raises:
+            PolicyError: The response belongs to another observation, has gaps, or its rows are invalid.
+            ContradictionError: The rows are for another rate.
         """
         actions = sorted(given, key=lambda one: one.timestep)
         steps = [one.timestep for one in actions]
@@ -141,7 +142,7 @@ class AsyncRequest:
         return self._grip.to_robot(made)
 
     def _check_rate(self, times: Sequence[float]) -> None:
-        """The server says when each row is for, by the rate that it was started with."""
+        """Check the rate by the rows' timestamps, which the server computes from the rate that it was started with."""
         if len(times) < 2:
             return
         apart = (times[-1] - times[0]) / (len(times) - 1)

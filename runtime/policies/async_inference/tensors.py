@@ -1,8 +1,8 @@
-"""Tensors out of the bytes in which torch pickles their storage, with numpy alone.
+"""Tensors from pickled torch storages, with numpy alone.
 
-A storage is a torch file of the old form: five pickles one after the other (magic number, version, machine, what it
-is, its keys), the number of elements as int64, the elements. A tensor is a view of one: offset, sizes, strides.
-Several tensors may show different rows of the same storage, as those of LeRobot's server do.
+A storage is a torch file in the old format: five consecutive pickles (magic number, version, machine, description,
+keys), the number of elements as int64, and the elements. A tensor is a view of one: offset, sizes, strides. Several
+tensors may be different rows of the same storage, as those of LeRobot's server are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from runtime.core.errors import CodecError
 
 _MAGIC, _VERSION = 0x1950A86A20F9469CFC6C, 1001
 _MOST_ELEMENTS = (
-    10_000_000  # of all tensors of a message: strides of 0 would make any number of them out of one
+    10_000_000  # of all tensors of a message: strides of 0 could expand one element to any number
 )
 _MOST_DIMENSIONS = 32
 _KINDS = {
@@ -37,14 +37,14 @@ Array = np.ndarray[Any, Any]
 
 
 class Tensors:
-    """The tensors of one message, and their storages by their bytes: a server sends the same one with each row.
+    """Tensors of one message, with a cache of storages by their bytes: a server sends the same one with each row.
 
-    `reader` is a machine for plain pickles.
+    `reader` is a pickle interpreter for plain data.
     """
 
     def __init__(self, reader: type[Any]) -> None:
         class Reader(reader):  # type: ignore[misc]
-            """Names of storages, and what a storage says of itself."""
+            """Pickle interpreter for the names and description of a storage."""
 
             def find_class(self, module: str, name: str) -> Any:
                 if module != "torch" or name not in _KINDS:
@@ -61,7 +61,7 @@ class Tensors:
         self._left = _MOST_ELEMENTS
 
     def storage(self, data: object) -> Array:
-        """The elements [n]; CodecError where the bytes are no storage."""
+        """Return the elements [n]. Raises CodecError if the bytes are not a storage."""
         if not isinstance(data, bytes):
             raise CodecError(f"a storage is {type(data).__name__}; expected bytes")
         if data not in self._known:
@@ -69,7 +69,7 @@ class Tensors:
                 self._known[data] = self._read(data)
             except CodecError:
                 raise
-            except Exception as error:  # a broken pickle may raise anything, and has run nothing
+            except Exception as error:  # a broken pickle may raise any exception, but has executed nothing
                 raise CodecError(
                     f"{len(data)} bytes are no storage of torch's: {type(error).__name__}: {error}"
                 ) from error
@@ -95,9 +95,9 @@ class Tensors:
         return np.frombuffer(raw, dtype)
 
     def tensor(self, storage: object, offset: object, size: object, stride: object, *_: object) -> Array:
-        """The elements [*size] that begin at `offset` and are `stride` elements apart, copied; CodecError for others.
+        """Return a copy of the elements [*size] from `offset` on, `stride` elements apart. Raises CodecError.
 
-        What follows (whether it wants a gradient, its hooks) has no meaning here.
+        Further arguments (gradient, hooks) have no meaning here.
         """
         if not isinstance(storage, np.ndarray) or type(size) is not tuple or type(stride) is not tuple:
             raise CodecError("a tensor is not made of a storage, sizes and strides")
@@ -105,6 +105,7 @@ class Tensors:
         if len(size) != len(stride) or not all(type(number) is int and number >= 0 for number in numbers):
             raise CodecError(f"a tensor has offset {offset}, sizes {size} and strides {stride}")
         start = int(numbers[0])
+        # Offset of the last element from the first; the checks come before the view and its copy are made.
         reach = sum((count - 1) * step for count, step in zip(size, stride, strict=True)) if all(size) else -1
         if start + reach >= len(storage) or start > len(storage) or len(size) > _MOST_DIMENSIONS:
             raise CodecError(

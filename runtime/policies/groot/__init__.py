@@ -1,1 +1,1 @@
-"""Parts of the GR00T protocol: its arrays, its modalities, its request, the REQ socket."""
+"""Parts of the GR00T protocol: arrays, modalities, requests, the REQ socket."""

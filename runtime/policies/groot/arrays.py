@@ -1,8 +1,8 @@
-"""The msgpack dialects of GR00T: arrays as numpy files (NPY), or as the package msgpack_numpy has them (MNP).
+"""Msgpack dialects of GR00T: arrays as numpy files (NPY), or in the form of the package msgpack_numpy (MNP).
 
-NPY, as N1.5 and N1.6 have it: a map of `__ndarray_class__` true and `as_npy`, the bytes of a .npy file. MNP, as
-N1.7 has it: a map of `nd`, `type`, `kind`, `shape`, `data` with binary keys. N1.7 reads both, its early access MNP
-alone. Nothing here ever unpickles.
+NPY, used by N1.5 and N1.6: a map of `__ndarray_class__` true and `as_npy`, the bytes of a .npy file. MNP, used by N1.7:
+a map of `nd`, `type`, `kind`, `shape`, `data` with binary keys. N1.7 reads both, its early access only MNP. Nothing is
+ever unpickled here.
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ _MOST_DIMENSIONS = 32
 
 
 def pack(value: object, mnp: bool = False) -> bytes:
-    """`value` as one message, arrays as NPY or `mnp`, numpy scalars as plain numbers; CodecError for anything else."""
+    """Return `value` as one message, arrays as NPY or `mnp`, numpy scalars as numbers.
+
+    Raises CodecError for other types.
+    """
     try:
         packed: bytes = msgpack.packb(value, default=_as_mnp if mnp else _as_npy)
     except (TypeError, ValueError, OverflowError) as error:
@@ -37,10 +40,10 @@ def pack(value: object, mnp: bool = False) -> bytes:
 
 
 def unpack(payload: bytes, limit: int) -> Any:
-    """The value of one message; arrays of bools, integers and floats come back **read-only**.
+    """Return the value of one message; arrays of bools, integers and floats are **read-only**.
 
-    Raises CodecError for more than `limit` bytes, broken msgpack, an array whose data do not fill its shape, object
-    arrays and other dtypes, and openpi's arrays (which it names).
+    Raises CodecError for more than `limit` bytes, invalid msgpack, an array whose data do not fill its shape, object
+    arrays and other dtypes, and openpi's arrays (which the message names).
     """
     if len(payload) > limit:
         raise CodecError(f"a message of {len(payload)} bytes exceeds the limit of {limit}")
@@ -76,7 +79,7 @@ def _plain(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 def _number(value: object) -> object:
     if isinstance(value, np.generic):
-        return value.item()  # N1.6 cannot pack numpy's own
+        return value.item()  # N1.6 cannot pack numpy scalars
     raise CodecError(f"cannot pack a {type(value).__name__}; allowed: numbers, strings, lists, maps, arrays")
 
 
@@ -100,7 +103,7 @@ def _text(key: object) -> object:
 
 
 def _from_npy(data: object) -> np.ndarray[Any, Any]:
-    """An array of a .npy file, whose header is read by us: numpy's reader believes it and takes that much memory."""
+    """Return the array of a .npy file. Its header is parsed here, because numpy's would allocate any size."""
     if not isinstance(data, bytes) or data[:6] != _MAGIC:
         raise CodecError(f"an array's as_npy is {_short(data)}; expected the bytes of a .npy file")
     start, length = {1: (10, "<H"), 2: (12, "<I")}.get(data[6] if len(data) > 6 else 0, (0, ""))
@@ -134,7 +137,7 @@ def _from_mnp(fields: Mapping[object, Any]) -> object:
 
 
 def _array(name: object, shape: list[int], data: bytes, order: Any) -> np.ndarray[Any, Any]:
-    """An array over `data`; CodecError where that does not fill it, or is of a type that is refused."""
+    """Return an array over `data`. Raises CodecError if the data do not fill it, or its dtype is refused."""
     if not isinstance(name, str) or not re.fullmatch(r"[<>|=]?[a-zA-Z?]\d*", name):
         raise CodecError(
             f"an array's dtype is {_short(name)}; allowed: bool, integers, floats, such as '<f4'"

@@ -1,4 +1,4 @@
-"""A ZMQ REQ socket whose every wait has a deadline, and that is built anew after a lost reply."""
+"""ZMQ REQ socket with a deadline for every wait, which is replaced after a lost reply."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from runtime.core.errors import (
 )
 from runtime.policies.connection import Dial, Place, open_connection
 
-_SPELL_MS = 20  # how soon a wait notices that it was aborted; an answer is noticed at once
-_SIGNATURE = b"\xff\0\0\0\0\0\0\0\1\x7f"  # how every ZMTP peer begins
-_KNOCK = _SIGNATURE + b"\r\n\r\n"  # the line ends make a web server answer too
+_SPELL_MS = 20  # period of the check for an abort [ms]; a response is noticed at once
+_SIGNATURE = b"\xff\0\0\0\0\0\0\0\1\x7f"  # first bytes of every ZMTP peer
+_KNOCK = _SIGNATURE + b"\r\n\r\n"  # the line ends make a web server respond, too
 _FAILED = (
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
@@ -31,9 +31,9 @@ _WATCHED = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED | zmq.EVENT_DISCONNECTED
 
 
 class ReqLink:
-    """For one thread at a time, except for `abort`; messages of more than `limit` bytes end the connection.
+    """REQ socket for one thread at a time, except `abort`; messages of more than `limit` bytes end the connection.
 
-    `dial` says where the url's host and port are connected to, where that is elsewhere.
+    `dial` returns the host and port to connect to, if they differ from the url's.
     """
 
     def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:
@@ -47,13 +47,15 @@ class ReqLink:
 
     @property
     def is_open(self) -> bool:
-        """True if a connection is held; the peer may have gone since."""
+        """True if there is a connection; the peer may have left since."""
         return self._socket is not None
 
     def open(self) -> float:
-        """Connect anew; what is left of the connect deadline [s].
+        """Connect anew; return the rest of the connect deadline [s].
 
-        PolicyLostError where nobody is there, or nobody who greets in time; PolicyError where somebody else is.
+        Raises:
+            PolicyLostError: There is no server, or it sends no greeting in time.
+            PolicyError: Another kind of server listens there.
         """
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
@@ -64,8 +66,14 @@ class ReqLink:
         for option, value in (
             (zmq.LINGER, 0),
             (zmq.MAXMSGSIZE, self._limit),
-            (zmq.REQ_CORRELATE, 1),  # a REP socket gives the request's number back; another's is thrown away
-            (zmq.RECONNECT_IVL, -1),  # after a lost connection the request is lost, and so is the socket
+            (
+                zmq.REQ_CORRELATE,
+                1,
+            ),  # REP sockets return the request's number; responses to other requests are dropped
+            (
+                zmq.RECONNECT_IVL,
+                -1,
+            ),  # with the connection the request is lost, so the socket must be replaced, too
         ):
             made.setsockopt(option, value)
         self._socket, self._monitor = made, made.get_monitor_socket(_WATCHED)
@@ -77,7 +85,12 @@ class ReqLink:
         return max(0.0, deadline - time.monotonic())
 
     def exchange(self, request: bytes, seconds: float, what: str = "an answer") -> bytes:
-        """The answer to `request`; PolicyTimeout after `seconds`, PolicyGone; both end the connection."""
+        """Return the response to `request`.
+
+        Raises:
+            PolicyTimeout: No response within `seconds` [s]; the connection is dropped.
+            PolicyDisconnected: The server closed the connection.
+        """
         wire = self._socket
         if wire is None:
             raise PolicyError(f"there is no connection to {self._url}; connect first")
@@ -85,7 +98,7 @@ class ReqLink:
         with self._dropping_on_error():
             try:
                 wire.send(request, zmq.NOBLOCK)
-            except zmq.Again as error:  # there is nobody any more to send it to
+            except zmq.Again as error:  # the peer has left
                 raise PolicyDisconnected(
                     f"the policy server at {self._url} closed the connection since the last request: see that it runs"
                 ) from error
@@ -107,11 +120,11 @@ class ReqLink:
             return frames[0]
 
     def abort(self) -> None:
-        """From another thread: whoever waits here raises PolicyError, now and later."""
+        """Make calls that wait in another thread raise PolicyError, now and later."""
         self._aborted = True
 
     def drop(self) -> None:
-        """End the connection and whatever is left to send; safe to call twice."""
+        """Close the connection and drop unsent messages. Safe to call twice."""
         wire, self._socket = self._socket, None
         monitor, self._monitor = self._monitor, None
         if wire is not None:
@@ -129,7 +142,7 @@ class ReqLink:
         return self._dial() if self._dial else (parts.hostname or "", parts.port or 0)
 
     def _probe(self, place: Place, deadline: float) -> None:
-        """See who listens, before ZMQ, which would try again for ever and say nothing."""
+        """Check who listens before ZMQ does, which would silently try again for ever."""
         try:
             seconds = self._connect_deadline
             with open_connection(self._url, *place, deadline, seconds, self._require_not_aborted) as wire:
@@ -175,7 +188,7 @@ class ReqLink:
             heard = self._poll_events(_SPELL_MS)
             if heard & zmq.EVENT_HANDSHAKE_SUCCEEDED:
                 return
-            if heard:  # it failed, or the peer hung up in the middle, as it does where sockets do not match
+            if heard:  # failed, or the peer closed in the middle, as it does if socket types do not match
                 raise WrongProtocolError(
                     f"{self._url} speaks ZMQ but takes no requests (its socket is no REP socket, or it wants keys): "
                     "the port of an execution node, perhaps; correct policy.url"
@@ -187,8 +200,8 @@ class ReqLink:
                 )
 
     def _poll_events(self, milliseconds: int = 0) -> int:
-        """Events of the connection since the last call, as one set of ZMQ's events."""
-        from zmq.utils.monitor import recv_monitor_message  # it brings asyncio along
+        """Return the events of the connection since the last call, as one bit set of ZMQ's events."""
+        from zmq.utils.monitor import recv_monitor_message  # imported here: it also imports asyncio
 
         monitor, events = self._monitor, 0
         assert monitor is not None
@@ -206,7 +219,10 @@ class ReqLink:
 
 
 def _receive_reply(wire: zmq.Socket[bytes]) -> list[bytes] | None:
-    """The frames of an answer, None where none comes within a spell: what answers another request is thrown away."""
+    """Return the frames of a response, None if none comes within a polling period.
+
+    ZMQ drops those to other requests.
+    """
     try:
         return wire.recv_multipart(zmq.NOBLOCK) if wire.poll(_SPELL_MS) else None
     except zmq.Again:

@@ -1,4 +1,4 @@
-"""A GR00T server's modality configuration, in the forms of three versions: its inputs and its answers."""
+"""Modality configuration of a GR00T server, i.e. its inputs and outputs, in the forms of three versions."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import Any, Literal
 from runtime.core.errors import WrongProtocolError
 
 Name = Literal["video", "state", "action", "language"]
-_MOST_ROWS = 10_000  # of an answer that a server announces
+_MOST_ROWS = 10_000  # most rows of a response that a server may announce
 _NAMES: tuple[Name, ...] = ("video", "state", "action", "language")
 _NEWEST = (
-    "__ModalityConfig__"  # N1.7's; all of its servers read MNP, and those of its early access nothing else
+    "__ModalityConfig__"  # mark of N1.7; all its servers read MNP, those of its early access nothing else
 )
 _MARKS = (_NEWEST, "__ModalityConfig_class__")
-_FIELDS = ("as_json", "modality_keys")  # of a configuration that has no mark
-_PLAIN = ("state_keys", "action_keys")  # of a server without configurations
+_FIELDS = ("as_json", "modality_keys")  # keys of a configuration without a mark
+_PLAIN = ("state_keys", "action_keys")  # keys of a server without configurations
 
 
 @dataclass(frozen=True, slots=True)
 class ActionFormat:
     """Format of an action in N1.6 and newer."""
 
-    representation: str  # "ABSOLUTE", "DELTA", "RELATIVE", which it answers as absolute
+    representation: str  # "ABSOLUTE", "DELTA" or "RELATIVE", whose responses are absolute, too
     format: str  # "DEFAULT", "XYZ_ROT6D", "XYZ_ROTVEC"
 
 
 @dataclass(frozen=True, slots=True)
 class Modality:
-    """Keys without their prefix, and the steps that each stands for, relative to the newest observation.
+    """Keys without their prefix, and the steps that each has, relative to the newest observation.
 
-    `keys` is None where the server does not say which it has. `written` says of actions how they are, `widths` of
-    how many numbers, by key, as far as the server does.
+    `keys` is None if the server does not list them. `written` is the format of actions and `widths` their number of
+    values, by key, as far as the server states them.
     """
 
     keys: tuple[str, ...] | None = ()
@@ -44,11 +44,11 @@ class Modality:
 
 @dataclass(frozen=True, slots=True)
 class Modalities:
-    """All four; `is_n15` where the server is of version N1.5, `reads_mnp` where it reads arrays as N1.7 does.
+    """Modalities of a server. `is_n15`: it has version N1.5; `reads_mnp`: it reads arrays like N1.7.
 
-    `reads_mnp` is None where its answer has the mark of no version.
+    `reads_mnp` is None if its response has no version mark.
 
-    `contract` is the answer of a server that speaks the protocol and has no modality configurations.
+    `contract` is the response of a server with this protocol but without modality configurations.
     """
 
     video: Modality
@@ -60,7 +60,7 @@ class Modalities:
     contract: Mapping[str, Any] | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """For a recording's manifest."""
+        """Return the modalities in the form of a recording's manifest."""
         if self.contract is not None:
             return dict(self.contract)
         each = {name: getattr(self, name) for name in _NAMES}
@@ -68,9 +68,9 @@ class Modalities:
 
 
 def parse_modalities(reply: object) -> Modalities:
-    """The answer to get_modality_config; PolicyError where it is none. A modality that is not in it has no keys.
+    """Parse the response to get_modality_config; a missing modality has no keys. Raises PolicyError if it is invalid.
 
-    StarVLA's servers of this protocol have flat lists of keys instead.
+    StarVLA's servers with this protocol have flat lists of keys instead.
     """
     if isinstance(reply, Mapping) and any(name in reply for name in _PLAIN):
         return _contract(reply)
@@ -83,13 +83,13 @@ def parse_modalities(reply: object) -> Modalities:
         _modality(given[name], name) if name in given else Modality() for name in _NAMES
     )
     newest = any(_NEWEST in one for one in given.values())
-    texts = any(isinstance(one.get("as_json"), str) for one in given.values())  # as N1.5 writes the fields
+    texts = any(isinstance(one.get("as_json"), str) for one in given.values())  # the form of N1.5
     marked = any(mark in one for one in given.values() for mark in _MARKS)
     return Modalities(video, state, action, language, texts and not newest, newest if marked else None)
 
 
 def _contract(given: Mapping[str, Any]) -> Modalities:
-    """Modalities from keys in flat lists; where nothing is said, the deployment's are right."""
+    """Return modalities from flat lists of keys; the deployment decides about everything that is not stated."""
     horizon: Any = given.get("action_horizon")
     rows = horizon if type(horizon) is int and 0 < horizon <= _MOST_ROWS else 1
     return Modalities(
@@ -102,7 +102,7 @@ def _contract(given: Mapping[str, Any]) -> Modalities:
 
 
 def _flat(given: Mapping[str, Any], name: Name) -> tuple[str, ...] | None:
-    """A list's keys without their prefix; None where there are none: such a model is not shown that."""
+    """Return a list's keys without their prefix; None without keys, because such a model does not use that modality."""
     keys = given.get(f"{name}_keys", [])
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise WrongProtocolError(f"the server has {name}_keys {_short(keys)}; expected a list of names")
@@ -151,7 +151,7 @@ def _modality(given: Mapping[str, Any], name: Name) -> Modality:
 
 
 def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
-    """By key; nothing where there is not one for each, which some servers get wrong without harm."""
+    """Return the formats by key; {} unless there is one for each key, which some servers get wrong without harm."""
     if not isinstance(configs, list) or len(configs) != len(keys):
         return {}
     return {
@@ -162,12 +162,12 @@ def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
 
 
 def _word(given: object) -> str:
-    """An enumeration's name, of its name or of its value."""
+    """Return the name of an enumeration member from its name or value."""
     return str(given).upper().replace("+", "_")
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Names for a sentence."""
+    """Return names for a message."""
     return ", ".join(names) or "none"
 
 

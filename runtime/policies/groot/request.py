@@ -1,4 +1,4 @@
-"""An observation as GR00T is shown it, and its answer as rows: by maps that a deployment declares."""
+"""GR00T requests from observations, and its responses as rows, by maps that a deployment declares."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 Parts = Annotated[dict[str, Dims], Field(min_length=1)]
 _ORIENTATIONS = {"XYZ_ROT6D": "6d", "XYZ_ROTVEC": "rotation_vector"}
-_LANGUAGE = "annotation.human.task_description"  # what servers that name no key look for
-_MOST_STEPS = 64  # of a modality; more pictures than that in one request are a mistake
+_LANGUAGE = "annotation.human.task_description"  # default of servers that name no key
+_MOST_STEPS = 64  # most steps of a modality; more pictures in one request are a mistake
 
 
 class RequestSettings(ActionLayoutSettings):
@@ -67,7 +67,7 @@ class ModelInput:
 
 
 class Gr00tRequest:
-    """Builds requests once `agree` was told what the server wants. Not for two threads at once."""
+    """Builder of requests; call `configure` first. For one thread at a time."""
 
     def __init__(self, settings: RequestSettings, robot: Robot, control_rate: float) -> None:
         self._settings = settings
@@ -86,7 +86,7 @@ class Gr00tRequest:
         self._moments: deque[ModelInput] = deque()
 
     def configure(self, wanted: Modalities) -> None:
-        """Hold what the server wants against the deployment; ContradictionError names both sides."""
+        """Compare the server's modalities with the deployment. Raises ContradictionError with both sides."""
         settings = self._settings
         if wanted.is_n15 != (settings.dialect == "n1.5"):
             version = "of version N1.5" if wanted.is_n15 else "newer than N1.5"
@@ -113,22 +113,22 @@ class Gr00tRequest:
 
     @property
     def horizon(self) -> int | None:
-        """Rows of an answer, as far as the server says."""
+        """Rows of a response, if the server states them."""
         steps = None if self._wanted is None else self._wanted.action.steps
         return len(steps) if steps is not None and len(steps) > 1 else None
 
     def reset(self) -> None:
-        """An episode ended: what was seen in it is not shown any more."""
+        """Forget earlier observations, because an episode ended."""
         self._moments.clear()
 
     def model_input(self, observation: Observation) -> ModelInput:
-        """Content of the observation; PolicyError where something is missing."""
+        """Return the content of an observation. Raises PolicyError if a part is missing."""
         shown = self._layout.build(self._grip.convert_observation(observation))
         pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
         return ModelInput(observation.step, pictures, shown["state"])
 
     def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
-        """The data of get_action for the newest moment, which is remembered as far as later ones need it."""
+        """Return the data of get_action for the newest input, which is stored as long as later requests need it."""
         wanted = self._wanted
         assert wanted is not None, "agree comes first"
         self._remember(moment)
@@ -148,7 +148,10 @@ class Gr00tRequest:
         return {"observation": {"video": batches, "state": vectors, "language": spoken}, "options": None}
 
     def rows(self, reply: object) -> Float32:
-        """Rows [H, W] in the robot's order of an answer to get_action; PolicyError where something is wrong in it."""
+        """Return rows [H, W] in the robot's order from a response to get_action.
+
+        Raises PolicyError if it is invalid.
+        """
         answer = self._answer(reply)
         parts = {key: self._part(answer, key, dims) for key, dims in self._settings.actions.items()}
         heights = {key: len(part) for key, part in parts.items()}
@@ -181,12 +184,12 @@ class Gr00tRequest:
                 "the server writes arrays in another dialect"
             )
         if isinstance(given, np.ndarray) and given.ndim == 1 and len(dims) == 1:
-            given = given[:, None]  # N1.5 leaves the last axis of single numbers away
+            given = given[:, None]  # N1.5 omits the last axis of single values
         return parse_action_rows(f"action {key!r}", given, len(dims))
 
     def _remember(self, moment: ModelInput) -> None:
         while self._moments and self._moments[-1].step >= moment.step:
-            self._moments.pop()  # asked again, or control began anew
+            self._moments.pop()  # a repeated request, or control restarted
         self._moments.append(moment)
         wanted = self._wanted
         assert wanted is not None
@@ -216,7 +219,7 @@ def _check_parts(parts: Mapping[str, Sequence[int]], width: int) -> None:
 
 
 def _check_cover(parts: Mapping[str, Sequence[int]], width: int) -> None:
-    """A place that nobody fills would be a number out of nowhere, one that two fill is one's mistake."""
+    """Check that each dimension of a row is filled exactly once. Raises ConfigurationError."""
     places = sorted(dim for dims in parts.values() for dim in dims)
     if places == list(range(width)):
         return
@@ -233,7 +236,7 @@ def _check_cover(parts: Mapping[str, Sequence[int]], width: int) -> None:
 
 
 def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
-    """Servers refuse a request with a key too many or too few, and name neither."""
+    """Check that the keys are equal: servers refuse a missing or surplus key without naming it."""
     here = list(given)
     if wanted.keys is not None and set(here) != set(wanted.keys):
         kind = ActionSpaceError if name == "actions" else ContradictionError
@@ -280,7 +283,7 @@ def _check_steps(name: str, wanted: Modality, history: str) -> None:
 
 
 def _check_written(key: str, written: ActionFormat | None, settings: RequestSettings) -> None:
-    """Rows of poses, or of changes, must not be taken for joints, or for targets."""
+    """Check that poses cannot be mistaken for joints, nor changes for targets. Raises ActionSpaceError."""
     if written is None:
         return
     orientation, mine = _ORIENTATIONS.get(written.format), settings.action_pose.orientation

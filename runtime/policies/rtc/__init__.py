@@ -1,1 +1,1 @@
-"""The robot's commitment on the wire to policy servers: one file per dialect."""
+"""Conditioning of real-time chunking in requests to policy servers: one module per dialect."""

@@ -1,4 +1,4 @@
-"""The versioned envelope openpi-async-rtc, version 2: requests are numbered, errors are messages."""
+"""Versioned envelope openpi-async-rtc, version 2: requests are numbered, errors are messages."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Schedule = Literal["exp", "linear", "ones", "zeros"]
 
 
 class AsyncRtc(Dialect):
-    """One request at a time, each with a number of its own that the answer has to carry.
+    """Dialect with one request at a time, whose number the response must repeat.
 
-    `rtc` holds what is left of the chunk before, the predicted delay, and `execution_horizon`, to this dialect
-    the end of the transition from those rows to new ones: never below the delay, never above the model's horizon.
+    `rtc` contains the rest of the previous chunk, the predicted delay, and `execution_horizon`, in this dialect the
+    end of the transition from those rows to new ones: never below the delay, never above the model's horizon.
     """
 
     def __init__(self, schedule: Schedule, max_guidance_weight: float) -> None:
@@ -31,7 +31,7 @@ class AsyncRtc(Dialect):
         self._horizon: int | None = None
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Value of `rtc_supported`; PolicyError if protocol, version, codec or the word itself is wrong."""
+        """Return `rtc_supported`. Raises PolicyError if protocol, version, codec or that value is wrong."""
         said = metadata.get("async_rtc")
         if not isinstance(said, Mapping):
             found = ", ".join(map(str, metadata)) or "nothing"
@@ -53,7 +53,7 @@ class AsyncRtc(Dialect):
         return supported
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """The envelope for the next request."""
+        """Return the envelope for the next request."""
         self._number += 1
         return {
             "protocol": NAME,
@@ -65,7 +65,10 @@ class AsyncRtc(Dialect):
         }
 
     def unwrap(self, reply: Message) -> Message:
-        """Content of the envelope; PolicyError for the server's error, another version or request number."""
+        """Return the content of the envelope.
+
+        Raises PolicyError for a server's error, another version or request number.
+        """
         _check_version(reply, "the answer")
         if reply.get("error"):
             raise ServerReportedError(
@@ -85,7 +88,7 @@ class AsyncRtc(Dialect):
 
     def _rtc(self, conditioning: Conditioning) -> Message:
         left = conditioning.remaining_rows
-        delay = min(conditioning.predicted_delay, len(left))
+        delay = min(conditioning.predicted_delay, len(left))  # only the rows in `left` can be committed
         highest = len(conditioning.previous) if self._horizon is None else self._horizon
         return {
             "prev_chunk_left_over": np.ascontiguousarray(left, np.float32),

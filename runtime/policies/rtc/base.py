@@ -1,4 +1,4 @@
-"""Dialects of real-time chunking: their changes to the messages of a policy protocol."""
+"""Dialects of real-time chunking (RTC): their additions to the messages of a policy protocol."""
 
 from __future__ import annotations
 
@@ -13,40 +13,43 @@ Message = dict[str, Any]
 
 
 class Dialect(ABC):
-    """Wraps requests and unwraps replies; one per connection's policy, for one thread.
+    """Wrapper of requests and unwrapper of replies. One per policy, for one thread.
 
-    There is no common standard. Each dialect says what it found where a server speaks another one.
-    `continues_model_rows` is whether a chunk is given back in the model's own space where the server returned that.
+    There is no common standard. A dialect that meets a server of another dialect reports its finding.
+    `continues_model_rows`: whether a chunk is sent back in the model's own space, if the server returned that.
     """
 
     continues_model_rows = True
 
     @abstractmethod
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """True if the server continues a chunk that it is given; None where its metadata do not say.
+        """Return True if the server continues a previous chunk, None if its metadata do not state it.
 
-        Raises PolicyError where it speaks another dialect.
+        Raises PolicyError if it uses another dialect.
         """
 
     @abstractmethod
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """The message to send for an observation."""
+        """Return the message to send for an observation."""
 
     @abstractmethod
     def unwrap(self, reply: Message) -> Message:
-        """The part of a reply that holds the actions; PolicyError for an error, or a reply to something else."""
+        """Return the part of a reply with the actions.
+
+        Raises PolicyError for an error or a reply to another request.
+        """
 
 
 class NoRtc(Dialect):
-    """No RTC: servers drop keys that they do not know, so conditioning would be sent and do nothing."""
+    """No RTC: servers drop unknown keys, so conditioning would be sent without an effect."""
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Never."""
+        """Return False."""
         refuse_envelopes(metadata, "none")
         return False
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """The observation itself; PolicyError for conditioning."""
+        """Return the observation itself. Raises PolicyError for conditioning."""
         if conditioning is not None:
             raise PolicyError(
                 "plain openpi servers drop RTC conditioning without a word; choose an RTC protocol (policy.rtc)"
@@ -54,14 +57,14 @@ class NoRtc(Dialect):
         return observation
 
     def unwrap(self, reply: Message) -> Message:
-        """The reply itself."""
+        """Return the reply itself."""
         return reply
 
 
 def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
-    """The map under the metadata key `rtc`, that of our bundled server; None where the server does not say.
+    """Return the map under the metadata key `rtc`, as our bundled server has it; None without the key.
 
-    ContradictionError for a server that takes versioned envelopes alone, or whose key is something else.
+    Raises PolicyError if the server accepts only versioned envelopes, or the key has another content.
     """
     refuse_envelopes(metadata, name)
     said = metadata.get("rtc")
@@ -73,7 +76,7 @@ def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any
 
 
 def refuse_envelopes(metadata: Mapping[str, Any], configured: str) -> None:
-    """ContradictionError where the server says that it takes versioned envelopes: it would answer nothing else."""
+    """Raise ContradictionError for a server that accepts only versioned envelopes."""
     if "async_rtc" in metadata:
         raise ContradictionError(
             f"the server's metadata have async_rtc, so it takes envelopes alone; policy.rtc is {configured!r}, "

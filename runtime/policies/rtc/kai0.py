@@ -1,8 +1,8 @@
-"""Flat keys of kai0: the chunk before as nested lists, the predicted delay, the end of the transition.
+"""Flat keys of kai0: the previous chunk as nested lists, the predicted delay, the end of the transition.
 
-The server compares row n of that chunk with row n of the new one, so it has to begin at the first row that the robot
-has not consumed. kai0's own client sends the whole chunk as it was answered, which is right only where nothing was
-consumed; `rows` = "whole" does as it does. Rows are the robot's numbers, never the model's own.
+The server compares row n of that chunk with row n of the new one, so it must begin at the first row that the robot has
+not consumed. kai0's own client sends the whole chunk as received, which is right only if nothing was consumed; so does
+`rows` = "whole". Rows contain the robot's values, never the model's own.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from runtime.policies.rtc.openpi_rtc import Rows
 from runtime.policies.rtc.prev_action import pad_rows
 
 NAME = "kai0"
-_COLUMNS = 32  # of the model: rows are padded with zeros to it, or cropped
+_COLUMNS = 32  # width of the model: rows are padded with zeros or cropped
 
 
 class Kai0(Dialect):
-    """All but `prev_action_chunk` is on every request; the server ignores the last three keys."""
+    """Dialect whose keys are in every request, except `prev_action_chunk`; the server ignores the last three."""
 
     continues_model_rows = False
 
@@ -31,12 +31,12 @@ class Kai0(Dialect):
         self._weight = max_guidance_weight
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """True if the metadata key `rtc` names this dialect; None without it."""
+        """Return True if the metadata key `rtc` names this dialect, None without it."""
         said = declared_dialect(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """The observation with the keys."""
+        """Return the observation with the dialect's keys."""
         chunk, delay, horizon = self._continued(conditioning)
         return {
             **observation,
@@ -49,17 +49,17 @@ class Kai0(Dialect):
         }
 
     def unwrap(self, reply: Message) -> Message:
-        """The reply itself."""
+        """Return the reply itself."""
         return reply
 
     def _continued(self, conditioning: Conditioning | None) -> tuple[Message, int, int]:
-        """The chunk, the delay, and the row at which nothing of it is followed any more."""
+        """Return the chunk, the delay, and the row from which none of it is followed."""
         if conditioning is None:
             return {}, 0, 1
         delay, end = conditioning.predicted_delay, conditioning.execution_horizon
         rows = conditioning.previous
         if self._rows == "aligned":
-            left = conditioning.remaining_rows
+            left = conditioning.remaining_rows  # the padding after them is no plan and must not be followed
             rows, end = pad_rows(left, len(rows)), max(delay, min(end, len(left)))
         return {"prev_action_chunk": _nested_lists(rows).tolist()}, delay, max(1, end)
 

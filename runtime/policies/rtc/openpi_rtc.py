@@ -1,9 +1,9 @@
-"""The envelope of openpi-rtc and its forks: the observation in a map, beside the chunk before.
+"""Envelope of openpi-rtc and its forks: the observation in a map, with the previous chunk.
 
-These servers take rows off that chunk by themselves: the ancestor always 25, whatever the robot has executed, forks
-as many as the request says. The rows are put so that what the server is left with begins at the first row that the
-robot has not consumed; where it has consumed exactly as many as the server takes off, that is the chunk as it was
-answered, which is all that these servers' own clients ever send.
+These servers remove rows from that chunk by themselves: the original always 25, whatever the robot has executed,
+forks as many as the request states. The rows are shifted so that the server's remainder begins at the first row that
+the robot has not consumed. If the robot has consumed exactly as many as the server removes, that is the chunk as
+received, which is all that these servers' own clients ever send.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class EnvelopeKeys(Settings):
 
 
 class OpenpiRtc(Dialect):
-    """`prev_action` float32 [T, W] is the chunk before, absent on the first request and after a reset."""
+    """Dialect with `prev_action` float32 [T, W], the previous chunk; absent on the first request and after a reset."""
 
     def __init__(self, keys: EnvelopeKeys, rows: Rows) -> None:
         if rows == "aligned" and not keys.shift and keys.server_shift is None:
@@ -52,7 +52,10 @@ class OpenpiRtc(Dialect):
         self._rows = rows
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """True if `rtc` names this dialect, None without the key; ContradictionError for other row counts."""
+        """Return True if `rtc` names this dialect, None without the key.
+
+        Raises ContradictionError for other row counts.
+        """
         said = declared_dialect(metadata, NAME)
         if said is None:
             return None
@@ -65,7 +68,7 @@ class OpenpiRtc(Dialect):
         return bool(said["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """The envelope."""
+        """Return the envelope."""
         keys = self._keys
         message: Message = {keys.observation: observation}
         if conditioning is not None:
@@ -78,17 +81,18 @@ class OpenpiRtc(Dialect):
         return message
 
     def unwrap(self, reply: Message) -> Message:
-        """The reply itself."""
+        """Return the reply itself."""
         return reply
 
     def _placed(self, conditioning: Conditioning) -> Float32:
         previous = conditioning.previous
         if self._rows == "whole" or self._keys.shift or self._keys.server_shift is None:
             return np.ascontiguousarray(previous, np.float32)
+        # The server removes `server_shift` rows; after this shift its remainder begins at the first row not consumed.
         return shift_rows(previous, conditioning.consumed_rows - self._keys.server_shift)
 
 
 def shift_rows(rows: Float32, by: int) -> Float32:
-    """Row n is row n + `by` [T, W]; what is before the first or after the last row repeats that."""
+    """Shift rows [T, W]: row n becomes row n + `by`; the first and last row are repeated at the ends."""
     places = np.clip(np.arange(len(rows)) + by, 0, len(rows) - 1)
     return np.ascontiguousarray(rows[places], np.float32)

@@ -14,19 +14,19 @@ NAME = "prev_action"
 
 
 class PrevAction(Dialect):
-    """`prev_action` float32 [T, W] is what is left of the chunk before, padded with its last row to its length.
+    """Dialect with `prev_action` float32 [T, W], the rest of the previous chunk, padded with its last row to T.
 
-    `rtc_params` = {"s": rows that were removed}. Both are absent on the first request and after a reset. A server
-    that does not know them drops them without a word, and most say nothing of themselves.
+    `rtc_params` is {"s": number of removed rows}. Both are absent on the first request and after a reset. A server
+    that does not know them drops them silently, and most do not declare whether they do.
     """
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """True if the metadata key `rtc` (that of our bundled server) names this dialect; None without it."""
+        """Return True if the metadata key `rtc` (of our bundled server) names this dialect, None without it."""
         said = declared_dialect(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """The observation with both keys, or as it is."""
+        """Return the observation with both keys, or unchanged."""
         if conditioning is None:
             return observation
         return observation | {
@@ -35,11 +35,11 @@ class PrevAction(Dialect):
         }
 
     def unwrap(self, reply: Message) -> Message:
-        """The reply itself."""
+        """Return the reply itself."""
         return reply
 
 
 def pad_rows(rows: Float32, count: int) -> Float32:
-    """`rows` and then the last of them until there are `count`."""
+    """Return `rows`, followed by copies of the last row up to `count` rows."""
     missing = count - len(rows)
     return np.ascontiguousarray(np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)]), np.float32)

@@ -1,1 +1,1 @@
-"""An SSH tunnel to a policy server: what a deployment says of it, its process, and the policy at its end."""
+"""SSH tunnel to a policy server: settings, process, and the policy at its end."""

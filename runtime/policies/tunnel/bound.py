@@ -1,7 +1,7 @@
-"""Becomes another program that ends when the process that started it does, however that ends.
+"""Launcher of a program that ends with its parent process, however that ends.
 
-A program of its own, run by its path: `bound.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it
-is at once the program it is to become.
+Run by its path: `bound.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it starts the program at
+once.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Ask for SIGTERM at the parent's death, and become the program; never returns."""
+    """Request SIGTERM at the parent's death, and replace this process by the program. Never returns."""
     parent, program = int(sys.argv[1]), sys.argv[2:]
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0):

@@ -1,4 +1,4 @@
-"""The command line of a tunnel: a list of arguments that no shell sees."""
+"""Command line of a tunnel, as a list of arguments without a shell."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from runtime.policies.connection import Place
 from runtime.policies.tunnel.settings import TunnelSettings, is_host
 
 _USUAL_PORTS = {"ws": 80, "wss": 443}
-# Goes on until its input ends, in every shell, and says again what it is told.
+# Runs until its input ends, in every shell, and echoes it.
 _ECHO = "cat"
-# No question, nothing but the one forwarding; what is given here comes before ssh's configuration.
+# No prompts, and nothing but the one forwarding; these options precede ssh's configuration.
 _ALWAYS = (
     "BatchMode=yes",
     "NumberOfPasswordPrompts=0",
     "ExitOnForwardFailure=yes",
-    "ControlMaster=no",  # a master belongs to others: the tunnel would end with theirs
+    "ControlMaster=no",  # a master connection belongs to others, and the tunnel would end with it
     "ControlPath=none",
     "PermitLocalCommand=no",
     "RemoteCommand=none",
@@ -26,12 +26,12 @@ _ALWAYS = (
     "TCPKeepAlive=yes",
     "ServerAliveCountMax=3",
     "ConnectionAttempts=1",
-    "LogLevel=INFO",  # below it nothing is said of a far end that refuses
+    "LogLevel=INFO",  # below that, refusals of the far end are not reported
 )
 
 
 def far_end(url: str) -> Place:
-    """Host and port of a policy server as they are seen from the tunnel's far end; ConfigurationError for others."""
+    """Return host and port of a policy server as reached from the far end. Raises ConfigurationError."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port or _USUAL_PORTS.get(parts.scheme, 0)
@@ -46,7 +46,7 @@ def far_end(url: str) -> Place:
 
 
 def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[str]:
-    """Command of ssh, with the near end at `port` on the loopback and the far end leading to `far`."""
+    """Return the ssh command with the near end at `port` on the loopback, forwarded to `far`."""
     options = [
         *_ALWAYS,
         f"StrictHostKeyChecking={'yes' if settings.host_keys == 'strict' else 'accept-new'}",
@@ -76,11 +76,11 @@ def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[s
 
 
 def require_files(settings: TunnelSettings) -> None:
-    """ConfigurationError for a file that is named and cannot be read: ssh goes on without it, and fails later."""
+    """Raise ConfigurationError for an unreadable file: ssh would continue without it, and fail later."""
     files = ("identity_file", "known_hosts_file", "ssh_config")
     for name in files:
         given = getattr(settings, name)
-        # A file of known hosts may be about to be made.
+        # The file of known hosts may not exist yet.
         if given in (None, "none") or (name == "known_hosts_file" and settings.host_keys == "accept-new"):
             continue
         path = _at_home(given)

@@ -1,4 +1,4 @@
-"""Keeps a tunnel up: starts ssh, sees that its near end takes connections, starts another when it has ended."""
+"""Keeper of a tunnel: starts ssh, checks that its near end accepts connections, restarts it when it ends."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ from runtime.policies.tunnel.sentences import explain_exit, explain_session_refu
 
 log = logging.getLogger(__name__)
 _POLL_S = 0.05
-_FIRST_S, _LONGEST_S = 0.2, 5.0  # between two starts
-_STEADY_S = 10.0  # a tunnel that was up for so long has earned the shortest wait again
-_PORTS = 5  # near ends that are tried at once where others are quicker to take them
+_FIRST_S, _LONGEST_S = 0.2, 5.0  # shortest and longest pause between starts [s]
+_STEADY_S = 10.0  # a tunnel that was up this long resets the pause [s]
+_PORTS = 5  # ports tried without a pause if other processes take them first
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A tunnel at one moment: its near end while it is up; since when it is as it is, on the keeper's clock; and why it
-    was last down.
+    """State of a tunnel at one moment: its near end while it is up, since when, and why it was last down.
 
-    `failures` counts the starts that came to nothing and the tunnels that broke, `refusals` the connections that the
-    far end did not make, `refusal` says why it did not make the newest of these.
+    `since` is on the keeper's clock. `failures` counts failed starts and broken tunnels, `refusals` the connections
+    that the far end refused, and `refusal` is the newest reason for that.
     """
 
     up: bool
@@ -40,26 +39,29 @@ class Status:
 
 
 class TunnelKeeper:
-    """One tunnel from `begin` to `close`; `start` starts one ssh with a near end of its own, or raises OSError."""
+    """Tunnel from `start` to `close`.
+
+    The function `start` launches one ssh with a near end of its own, or raises OSError.
+    """
 
     def __init__(
         self, name: str, start: Callable[[], Ssh], deadline: float, now: Callable[[], float] = time.monotonic
     ) -> None:
-        self._name = name  # of the far end
+        self._name = name  # name of the far end
         self._start = start
-        self._deadline = deadline  # for each ssh to be up [s]
+        self._deadline = deadline  # time for each ssh until it is up [s]
         self._now = now
         self._ssh: Ssh | None = None
-        self._begun = 0.0  # the newest ssh
-        self._refused = 0  # of the newest ssh's refusals, those that are counted
-        self._taken = 0  # ports in a row
+        self._begun = 0.0  # start time of the newest ssh
+        self._refused = 0  # refusals of the newest ssh that are already counted
+        self._taken = 0  # consecutive ports that were taken
         self._back_off = BackOff(_FIRST_S, _LONGEST_S)
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self.status = Status(False, now())
 
     def start(self) -> None:
-        """Keep it in a thread of its own: ssh ends with the thread that started it."""
+        """Run in a thread of its own: ssh ends with the thread that started it."""
         threading.Thread(target=self._keep, name="tunnel", daemon=True).start()
 
     def close(self) -> None:
@@ -68,22 +70,22 @@ class TunnelKeeper:
         self._stop.set()
 
     def duration(self, status: Status) -> float:
-        """Duration of the status so far [s]."""
+        """Return the duration of the status so far [s]."""
         return self._now() - status.since
 
     def owns_port(self, port: int) -> bool:
-        """True if the near end at `port` is its own at this moment; one that was its own may be another's."""
+        """Return True if the near end at `port` is its own now; a former port may belong to another process."""
         ssh = self._ssh
         return ssh is not None and ssh.port == port and ssh.is_listening()
 
     def wait_for(self, reached: Callable[[Status], bool], seconds: float) -> Status:
-        """The status as soon as it is one, or after `seconds`."""
+        """Return the status as soon as `reached(status)`, or after `seconds` [s]."""
         with self._changed:
             self._changed.wait_for(lambda: reached(self.status), seconds)
             return self.status
 
     def poll(self) -> None:
-        """Whatever is due."""
+        """Start, check or replace ssh, as due."""
         now, ssh = self._now(), self._ssh
         if ssh is None:
             if not self._back_off.remaining_delay(now):
@@ -126,11 +128,11 @@ class TunnelKeeper:
             self._tell(refusals=self.status.refusals + new, refusal=ssh.refusal)
 
     def _discard(self, ssh: Ssh, reason: str) -> None:
-        """This ssh is of no use any more."""
+        """End this ssh and record the failure; retry at once if only its port was taken."""
         taken = not self.status.up and port_was_taken(ssh.said)
         self.stop()
         if taken and self._taken < _PORTS:
-            self._taken += 1  # another port is free for certain
+            self._taken += 1  # another port is certainly free
             return
         self._failed(reason)
 
@@ -155,7 +157,7 @@ class TunnelKeeper:
             while not self._stop.is_set():
                 self.poll()
                 self._stop.wait(_POLL_S)
-        except Exception as error:  # of our own code: whoever waits has to be told
+        except Exception as error:  # an error of our own code must be reported to waiting threads
             log.exception("the tunnel to %s is not kept any more", self._name)
             self._tell(why=f"it is not kept any more ({type(error).__name__}: {error})")
         finally:

@@ -1,6 +1,6 @@
-"""Processes that listen on loopback ports, read off the kernel's tables: no connection has to be made.
+"""Check which process listens on a loopback port, from the kernel's tables and without a connection.
 
-A connection would go through to the policy server, and would not tell our own process from another one on the port.
+A connection would reach the policy server, and could not distinguish our process from another one on that port.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ _LOOPBACK = int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder)
 
 
 def is_listening(pid: int, port: int) -> bool:
-    """True if the process `pid`, and no other, takes connections on 127.0.0.1:`port`."""
+    """Return True if the process `pid`, and no other, accepts connections on 127.0.0.1:`port`."""
     sockets = _sockets(pid)
     return any(f"socket:[{inode}]" in sockets for inode in _listeners(pid, port)) if sockets else False
 
 
 def _listeners(pid: int, port: int) -> list[str]:
-    """Inodes of the sockets that listen there, in the process's own network namespace."""
+    """Return inodes of the sockets that listen there, in the process's own network namespace."""
     here = f"{_LOOPBACK:08X}:{port:04X}"
     try:
         rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text("ascii").splitlines()[1:]]
@@ -36,7 +36,7 @@ def _sockets(pid: int) -> set[str]:
         for entry in os.scandir(f"/proc/{pid}/fd"):
             try:
                 found.add(os.readlink(entry.path))
-            except OSError:  # closed since
+            except OSError:  # closed meanwhile
                 continue
     except OSError:  # it has ended
         return set()

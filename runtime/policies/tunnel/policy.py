@@ -1,4 +1,4 @@
-"""A policy whose server is reached through a tunnel: another policy, led to the tunnel's near end."""
+"""Policy behind a tunnel: another policy that connects to the tunnel's near end."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from runtime.policies.tunnel.process import Ssh, free_port
 from runtime.policies.tunnel.sentences import explain_forward_refused
 from runtime.policies.tunnel.settings import TunnelSettings
 
-_SLACK_S = 3.0  # of the keeper's own deadline, which says more
-_HEARD_S = 0.3  # how soon ssh is known to have ended, or to have said what it was refused
+_SLACK_S = 3.0  # beyond the keeper's own deadline, whose message is better [s]
+_HEARD_S = 0.3  # time until ssh's end or its messages are known [s]
 
 
 def through_tunnel(policy: Policy, config: Settings) -> Policy:
-    """`policy`, through the tunnel that its section has, or as it is where that has none.
+    """Return `policy` behind the tunnel of its section, or `policy` itself without one.
 
-    Starts nothing. ConfigurationError where ssh is not installed, or policy.url is nowhere that a tunnel could lead.
+    Starts nothing. Raises ConfigurationError if ssh is not installed, or policy.url is not a valid far end.
     """
     settings, url = getattr(config, "tunnel", None), getattr(config, "url", "")
     if settings is None:
@@ -46,9 +46,9 @@ def through_tunnel(policy: Policy, config: Settings) -> Policy:
 
 
 class TunnelledPolicy(Policy):
-    """The tunnel is made by `connect` and kept until `close`; while it is down, errors say so and why.
+    """Policy whose tunnel is opened by `connect` and lives until `close`; while it is down, errors name the reason.
 
-    Each ssh has a near end of its own, so that no two stations and nobody else can be in its way.
+    Each ssh has a near end of its own, so that stations and other programs cannot conflict.
     """
 
     def __init__(self, policy: Policy, settings: TunnelSettings, far: Place, ssh: str) -> None:
@@ -56,48 +56,48 @@ class TunnelledPolicy(Policy):
         self._settings = settings
         self._far = far
         self._ssh = ssh
-        self._turning = threading.Lock()  # between two keepers: held for a moment
+        self._turning = threading.Lock()  # for the change of keepers; held briefly
         self._keeper: TunnelKeeper | None = None
         self.observation_eef, self.uses_poses = policy.observation_eef, policy.uses_poses
         self.observe_period_s = policy.observe_period_s
         policy.address_override = self._local_address
 
     def connect(self) -> PolicyInfo:
-        """Make the tunnel, then reach the server; a tunnel that there was is replaced."""
+        """Open the tunnel, then connect to the server; an existing tunnel is replaced."""
         require_files(self._settings)
         keeper = self._new_keeper()
         status = keeper.wait_for(
             lambda now: now.up or now.closed or now.failures > 0, self._settings.connect_deadline + _SLACK_S
         )
         if not status.up:
-            keeper.close()  # else it would go on knocking while nobody waits for it
+            keeper.close()  # otherwise it would try on although no thread waits for it
             raise self._ended(status) if status.closed else TunnelError(self._absence(status))
         with self._explain_errors():
             return self._policy.connect()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """As the policy; PolicyLostError with the tunnel's own reason where it is down, until it is up again."""
+        """Call the policy's `infer`. Raises PolicyLostError with the tunnel's reason while it is down."""
         if self._keeper is None:
             raise self._never()
         with self._explain_errors():
             return self._policy.infer(observation, conditioning)
 
     def observe(self, observation: Observation) -> None:
-        """As the policy."""
+        """Call the policy's `observe`."""
         self._policy.observe(observation)
 
     def reset(self) -> None:
-        """As the policy."""
+        """Call the policy's `reset`."""
         with self._explain_errors():
             self._policy.reset()
 
     def end_episode(self) -> None:
-        """As the policy."""
+        """Call the policy's `end_episode`."""
         with self._explain_errors():
             self._policy.end_episode()
 
     def close(self) -> None:
-        """As the policy; the tunnel ends."""
+        """Close the policy and the tunnel."""
         with self._turning:
             if self._keeper is not None:
                 self._keeper.close()
@@ -116,7 +116,7 @@ class TunnelledPolicy(Policy):
         return Ssh(command(self._ssh, self._settings, port, self._far), port, self._settings.session)
 
     def _local_address(self) -> Place:
-        """Near end that the policy connects to, looked up each time: a port once ours may be another's."""
+        """Return the near end. Checked at each call: another process may have taken a former port of ours."""
         keeper = self._keeper
         if keeper is None:
             raise self._never()
@@ -131,7 +131,7 @@ class TunnelledPolicy(Policy):
 
     @contextlib.contextmanager
     def _explain_errors(self) -> Iterator[None]:
-        """Say of an error that has to do with the tunnel that it does."""
+        """Convert errors of this context that are caused by the tunnel to errors that explain it."""
         keeper = self._keeper
         before = keeper.status if keeper else None
         try:

@@ -1,4 +1,4 @@
-"""One ssh: started for one near end, and all that it says."""
+"""ssh process with one near end, and its messages."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from runtime.core.environment import ssh_environment
 from runtime.policies.tunnel.listening import is_listening
 
 _BOUND = Path(__file__).with_name("bound.py")
-_PATIENCE_S = 2.0  # after it was told to end
-_LINES, _WIDTH = 20, 300  # of what it says, kept
-_WORD = b"eva-tunnel"  # that the far end says again
+_PATIENCE_S = 2.0  # time for its end after SIGTERM [s]
+_LINES, _WIDTH = 20, 300  # stored lines of its output, and their longest width
+_WORD = b"eva-tunnel"  # text that the far end echoes
 _REFUSED = re.compile(r"channel \d+: open failed: (.+)")
 
 
 def free_port() -> int:
-    """A loopback port that nobody listens on; somebody may before it is used."""
+    """Return a loopback port on which nothing listens; another process may take it before it is used."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         return int(taken.getsockname()[1])
 
 
 class Ssh:
-    """A process of its own session, which ends with the thread that started it, and with this process in any case.
+    """ssh process in a session of its own, which ends with the thread that started it and with this process.
 
-    With `echoes` it says again what it is told, once it is connected; where it does not, its near end is of no use.
+    With `echoes` the far end echoes its input once it is connected; before that the near end is of no use.
     """
 
     def __init__(self, command: Sequence[str], port: int, echoes: bool = False) -> None:
         self.port = port
         self.said: deque[str] = deque(maxlen=_LINES)
-        self.refusal = ""  # why the far end did not make the newest connection that it did not make
-        self.refusals = 0  # of this ssh
+        self.refusal = ""  # reason of the newest connection that the far end refused
+        self.refusals = 0  # number of refused connections
         self._echoed = not echoes
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", str(_BOUND), str(os.getpid()), *command],
-            stdin=subprocess.PIPE if echoes else subprocess.DEVNULL,  # its end is that of a session, too
+            stdin=subprocess.PIPE if echoes else subprocess.DEVNULL,  # the remote command ends with this pipe
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env=ssh_environment(),
-            start_new_session=True,  # without a terminal: nobody can be asked
+            start_new_session=True,  # without a terminal, because no person can answer
         )
         self._pipes = [pipe for pipe in (self._process.stdout, self._process.stderr) if pipe is not None]
         self._rests = {pipe.fileno(): b"" for pipe in self._pipes}
@@ -56,7 +56,7 @@ class Ssh:
             os.set_blocking(pipe.fileno(), False)
         if self._process.stdin is not None:
             self._pipes.append(self._process.stdin)
-            with contextlib.suppress(BrokenPipeError):  # it has ended, which is noticed
+            with contextlib.suppress(BrokenPipeError):  # it has ended, which `poll` reports
                 os.write(self._process.stdin.fileno(), _WORD + b"\n")
 
     @property
@@ -64,8 +64,8 @@ class Ssh:
         return self._process.pid
 
     def poll(self) -> int | None:
-        """Take in what it said; its exit code, None while it lives."""
-        code = self._process.poll()  # first, so that all it said is there to be read when it has ended
+        """Read pending ssh output; return the exit code, or None while it runs."""
+        code = self._process.poll()  # first, so that all its output can be read if it has ended
         for pipe in self._rests:
             self._read(pipe)
             if code is not None and self._rests[pipe]:
@@ -73,12 +73,12 @@ class Ssh:
         return code
 
     def is_listening(self) -> bool:
-        """True if its near end takes connections, and its far end answers."""
+        """Return True if the near end accepts connections and the far end responds."""
         return self._echoed and is_listening(self.pid, self.port)
 
     def terminate(self) -> None:
-        """End it and what it started, wait for that; nobody else's."""
-        if self._process.poll() is None:  # not reaped: the number of its session is still its own
+        """End it with its children and wait for that."""
+        if self._process.poll() is None:  # not reaped yet, so its session id cannot belong to another process
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGTERM)
             try:

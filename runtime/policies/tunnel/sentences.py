@@ -1,11 +1,11 @@
-"""Messages of an ssh that ends, as one sentence, and advice about it."""
+"""Explanations of an ssh exit, as one sentence with advice."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 
-_OWN_FAULT = 255  # of ssh; any other code is that of what was run at the far end
+_OWN_FAULT = 255  # exit code of ssh's own errors; others come from the remote command
 _SIGNALS = range(-64, 0)
 _OVER = "what is run there, cat, ended; for an account that may run nothing set policy.tunnel.session = false"
 _TAKEN = re.compile(r"Address already in use|cannot listen to port")
@@ -32,12 +32,12 @@ _ADVICE = (
 
 
 def port_was_taken(said: Sequence[str]) -> bool:
-    """True if another process was quicker to take the near end's port."""
+    """Return True if another process took the near end's port first."""
     return any(_TAKEN.search(line) for line in said)
 
 
 def explain_exit(said: Sequence[str], code: int) -> str:
-    """The last of what ssh said, with what came before it where that alone says little, and an advice."""
+    """Return the last two lines of ssh's output, with advice if there is some."""
     told = "; ".join(list(said)[-2:]) or f"ssh ended with {code} and said nothing"
     if code not in (_OWN_FAULT, *_SIGNALS):
         return f"{told}: {_OVER}"
@@ -45,7 +45,7 @@ def explain_exit(said: Sequence[str], code: int) -> str:
 
 
 def explain_session_refused(refusal: str) -> str:
-    """Why an ssh ended that was never up and said nothing but that the far end did not open its session."""
+    """Return why ssh ended without ever being up, when its only message was a refused session."""
     return (
         f"no session was opened there ({refusal}): for an account or a server without any set "
         "policy.tunnel.session = false"
@@ -53,7 +53,7 @@ def explain_session_refused(refusal: str) -> str:
 
 
 def explain_forward_refused(refusal: str) -> str:
-    """Advice for a connection that the far end did not make."""
+    """Return advice for a connection that the far end refused."""
     if "prohibited" in refusal:
         return "let the SSH server there forward to it (AllowTcpForwarding, PermitOpen)"
     return "start the policy server there, or correct policy.url, which is as seen from there"

@@ -1,4 +1,4 @@
-"""Settings in a checkpoint of the SSH tunnel through which its policy server is reached."""
+"""Settings of the SSH tunnel through which a checkpoint's policy server is reached."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from runtime.core.machine_names import HostReference
 from runtime.core.settings import Settings
 
-# Nothing here begins with "-", which ssh would take for an option, or means something to a shell, which ssh itself
+# Values must not begin with "-", which ssh would take for an option, nor have a meaning for a shell, which ssh itself
 # starts for a jump.
 _NAME = r"[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,252}[A-Za-z0-9_])?"
 _USER = r"[A-Za-z0-9_][A-Za-z0-9._@+-]{0,63}"
@@ -20,7 +20,7 @@ _JUMP = re.compile(rf"(?:{_USER}@)?(?P<host>{_NAME}|\[[0-9A-Fa-f:.]+\])(?::(?P<p
 
 
 def is_host(name: str) -> bool:
-    """True if it is a name, an alias of ssh's configuration, or an address, and nothing else."""
+    """Return True if it is a host name, an alias of ssh's configuration, or an address, and nothing else."""
     if re.fullmatch(_NAME, name):
         return True
     try:
@@ -106,6 +106,6 @@ class TunnelSettings(Settings):
 
     @property
     def where(self) -> str:
-        """The far end in sentences."""
+        """Far end, for messages."""
         user, host = f"{self.user}@" if self.user else "", f"[{self.host}]" if ":" in self.host else self.host
         return f"{user}{host if self.port is None else f'{host}:{self.port}'}"

@@ -1,1 +1,1 @@
-"""Process 4, the e-stop."""
+"""Guard, process 4: the e-stop."""

@@ -1,4 +1,4 @@
-"""The process that holds the e-stop: its socket, the latch on disk, the flag that every send checks."""
+"""Guard process: e-stop socket, latch on disk, and the flag that control checks before every send."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ _NOT_OBEYED = Pattern(
     "latched, but control has not obeyed within {ms:.0f} ms: USE THE HARDWARE STOP{doubt}",
 )
 _UNKNOWN = Pattern("guard.unknown", "the guard knows estop and status, not {kind!r}")
-_SHARE = 8  # questions that are answered in one turn, besides all presses
-_REMEMBERED = 10_000  # presses of one e-stop
+_SHARE = 8  # requests answered per turn, besides all presses
+_REMEMBERED = 10_000  # most remembered presses of one e-stop
 
 
 class Guard:
-    """Presses and releases: the flag, the disk, the answer, then the log; none delays what comes before it."""
+    """E-stop presses and releases, in this order: flag, disk, answer, log. No step delays an earlier one."""
 
     def __init__(
         self, shared: SharedState, latch: Latch, clock: Clock, period: float, station: str = ""
@@ -51,28 +51,30 @@ class Guard:
         self._shared_state = shared
         self._latch = latch
         self._clock = clock
-        self._said = {"station": station}  # so that nobody takes another station's answer for his own
+        self._said = {
+            "station": station
+        }  # so that a client cannot mistake another station's answer for this one
         self._patience = max(0.05, 2.0 * period)
-        self._unsaid: list[tuple[int, str]] = []  # level and line, for after the answer
-        self._releases = shared.releases  # what was asked for before is void
-        self._latched: tuple[str, str] | None = None  # by whom and why, as this process has written it
+        self._unsaid: list[tuple[int, str]] = []  # level and text of log lines for after the answer
+        self._releases = shared.releases  # releases requested before this start are void
+        self._latched: tuple[str, str] | None = None  # user and reason of the latch that this process wrote
         latched = latch.read()
-        # A restarted guard also trusts the flag of its predecessor, which may not have reached the disk.
+        # Also trust the flag of a predecessor, whose press may not have reached the disk.
         shared.set_estop(EStop.LATCHED if latched or shared.estop is EStop.LATCHED else EStop.CLEAR)
         if latched:
             log.warning("e-stop is latched since before this start, by %s: %s", latched.by, latched.why)
 
     def raise_flag(self) -> None:
-        """Stop the robot: before anybody is asked who he is."""
+        """Stop the robot, before the sender is authenticated."""
         self._shared_state.set_estop(EStop.LATCHED)
         self._releases = (
             self._shared_state.releases
-        )  # a release asked for before this press is not for this press
+        )  # a release requested before this press does not release it
 
     def press(self, by: str, why: str) -> str:
-        """Raise the flag, then latch on disk; returns "" or why the latch will not outlive a restart.
+        """Set the flag, then latch on disk; return "" or why the latch will not survive a restart.
 
-        What is latched by the same person for the same reason is written already.
+        A latch by the same user for the same reason is not written again.
         """
         self.raise_flag()
         if (by, why) == self._latched:
@@ -87,9 +89,9 @@ class Guard:
         return ""
 
     def poll(self) -> None:
-        """Release where the coordinator has asked for it, latch what came to it meanwhile, then log what there is.
+        """Release if the coordinator has requested it, latch presses that the coordinator received, then write the log.
 
-        The coordinator has raised the flag for such a press itself: a release in between has lowered it again.
+        The coordinator has already set the flag for such a press, but a release in between may have cleared it.
         """
         if self._shared_state.releases != self._releases:
             self._release()
@@ -101,7 +103,7 @@ class Guard:
         self._unsaid.clear()
 
     def _release(self) -> None:
-        """The coordinator has checked the lease; where the disk refuses, the e-stop stays."""
+        """Release the e-stop; the coordinator has checked the lease. It stays latched if the disk refuses."""
         self._releases = self._shared_state.releases
         try:
             self._latch.clear()
@@ -113,9 +115,9 @@ class Guard:
         self._unsaid.append((logging.WARNING, "e-stop released"))
 
     def wait_until_obeyed(self, version: int) -> bool:
-        """True if control has said since `version` of its status that it obeys.
+        """Return True if control has confirmed the e-stop in a status newer than `version`.
 
-        Waits at most max(50 ms, 2 ticks). An older word is worth nothing: control may have died after it.
+        Waits at most max(50 ms, 2 ticks). An older status proves nothing, because control may have died after it.
         """
         until = self._clock.now() + self._patience
         while not self._control_confirms(version):
@@ -129,9 +131,9 @@ class Guard:
         return status.version > version and bool(status.read()["estop_obeyed"])
 
     def answer(self, command: Command) -> Ack:
-        """Any user may press; "failed" means that control did not answer in time: use the hardware stop."""
+        """Answer a command. Every user may press; "failed" means no confirmation by control: use the hardware stop."""
         if command.kind == "estop":
-            version = self._shared_state.control.version
+            version = self._shared_state.control.version  # before the press: only a newer status confirms it
             doubt = self.press(display_name(command), reason_of(command))
             if self.wait_until_obeyed(version):
                 return Ack(command.uuid, "done", _OBEYED(doubt=doubt), data=self._said)
@@ -145,14 +147,13 @@ class Guard:
 
 
 class EStopServer:
-    """The guard's socket: every press that has come is answered in the turn in which it comes, however many there are.
+    """Socket of the guard: every press that has arrived is answered in the same turn, however many there are.
 
-    They raise one flag and are one latch, that of the first of them: the answer to it is that to all. A repeated uuid
-    gets the first answer for as long as it is true: until the e-stop is released.
+    All presses of a turn set one flag and one latch, that of the first; its answer is sent to all. A repeated uuid gets
+    the first answer again until the e-stop is released.
 
-    The data of an answer say when that press was carried out (`carried_out_at`, Unix time [s]) and whether it
-    `latched`: "anew", "already" where the e-stop was latched when it came, "before" where this is the answer to an
-    earlier one.
+    The data of an answer contain `carried_out_at`, the time of the press (Unix time [s]), and `latched`: "anew",
+    "already" if the e-stop was latched before, or "before" if this is the answer to an earlier press.
     """
 
     def __init__(
@@ -174,7 +175,7 @@ class EStopServer:
         self._endpoints.write("guard", {"estop": self._server.endpoint})
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for a message, or for what the guard watches; answer what there is."""
+        """Wait up to `timeout` [s] for a message or the bell, then answer all that waits."""
         if not self._turns.has_waiting:
             self._poller.poll(int(timeout * 1000))
         if self._bell is not None:
@@ -183,7 +184,7 @@ class EStopServer:
         anew = self._shared_state.estop is not EStop.LATCHED
         if anew:
             self._answered.clear()
-        if presses:
+        if presses:  # first the flag for all of them, then authentication, the latch and answers
             self._guard.raise_flag()
             self._answer(presses, "anew" if anew else "already")
         for call, command in others:
@@ -217,7 +218,7 @@ class EStopServer:
 
 
 def _arguments() -> argparse.Namespace:
-    """Arguments from the supervisor: values, so that nothing that a deployment may name is loaded here."""
+    """Parse the supervisor's arguments: plain values, so that no module that a deployment names is loaded here."""
     parser = argparse.ArgumentParser(prog="runtime.guard", description="started by the supervisor")
     parser.add_argument("--station", required=True)
     parser.add_argument("--folder", required=True, type=Path, help="of the station: latch, key, endpoints")
@@ -232,11 +233,11 @@ def _arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Guard until the supervisor is gone and control has stopped ticking."""
+    """Guard until the supervisor has ended and control has stopped ticking."""
     descriptors.raise_file_limit()
     given = _arguments()
     logs.configure_logging("guard")
-    # before there are other threads, which are to have the same
+    # before other threads exist, which inherit the class
     scheduling = realtime.enter_realtime_below(given.priority) if given.priority else "ordinary"
     log.info("guarding, scheduling %s", scheduling)
     sizes = json.loads(given.layout)

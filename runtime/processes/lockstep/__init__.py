@@ -1,1 +1,1 @@
-"""All processes in one, on a virtual clock."""
+"""Lockstep: all station processes in one, on a virtual clock."""

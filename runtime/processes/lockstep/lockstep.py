@@ -1,4 +1,4 @@
-"""The same parts in one process on a virtual clock: deterministic, and as fast as the machine allows."""
+"""Lockstep station: the same parts in one process on a virtual clock, deterministic and as fast as possible."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _HOLDER = "lockstep"
 
 @dataclass(frozen=True, slots=True)
 class LockstepRun:
-    """Result of a lockstep run: the episode as media closed it, the last state, every event."""
+    """Result of a lockstep run: the closed episode, the last state and every event."""
 
     episode: dict[str, Any]
     state: SessionState
@@ -50,11 +50,11 @@ class LockstepRun:
 
 @dataclass(frozen=True, slots=True)
 class LockstepEnvironment:
-    """Surroundings of a lockstep station; by default it is alone."""
+    """Environment of a lockstep station; by default it has no clients."""
 
     runner: Runner | None = None
-    client_clock: Clock | None = None  # the clock of leases and commands
-    waits: Clock | None = None  # what the guard waits by
+    client_clock: Clock | None = None  # clock of leases and commands
+    waits: Clock | None = None  # clock by which the guard waits
     preview: Callable[[Observation], None] = lambda observation: None
     closer: Callable[[Close], Future[ClosedEpisode]] = at_once
     on_disk: Callable[[Path], None] = lambda folder: None
@@ -62,7 +62,7 @@ class LockstepEnvironment:
 
 @dataclass(frozen=True, slots=True)
 class Peers:
-    """Makers of what a station is connected to; by default of what its deployment names."""
+    """Constructors of a station's peers; by default those that its deployment names."""
 
     source: Callable[[StationSpec, Clock], Source] = make_source
     sink: Callable[[StationSpec, Clock], Sink] = make_sink
@@ -70,9 +70,9 @@ class Peers:
 
 
 class Lockstep:
-    """One station without processes; each `tick` is reception, media, the coordinator, control in that order.
+    """Station without processes; each `tick` runs reception, media, coordinator and control in that order.
 
-    `clock`, `around` and `peers` are given where somebody else has a part in it.
+    `clock`, `around` and `peers` are passed if other code takes part.
     """
 
     def __init__(
@@ -99,12 +99,12 @@ class Lockstep:
         self.step = 0
 
     def connect(self) -> None:
-        """Open source and sink; raises TransportError."""
+        """Open source and sink. Raises TransportError."""
         self._source.connect()
         self._sink.connect()
 
     def tick(self) -> None:
-        """One control period."""
+        """Run one control period."""
         now = self.clock.now()
         for process in ("control", "guard", "reception", "media"):
             self.shared.beat(process, now)
@@ -120,11 +120,11 @@ class Lockstep:
         self._advance_clock()
 
     def _advance_clock(self) -> None:
-        """Let time come to the next tick: from the start and not by adding up, so that tick k is at k / rate."""
+        """Advance the clock to the next tick, computed from the start: tick k is exactly at k / rate."""
         self.clock.sleep_until(self.step / self.spec.rate)
 
     def command(self, kind: str, **arguments: Any) -> Ack:
-        """Give a command under a lease of lockstep's own; raises SetupError where it is refused."""
+        """Execute a command under a lease of lockstep's own. Raises SetupError if it is refused."""
         self._handle("lease_claim")
         ack = self._handle(kind, arguments)
         if ack.status == "refused":
@@ -148,7 +148,7 @@ class Lockstep:
         )
 
     def until(self, reached: Callable[[], bool], seconds: float, what: str) -> SessionState:
-        """Tick until `reached`, return the state then; raises SetupError after `seconds` of virtual time."""
+        """Tick until `reached()`, return the state then. Raises SetupError after `seconds` [s] of virtual time."""
         end = self.clock.now() + seconds
         while not reached():
             if self.clock.now() > end:
@@ -168,10 +168,9 @@ class Lockstep:
 
 
 def check(spec: StationSpec) -> None:
-    """Raise SetupError where what is at the other end of the transport goes on by itself.
+    """Raise SetupError if the peer of the transport runs in real time.
 
-    Its messages are stamped in a time that the virtual clock does not have: a run would only hold, for the age of
-    its joints.
+    Its stamps have no relation to the virtual clock: a run would only hold because joints seem too old.
     """
     kind = spec.deployment.transport.kind
     known = variants("runtime.transports")
@@ -185,9 +184,9 @@ def check(spec: StationSpec) -> None:
 
 
 def run(spec: StationSpec, longest: float = 3600.0, peers: Peers | None = None) -> LockstepRun:
-    """Set up, run to the end of the source or of run.duration_s, close; raises RuntimeFault where it cannot.
+    """Set up, run to the end of the source or run.duration_s, and close. Raises RuntimeFault.
 
-    `longest` bounds the virtual time of the run [s]; `peers` as by `Lockstep`.
+    `longest` bounds the virtual time of the run [s]; `peers` as in `Lockstep`.
     """
     station = Lockstep(spec, peers=peers)
     session = station.coordinator.session
@@ -203,7 +202,7 @@ def run(spec: StationSpec, longest: float = 3600.0, peers: Peers | None = None) 
         why = session.reason
         if how is SessionState.HOLDING:
             station.command("stop")
-        for _ in range(3):  # the end goes from the coordinator to media and back
+        for _ in range(3):  # the end passes from the coordinator to media and back
             station.tick()
         return LockstepRun(
             station.coordinator.runs.last_episode, how, why, station.step, station.coordinator.events.since(0)

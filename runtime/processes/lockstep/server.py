@@ -1,10 +1,9 @@
-"""A lockstep station that people and programs find as they find any other: commands, streams, pictures, e-stop.
+"""Lockstep station with the sockets of an ordinary station: commands, streams, pictures, e-stop.
 
-Its time passes as fast as the machine can while it sets up or the policy drives, and stands still while it is ready,
-while the policy is asked and while an episode is being closed: nothing that is recorded depends on how long those
-took. A paced one is no faster than life in any state, as people expect it, and only stands still while the policy is
-asked and while an episode is being closed. Leases, and for how long a command is valid, are of the people's own time,
-which goes on.
+Time passes as fast as the machine can while it sets up or the policy drives. It is paused while the station is ready,
+while the policy computes and while an episode is being closed, so that no recording depends on the duration of these.
+A paced station runs in real time in every state, as people expect, and is paused only while the policy computes and
+while an episode is being closed. Leases and the validity of commands use real time, which is never paused.
 """
 
 from __future__ import annotations
@@ -37,19 +36,19 @@ from runtime.station.lock import acquire_station_lock
 from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
-_POLL_S = 0.002  # for a command, while time stands still
-_AGAIN_S = 0.2  # between two showings of the same pictures
-_LAST_S, _EXPORT_S = 8.0, 3.0  # at the end: for the last episode, for exports
-_FIGURES_EVERY = 30  # ticks
-_ON_DEMAND = ("step", "preview", "manual")  # modes in which a person is waited for: no faster than they live
+_POLL_S = 0.002  # polling period for commands while time is paused [s]
+_AGAIN_S = 0.2  # period for showing the same pictures again [s]
+_LAST_S, _EXPORT_S = 8.0, 3.0  # time at the end for the last episode and for exports [s]
+_FIGURES_EVERY = 30  # [ticks]
+_ON_DEMAND = ("step", "preview", "manual")  # modes that wait for a person, in real time
 Over = Callable[[bool], str]
-"""Asked before each tick with whether a run goes on: why it is over, "" while it is not."""
+"""Called before each tick with whether a run is active; returns why the run is over, or ""."""
 
 
 def declared_delay(rate: float) -> Callable[[Any], tuple[Any, int]]:
-    """Hand-over of a policy's answer, and how many ticks late it is: as late as it says that it took.
+    """Return a function that maps a policy's response to (response, delay in ticks), from its own timing.
 
-    A result that is no answer, that of connecting, is there with the next tick.
+    Other results, such as that of connecting, have a delay of one tick.
     """
 
     def told(result: Any) -> tuple[Any, int]:
@@ -66,7 +65,7 @@ def declared_delay(rate: float) -> Callable[[Any], tuple[Any, int]]:
 
 
 class _TickingClock(Clock):
-    """The station's clock for its guard, which waits for control: to wait is to tick."""
+    """Station clock for its guard, which waits for control: waiting means ticking."""
 
     def __init__(self, clock: Clock, tick: Callable[[], None]) -> None:
         self._clock, self._tick = clock, tick
@@ -80,9 +79,9 @@ class _TickingClock(Clock):
 
 
 class ServedLockstep(Lockstep):
-    """One lockstep station with the sockets of a family; `serve` until told to end, then `close`.
+    """Lockstep station with sockets; call `serve`, then `close`.
 
-    Raises SetupError where another process has the station, or what it needs is no part of lockstep.
+    Raises SetupError if another process has the station, or if it needs something that lockstep lacks.
     """
 
     def __init__(
@@ -121,17 +120,17 @@ class ServedLockstep(Lockstep):
         context: zmq.Context[Any] = zmq.Context.instance()
         self._estops = EStopServer(self.guard, self.shared, context, settings.station_dir)
         self._service = CommandService(self.coordinator, context)
-        self._told_at = -1  # the step that the coordinator was last told of how it goes, time standing still
-        self._again_at = self._next_at = 0.0  # on the people's clock
+        self._told_at = -1  # step of the last report to the coordinator while time was paused
+        self._again_at = self._next_at = 0.0  # on the clients' clock [s]
 
     def serve(self, ended: Callable[[], bool]) -> None:
-        """Tick where time passes, answer commands, publish, until `ended`."""
+        """Tick when time passes, answer commands and publish, until `ended()`."""
         self.connect()
         while not ended():
             self.poll()
 
     def poll(self) -> None:
-        """One tick if time passes, then every command there is."""
+        """Run one tick if time passes, then handle all commands that wait."""
         wait = _POLL_S
         if not self._is_paused():
             now = self._people.now()
@@ -147,7 +146,7 @@ class ServedLockstep(Lockstep):
         self._estops.serve(0.0)
 
     def tick(self) -> None:
-        """One control period; a run that is over ends within it."""
+        """Run one control period; a run that is over ends within it."""
         super()._advance_clock()
         if why := self._over(self.coordinator.session.state is SessionState.RUNNING):
             self.coordinator.end_source_run(why)
@@ -157,15 +156,15 @@ class ServedLockstep(Lockstep):
             self._figures.write()
 
     def _tick_ahead(self) -> None:
-        """A tick that a press of the e-stop waits for: those after it come so much later, or it would hurry time."""
+        """Run a tick while an e-stop press waits; later ticks are delayed by as much, or time would run faster."""
         self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
         self.tick()
 
     def _advance_clock(self) -> None:
-        """Time comes to a tick when that begins: the policy is asked between two, and it is now until it answers."""
+        """Do nothing: time advances at the start of a tick, since the policy is queried between ticks."""
 
     def _is_paused(self) -> bool:
-        """True if time stands still: nothing needs it, or the policy or a closing episode is waited for."""
+        """Return True if time is paused: it is not needed, or the policy or a closing episode is awaited."""
         if self._asking.start_waiting() or self.media.closing:
             return True
         if self._paced or self.coordinator.session.state not in (SessionState.IDLE, SessionState.READY):
@@ -176,7 +175,7 @@ class ServedLockstep(Lockstep):
         )
 
     def _is_unpaced(self) -> bool:
-        """True if ticks need no pace: no operator is waited for, to see them as they happen."""
+        """Return True if ticks need no pace, because no operator has to watch them in real time."""
         if self._paced:
             return False
         state, run = self.coordinator.session.state, self.coordinator.run
@@ -185,7 +184,7 @@ class ServedLockstep(Lockstep):
         return state is SessionState.SETTING_UP
 
     def _poll_paused(self) -> None:
-        """Hear and tell, while it is still now; what begins, begins with a tick."""
+        """Handle messages while time is paused; anything that begins, begins with a tick."""
         self.guard.poll()
         closing, rests = (
             self.media.closing,
@@ -195,7 +194,7 @@ class ServedLockstep(Lockstep):
             self.media.report_closed()
         elif rests:
             self.media.poll()
-        # Once in each rest, and after the episode is closed: whoever commands next, however soon, finds it said.
+        # Report once per pause, and after the episode is closed, so that the next command finds it reported.
         if not self.media.closing and (closing or (rests and self._told_at != self.step)):
             self._told_at = self.step
             self.media.report()
@@ -206,7 +205,7 @@ class ServedLockstep(Lockstep):
             self._previews.republish()
 
     def close(self) -> None:
-        """Close the episode, what is asked, all sockets; then the station is free for another process."""
+        """Close the episode, pending requests and all sockets; then another process may use the station."""
         self.media.poll()
         self.media.end("interrupted", "the station's supervisor ended")
         self.media.finish(_LAST_S)

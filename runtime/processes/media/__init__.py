@@ -1,1 +1,1 @@
-"""Process 3, records and previews."""
+"""Media, process 3: recordings and previews."""

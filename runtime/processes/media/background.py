@@ -1,4 +1,4 @@
-"""Work on observations that may be late: on a thread that gives way to everything else of its process."""
+"""Low-priority thread for work on observations that may be late."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from runtime.core.types import Observation
 from runtime.ipc.bells import Bell
 
 _LOOK_MS = 200
-NICE = 5  # as the web, which is whom live pictures are for
+NICE = 5  # the same as the web's, which shows the pictures
 
 
 class Work(Protocol):
-    """Work that somebody may or may not want; all of it is asked by one thread."""
+    """Work that only some clients want; all methods are called by one thread."""
 
     @property
     def socket(self) -> zmq.Socket[Any]:
-        """Can be read when it may be wanted by others than before."""
+        """Socket that becomes readable when the set of clients may have changed."""
 
     def wanted(self) -> bool:
-        """True if anybody wants it now; asked every 0.2 s at least."""
+        """Return True if a client wants the work now; called at least every 0.2 s."""
 
     def __call__(self, observation: Observation) -> None:
-        """Do it."""
+        """Process one observation."""
 
 
 class LowPriorityWorker:
-    """Calls `work` with the newest observation; those that come while it is at work replace each other.
+    """Thread that calls `work` with the newest observation; observations that arrive meanwhile replace each other.
 
-    While nobody wants the work nothing of it is done; who begins to want it gets the newest observation at once.
-    Where `work` fails, the next call raises what it failed with.
+    While no client wants the work, nothing is done; a new client gets the newest observation at once. If `work` fails,
+    the next call raises its exception.
     """
 
     def __init__(self, work: Work, nice: int = NICE) -> None:
         self._work = work
         self._nice = nice
         self._bell = Bell.made()
-        self._newest: deque[Observation] = deque(maxlen=1)  # that was not worked on yet
-        self._wanted = True  # as the thread last found
+        self._newest: deque[Observation] = deque(maxlen=1)  # not processed yet
+        self._wanted = True  # last answer to `work.wanted`
         self._failure: Exception | None = None
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="aside", daemon=True)
@@ -56,20 +56,22 @@ class LowPriorityWorker:
             self._bell.ring()
 
     def close(self) -> None:
-        """End after what is being worked on."""
+        """End after the present observation."""
         self._closed = True
         self._bell.ring()
         self._thread.join()
         self._bell.close()
 
     def _run(self) -> None:
-        # Of Linux alone, where a thread has a nice value of its own; its number stands for a process there.
+        # Linux only: there a thread has a nice value of its own, and its id is accepted as a process id.
         os.setpriority(
             os.PRIO_PROCESS, threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0) + self._nice
         )
         try:
             self._turn_by_turn()
-        except Exception as error:  # whatever it was: the process is to end of it as if it had done the work
+        except (
+            Exception
+        ) as error:  # any exception must end the process, as if the process had done the work itself
             self._failure = error
 
     def _turn_by_turn(self) -> None:
@@ -77,7 +79,7 @@ class LowPriorityWorker:
         poller.register(self._work.socket, zmq.POLLIN)
         poller.register(self._bell.descriptor, zmq.POLLIN)
         while not self._closed:
-            # Before the newest is looked at: one that came while nobody wanted it has rung no bell.
+            # Before the newest is read: an observation that came while the work was not wanted has rung no bell.
             self._wanted = self._work.wanted()
             if self._wanted and self._newest:
                 self._work(self._newest.pop())

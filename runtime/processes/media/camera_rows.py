@@ -1,4 +1,4 @@
-"""Pictures of each camera in the rows of an episode: each once, how old the newest one is, and cameras that stop."""
+"""Pictures of each camera in the rows of an episode: each used once, with age checks and dropout events."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ _ONCE_MORE = Pattern("media.stopped_once_more", "{what}; it stopped {more} more 
 _MORE = Pattern("media.stopped_more", "{what}; it stopped {more} more times since row {row}")
 
 
-QUIET_S = 5.0  # from one pictures_stopped of a camera to its next
+QUIET_S = 5.0  # shortest time between two pictures_stopped events of a camera [s]
 
 
 @dataclass(slots=True)
 class _Camera:
     silent: bool = False
-    row: int = 0  # of its newest change
-    said: bool = False  # its silence was, and not yet that it is back
-    unsaid: int = 0  # how often it fell silent since something was said
-    unsaid_from: int = 0  # the row of the first of these
-    spoken: float = -math.inf  # when that was
+    row: int = 0  # row of the last change
+    said: bool = False  # its dropout has been reported, but not its return
+    unsaid: int = 0  # number of dropouts since the last report
+    unsaid_from: int = 0  # row of the first of these
+    spoken: float = -math.inf  # time of the last report [s]
 
     def set_silent(self, silent: bool, row: int) -> None:
-        """It falls silent at row `row`, or is back."""
+        """Record that it stops at row `row`, or is back."""
         self.silent, self.row = silent, row
         if silent:
             self.unsaid_from = self.unsaid_from if self.unsaid else row
             self.unsaid += 1
 
     def is_due(self, now: float) -> bool:
-        """Something is to be said of it."""
+        """Return True if an event is due."""
         return (self.said and not self.silent) or (self.unsaid > 0 and now - self.spoken >= QUIET_S)
 
     def to_event(self, name: str, now: float, age: float | None) -> Event:
-        """How it is; `age` [s] is that of its last picture."""
+        """Return the event about its present state; `age` is that of its last picture [s]."""
         data: dict[str, object] = {"camera": name, "row": self.row}
         if self.silent:
             stopped = {"camera": name, "row": self.row}
@@ -65,17 +65,17 @@ class _Camera:
 
 
 class DropoutLog:
-    """Follows the cameras of one episode row by row.
+    """Dropouts of the cameras of one episode, updated row by row.
 
-    A camera is said to have stopped, and to be back, at most once in QUIET_S. What comes meanwhile is counted, and said
-    when that time is over: as what the camera does then, since its own row, with the number.
+    A stop and a return are each reported at most once in QUIET_S. Changes meanwhile are counted, and reported with
+    their number when that time is over, as the state at that time.
     """
 
     def __init__(self, cameras: Iterable[str]) -> None:
         self._cameras = {name: _Camera() for name in sorted(cameras)}
 
     def update(self, now: float, row: int, silent: Mapping[str, float]) -> list[Event]:
-        """Events at row `row`, made at `now` [s]; `silent` has the age [s] of each picture too old."""
+        """Return the events at row `row` and time `now` [s]; `silent` maps cameras to the age of an old picture [s]."""
         events = []
         for name, camera in self._cameras.items():
             if (name in silent) != camera.silent:
@@ -85,26 +85,24 @@ class DropoutLog:
         return events
 
     def flush(self, now: float) -> list[Event]:
-        """Events that were counted and not said yet, at the end of the episode."""
+        """Return the events that were counted but not reported, at the end of the episode."""
         return [camera.to_event(name, now, None) for name, camera in self._cameras.items() if camera.unsaid]
 
 
 class CameraRows:
-    """Follows the cameras of one episode row by row."""
+    """Pictures of the cameras of one episode, updated row by row."""
 
     def __init__(self, cameras: Sequence[str], settings: RecordingSettings) -> None:
         self._cameras = tuple(cameras)
         self._settings = settings
-        self._captured: dict[str, float] = {}  # of the newest picture that a row has
+        self._captured: dict[str, float] = {}  # capture time of the newest used picture
         self._began: float | None = None
         self._silences = DropoutLog(cameras)
-        self.stale: frozenset[str] = frozenset()  # cameras whose newest picture is too old for the newest row
-        self.lost: frozenset[str] = (
-            frozenset()
-        )  # cameras whose picture for the newest row was there, and is gone
+        self.stale: frozenset[str] = frozenset()  # cameras whose picture is too old for the newest row
+        self.lost: frozenset[str] = frozenset()  # cameras whose new picture for the newest row is gone
 
     def sizes(self, seen: Observation) -> dict[str, dict[str, int]]:
-        """Sizes of each video, and of the pictures of its camera where they are scaled for it."""
+        """Return the size of each video, and of the camera's pictures if they are scaled for it."""
         pictures = {camera: seen.pictures[camera] for camera in self._cameras}
         given = {camera: (picture.shape[0], picture.shape[1]) for camera, picture in pictures.items()}
         sizes = {}
@@ -115,10 +113,10 @@ class CameraRows:
         return sizes
 
     def pictures(self, seen: Observation | None) -> Mapping[str, UInt8 | None]:
-        """The observation's pictures; None for a camera whose picture an earlier row has already, or that is lost."""
+        """Return the observation's pictures; None for a picture that is lost or was used by an earlier row."""
         pictures: dict[str, UInt8 | None] = dict.fromkeys(self._cameras)
         lost = set()
-        if seen is None:  # what the row's tick saw has not come to us: nor have its pictures
+        if seen is None:  # the observation of the row's tick has not arrived
             self.lost = frozenset(self._cameras)
             return pictures
         for camera in self._cameras:
@@ -133,7 +131,7 @@ class CameraRows:
         return pictures
 
     def check_ages(self, now: float, row: int) -> list[Event]:
-        """Judge the age of what row `row` shows at `now` [s]; cameras that fall silent or are back are events."""
+        """Check the ages of the pictures at row `row` and time `now` [s]; return dropout and return events."""
         self._began = now if self._began is None else self._began
         ages = {camera: now - self._captured.get(camera, self._began) for camera in self._cameras}
         old = {camera: age for camera, age in ages.items() if age > self._settings.max_picture_age_s}
@@ -141,5 +139,5 @@ class CameraRows:
         return self._silences.update(now, row, old)
 
     def flush(self, now: float) -> list[Event]:
-        """Events about the cameras that are left to be said when the episode ends."""
+        """Return the remaining events at the end of the episode."""
         return self._silences.flush(now)

@@ -1,4 +1,4 @@
-"""The chunks of an episode: what the policy answered, together with where control put it."""
+"""Log of an episode's chunks: the policy's response together with its placement by control."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from runtime.core.types import Float32, UInt8
 from runtime.ipc.messages import ChunkMerged, PolicyAnswer
 from runtime.recording.base import Journal, RawChunk
 
-_KEPT = 256  # of either half, until the other comes
+_KEPT = 256  # most entries of either half that wait for the other
 
 
 class ChunkLog:
-    """Writes each chunk of one episode once both halves are known, in whichever order they come; RecordingError."""
+    """Writer of each chunk of one episode when both halves are known, in either order. Raises RecordingError."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
@@ -20,17 +20,17 @@ class ChunkLog:
         self._merged: dict[int, ChunkMerged] = {}
 
     def add_answer(self, answer: PolicyAnswer) -> None:
-        """A chunk as the policy gave it."""
+        """Add a chunk as the policy returned it."""
         merged = self._merged.pop(answer.chunk_id, None)
         if merged is not None:
             self._write(answer, merged)
             return
         self._answers[answer.chunk_id] = answer
-        if len(self._answers) > _KEPT:  # the oldest never came to control
+        if len(self._answers) > _KEPT:  # the oldest never reached control
             self._write(self._answers.pop(next(iter(self._answers))), None)
 
     def add_merge(self, merged: ChunkMerged) -> None:
-        """Place that control gave a chunk."""
+        """Add the placement of a chunk by control."""
         answer = self._answers.pop(merged.chunk_id, None)
         if answer is not None:
             self._write(answer, merged)
@@ -38,14 +38,14 @@ class ChunkLog:
             self._merged[merged.chunk_id] = merged
 
     def flush(self) -> None:
-        """Write the chunks that never came to control."""
+        """Write the chunks that never reached control."""
         for answer in list(self._answers.values()):
             self._write(answer, None)
 
     def _write(self, answer: PolicyAnswer, merged: ChunkMerged | None) -> None:
         targets = np.full(len(answer.actions), -1, np.int64)
         if merged is not None:
-            # A row of the policy counts for the first step that was made from it.
+            # A row of the policy belongs to the first step that was made from it.
             for step, row in zip(merged.targets[::-1], answer.source_rows[::-1], strict=True):
                 targets[row] = step
         metres, radians, flags = _met(answer)
@@ -71,9 +71,9 @@ class ChunkLog:
 
 
 def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
-    """IK errors of each row [H, arms] of the policy: the worst [m, rad] and all flags of its steps.
+    """Return the IK errors [m], [rad] and flags of each policy row [H, arms], the worst of its steps.
 
-    NaN and no flag for a row that no step was made of, None for a chunk of joints.
+    A row without steps has NaN and no flags; None for a chunk of joints.
     """
     errors, flags = (answer.position_error, answer.rotation_error), answer.ik_flags
     if errors[0] is None or errors[1] is None or flags is None:

@@ -1,4 +1,4 @@
-"""Episodes that the last start of a station left open."""
+"""Repair of episodes that the previous start of a station left open."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ log = logging.getLogger(__name__)
 
 
 def start_repair(root: Path, station: str, repaired: Callable[[Path], None]) -> None:
-    """On a thread: what is to be received and recorded now does not wait for what was left."""
+    """Start the repair on a thread, so that new observations and recordings do not wait for it."""
     given = (find_open_episodes(root), station, repaired)
     threading.Thread(target=repair_open_episodes, args=given, name="repair", daemon=True).start()
 
 
 def find_open_episodes(root: Path) -> list[Path]:
-    """The folders of episodes without an outcome, to be found before the first new one begins."""
+    """Return the folders of episodes without an outcome. Call it before the first new episode begins."""
     folders = [manifest.parent for manifest in root.glob("*/manifest.json")]
     return [folder for folder in folders if not os.path.exists(folder / "outcome.json")]
 
@@ -30,10 +30,10 @@ def find_open_episodes(root: Path) -> list[Path]:
 def repair_open_episodes(
     folders: list[Path], station: str, repaired: Callable[[Path], None] = lambda folder: None
 ) -> None:
-    """Close what the last start of `station` left open: nobody else writes its episodes.
+    """Repair the episodes that the previous start of `station` left open; no other process writes them.
 
-    `repaired` hears of each one that is whole again. One that cannot be repaired is left as it is, for
-    `python -m runtime.recording repair` and a person.
+    `repaired` is called with each folder that is complete again. An episode that cannot be repaired is left as it is,
+    for `python -m runtime.recording repair` and a person.
     """
     for folder in folders:
         if _station_of(folder / "manifest.json") != station:
@@ -46,7 +46,7 @@ def repair_open_episodes(
                 repaired(folder)
         except RecordingError as error:
             log.error("episode %s was left open and stays as it is: %s", folder.name, error)
-        except Exception:  # of a file that nobody foresaw: it must not keep the others
+        except Exception:  # an unforeseen file must not prevent the repair of the others
             log.exception("episode %s was left open and stays as it is", folder.name)
 
 

@@ -1,4 +1,4 @@
-"""Closing of an episode: here and now, or beside the work."""
+"""Closing of an episode: immediately, or on a thread."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ Close = Callable[[], ClosedEpisode]
 
 
 def at_once(close: Close) -> Future[ClosedEpisode]:
-    """Close an episode here and now, as lockstep does."""
+    """Close an episode immediately, as lockstep does."""
     done: Future[ClosedEpisode] = Future()
     done.set_result(close())
     return done
 
 
 def in_background(close: Close) -> Future[ClosedEpisode]:
-    """Close an episode on a thread of its own, so that a slow disk stops nothing else."""
+    """Close an episode on a thread of its own, so that a slow disk delays nothing else."""
     done: Future[ClosedEpisode] = Future()
 
     def run() -> None:
         try:
             done.set_result(close())
-        except Exception as error:  # raised where the result is asked for
+        except Exception as error:  # raised by the future's result
             done.set_exception(error)
 
     threading.Thread(target=run, name="closing", daemon=True).start()

@@ -1,4 +1,4 @@
-"""Closed episodes are exported by a process of lowest priority: nothing that is received or sent waits for it."""
+"""Export of closed episodes by a child process of lowest priority, for which nothing else waits."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _LOOK_S = 0.02
 
 
 class ExportQueue:
-    """Exports into one data folder, one episode after the other; its process ends with ours, however that ends.
+    """Queue of exports into one data folder, one at a time; the child process ends with this one.
 
-    Where exports are not `wanted` it does nothing.
+    Without `wanted` it does nothing.
     """
 
     def __init__(self, data: Path, wanted: bool = True) -> None:
@@ -27,7 +27,7 @@ class ExportQueue:
         self._thread: threading.Thread | None = None
 
     def submit(self, folder: Path) -> None:
-        """Export the closed episode in `folder` in its turn; returns at once, what goes wrong is logged."""
+        """Queue the closed episode in `folder`; returns at once. Errors are logged."""
         if not self._wanted:
             return
         self._waiting.put(folder)
@@ -36,7 +36,7 @@ class ExportQueue:
             self._thread.start()
 
     def finish(self, seconds: float) -> None:
-        """Wait for what has been asked for, at most so long; the rest is exported when it is asked for again."""
+        """Wait for the queued exports, at most `seconds` [s]; the others are made when they are requested again."""
         deadline = time.monotonic() + seconds
         while self._waiting.unfinished_tasks and time.monotonic() < deadline:
             time.sleep(_LOOK_S)
@@ -63,12 +63,12 @@ class ExportQueue:
                 str(self._data),
                 "--background",
             ),
-            stdin=subprocess.PIPE,  # its end is ours
+            stdin=subprocess.PIPE,  # the child ends when we close it
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
         )
         assert child.stderr is not None
-        said = child.stderr.read().strip()  # not communicate(), which would close its standard input
+        said = child.stderr.read().strip()  # communicate() would close its standard input, which ends it
         if child.wait():
             log.error("%s is not exported: %s", folder, said or f"its process ended with {child.returncode}")

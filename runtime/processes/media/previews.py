@@ -15,9 +15,9 @@ from runtime.station.spec import StationSpec
 
 
 class Previews:
-    """Shows each new picture small to who looks, at most `bus.preview_rate` times a second and camera.
+    """Publisher of new pictures, scaled down, at most `bus.preview_rate` times per second and camera.
 
-    One that only stands in further observations is not shown again: who looks sees it grow old.
+    A picture that is merely repeated in later observations is not published again, so viewers see its age grow.
     """
 
     def __init__(self, spec: StationSpec) -> None:
@@ -27,9 +27,9 @@ class Previews:
         self._period = 1.0 / settings.preview_rate if settings.preview_rate else float("inf")
         self._height = settings.preview_height
         self._due: dict[str, float] = {}
-        self._shown: dict[str, float] = {}  # when each camera's last one was captured
+        self._shown: dict[str, float] = {}  # capture time of each camera's last preview
         self._newest: Observation | None = None
-        cv2.setNumThreads(1)  # the other cores belong to the rest of the family
+        cv2.setNumThreads(1)  # other cores belong to the other station processes
         self._endpoints = Endpoints(folder)
         self._write_endpoints()
 
@@ -38,15 +38,15 @@ class Previews:
 
     @property
     def socket(self) -> zmq.Socket[Any]:
-        """Can be read when somebody begins to look, or no longer does."""
+        """Socket that becomes readable when the set of viewers changes."""
         socket: zmq.Socket[Any] = self._publisher.socket
         return socket
 
     def wanted(self) -> bool:
-        """True if somebody looks; to be asked five times a second: looks whether they can connect."""
+        """Return True if there are viewers. Call it five times a second: it also repairs an unreachable socket."""
         if self._publisher.rebind_if_unreachable():
             self._write_endpoints()
-        for topic in self._publisher.hear():  # who begins to look sees what there is
+        for topic in self._publisher.hear():  # a new viewer gets the newest pictures
             self._due = {
                 name: due for name, due in self._due.items() if not f"camera/{name}".startswith(topic)
             }
@@ -64,17 +64,17 @@ class Previews:
                 continue
             if (
                 picture := observation.pictures.get(camera)
-            ) is None:  # overwritten: the next one comes at once
+            ) is None:  # overwritten; the next picture follows soon
                 continue
             self._shown[camera] = captured
-            # A little early counts, so that 15 of 30 pictures a second are shown and not 10.
+            # Slightly early, so that 15 of 30 pictures per second are shown and not 10.
             self._due[camera] = observation.arrived + 0.9 * self._period
             self._publisher.publish(
                 f"camera/{camera}", simplejpeg.encode_jpeg(self._small(picture), quality=80)
             )
 
     def republish(self) -> None:
-        """Show the newest of each camera once more: time stands still, and who begins to look now sees them too."""
+        """Publish the newest pictures again, because time is paused and new viewers would receive none."""
         self._due.clear()
         self._shown.clear()
         if self._newest is not None:
@@ -85,7 +85,7 @@ class Previews:
         self._publisher.close()
 
     def _small(self, picture: UInt8) -> UInt8:
-        """By a whole factor, each pixel the mean of those that it stands for."""
+        """Scale down by a whole factor; each pixel is the mean of those that it replaces."""
         factor = max(1, picture.shape[0] // self._height)
         size = (-(-picture.shape[1] // factor), -(-picture.shape[0] // factor))
         return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

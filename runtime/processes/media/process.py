@@ -1,4 +1,4 @@
-"""The process that records, and makes previews; the one writer of an episode."""
+"""Media process: the only writer of episodes, and source of previews."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _SUCCESS = fixed("media.success", "success")
 _NO_SUCCESS = fixed("media.no_success", "no success")
 _TRUTH = Pattern("media.truth", "the simulated bench says: {how}")
 _SUPERVISOR_ENDED = fixed("media.supervisor_ended", "the station's supervisor ended")
-# Of a deployment, what others make: what is wrong with its modules costs no recording.
+# Packages of a deployment that others may write: a fault in their modules must not cost a recording.
 _UNREAD = (
     "runtime.policies",
     "runtime.teleoperators",
@@ -73,14 +73,16 @@ _UNREAD = (
     "runtime.strategies",
 )
 _REPORT_PERIOD = 0.2
-_PERIOD_S = 0.002  # between two looks at what the family says, while there is something to record
-_LAST_S = 8.0  # for the last episode, before the supervisor's patience ends
-_EXPORT_S = 3.0  # of it, for the exports that are under way; the worker, or a person, makes up for them
-_CLOSING_S = 1.0  # how long a new episode waits for the one before it; longer is a disk in trouble
+_PERIOD_S = 0.002  # polling period while something is recorded [s]
+_LAST_S = 8.0  # for the last episode; less than the supervisor's patience [s]
+_EXPORT_S = 3.0  # part of that for running exports [s]; a worker or a person makes the missing ones
+_CLOSING_S = (
+    1.0  # a new episode waits at most this long for the previous one [s]; longer means a disk in trouble
+)
 
 
 class Media:
-    """One `digest` writes down what there is; lockstep calls it tick by tick."""
+    """Recorder and previews of one station; `poll` handles all messages that wait. Lockstep calls it tick by tick."""
 
     def __init__(
         self,
@@ -96,15 +98,15 @@ class Media:
         self._clock = clock
         self._preview = preview
         self._closer = closer
-        self._on_disk = on_disk  # hears of every episode that was closed
+        self._on_disk = on_disk  # called with every closed episode
         self._unclosed = UnclosedEpisodes(closer, clock.now)
         self._closing: Future[ClosedEpisode] | None = None
         self._closing_uuid = ""
-        self._waiting: BeginEpisode | None = None  # for the episode before it to be closed
+        self._waiting: BeginEpisode | None = None  # request that waits until the previous episode is closed
         self._waiting_since = 0.0
-        self._opened: EpisodeOpened | None = None  # the coordinator is told when the source has begun the run
-        self._newest = 0  # number of the newest observation
-        self._truth: Mapping[str, Any] = {}  # of a simulated bench, as its node last said it
+        self._opened: EpisodeOpened | None = None  # sent to the coordinator when the source has begun the run
+        self._newest = 0  # sequence of the newest observation
+        self._truth: Mapping[str, Any] = {}  # ground truth of a simulated bench, as last reported
         self._next_report = 0.0
         self._generation = shared.generation("coordinator")
         for ring in ("observations", "minutes", "ticks"):
@@ -118,20 +120,20 @@ class Media:
 
     @property
     def closing(self) -> bool:
-        """True if the last episode is still being closed."""
+        """True while the last episode is being closed."""
         return self._closing is not None
 
     @property
     def rests(self) -> bool:
-        """True while nothing is recorded, begun or closed: what is observed or asked for wakes media."""
+        """True while nothing is recorded, begun or closed; then messages wake the process."""
         going_on = self.recording, self.closing, self._waiting is not None, self._opened is not None
         return not any(going_on)
 
     def poll(self) -> None:
-        """Write down what reception, control and the coordinator have posted."""
+        """Handle all messages of reception, control and the coordinator."""
         died = (
             self._shared_state.generation("coordinator") != self._generation
-        )  # all that it said is in the rings
+        )  # all its messages are in the rings
         if died and self._waiting is not None and self._waiting.generation == self._generation:
             self._waiting = None
         self.report_closed()
@@ -150,7 +152,7 @@ class Media:
             self.report()
 
     def _end_orphaned_episode(self) -> None:
-        """End what a coordinator asked for that has died: the next one knows nothing of it. What it said is heard."""
+        """End the episode of a coordinator that has died, after its last messages; its successor does not know it."""
         generation = self._shared_state.generation("coordinator")
         if generation != self._generation:
             self._drain("ticks")
@@ -165,10 +167,10 @@ class Media:
         for payload in self._shared_state.rings[ring].drain():
             self._dispatch(decode(payload))
             if self._waiting is not None and ring == "minutes":
-                return  # what follows belongs to an episode that has not begun
+                return  # later messages belong to an episode that has not begun
 
     def _ready_to_begin(self) -> bool:
-        """Begin what has waited for long enough; False where it has to wait on."""
+        """Begin a request that has waited long enough; return False if it must continue to wait."""
         waiting = self._waiting
         if waiting is None:
             return True
@@ -189,7 +191,7 @@ class Media:
         if isinstance(message, Observed):
             self._observe(message)
         elif isinstance(message, TickDone):
-            if message.sequence > self._newest:  # it was handed on before the tick could see it
+            if message.sequence > self._newest:  # observations reach the ring before the tick that used them
                 self._drain("observations")
             recorder.add_tick(message)
         elif isinstance(message, ChunkMerged):
@@ -199,7 +201,7 @@ class Media:
         elif isinstance(message, Event):
             recorder.add_event(event_row(message))
         elif isinstance(message, BeginEpisode):
-            self._end_orphaned_episode()  # it may have died, and the next one asked, since this digest began
+            self._end_orphaned_episode()  # the coordinator may have died and been replaced since this poll began
             if message.generation != self._generation:
                 log.warning("run %d of a coordinator that has died is not recorded", message.run)
                 return
@@ -211,7 +213,7 @@ class Media:
         elif isinstance(message, RunBegun):
             self._run_begun(message)
         elif isinstance(message, EndEpisode):
-            self._drain("ticks")  # those that control did before the coordinator decided to end
+            self._drain("ticks")  # ticks that control ran before the coordinator decided to end
             self._emit_truth(message.details.get("reached") or {})
             self.end(message.status, message.reason, message.details)
             self._opened = None
@@ -224,7 +226,7 @@ class Media:
         self._preview(observation)
 
     def _begin(self, message: BeginEpisode) -> None:
-        self._shared_state.set_unrecorded(False)  # before anybody hears that it has begun
+        self._shared_state.set_unrecorded(False)  # before the start is announced
         opened = EpisodeOpened(message.run, "", "")
         if message.manifest is not None:
             with self._shared_state.recorder_stage(RecorderStage.OPENING):
@@ -240,7 +242,7 @@ class Media:
             error = _STILL_WRITING
             return EpisodeOpened(run, "", "", error)
         try:
-            # With its pictures as they are now: those of an earlier one may be overwritten by the time they are read.
+            # With its present pictures: those of an earlier observation may be overwritten before they are read.
             if (newest := self._shared_state.read_observation(self._shared_state.layout.cameras)) is not None:
                 self._recorder.add_observation(newest)
             identity, path = self._recorder.begin(manifest, run)
@@ -249,7 +251,7 @@ class Media:
         return EpisodeOpened(run, identity, str(path))
 
     def _run_begun(self, message: RunBegun) -> None:
-        """The source has: its first frame is here, and the run's first tick sees it."""
+        """Report the open episode: the source has begun, and its first frame is in the run's first tick."""
         opened = self._opened
         if opened is not None and message == RunBegun(opened.run, self._generation):
             self._send(opened)
@@ -260,7 +262,7 @@ class Media:
             log.warning("reception does not read: %s lost", type(message).__name__)
 
     def end(self, status: str, reason: str, details: Mapping[str, Any] | None = None) -> None:
-        """Close the open episode, if there is one; the coordinator is told when that is done."""
+        """Close the open episode, if there is one; the coordinator is informed when that is done."""
         if self._recorder.recording:
             self._closing_uuid = self._recorder.recording
             with self._shared_state.recorder_stage(RecorderStage.CLOSING):
@@ -268,7 +270,7 @@ class Media:
             self.report_closed()
 
     def finish(self, seconds: float) -> None:
-        """Wait for an episode that is being closed, at most so long; what is missing then, repair completes."""
+        """Wait at most `seconds` [s] for an episode that is being closed; repair completes it otherwise."""
         if self._closing is not None:
             wait([self._closing], seconds)
             self.report_closed()
@@ -280,7 +282,7 @@ class Media:
             log.error("episode %s has no outcome, the next start completes it: %s", uuid, why)
 
     def report_closed(self) -> None:
-        """Tell the coordinator of episodes that have been closed, at last or at once."""
+        """Inform the coordinator of episodes that have been closed."""
         if (late := self._unclosed.poll()) is not None:
             self._closed(late)
         if self._closing is None or not self._closing.done():
@@ -304,7 +306,7 @@ class Media:
         self.end("failed", str(error))
 
     def report(self) -> None:
-        """Tell the coordinator how it goes; done by itself five times a second."""
+        """Send the coordinator a report; `poll` does this five times a second."""
         recorder, now = self._recorder, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         recording = recorder.recording or self._closing_uuid  # until it is on disk
@@ -312,7 +314,7 @@ class Media:
         self._send(MediaReport(now, *told))
 
     def _emit_truth(self, reached: Mapping[str, float]) -> None:
-        """Report a simulated bench's end state and the times of its milestones: the episode's score."""
+        """Report the final state of a simulated bench and the times of its milestones: the episode's score."""
         truth = self._truth
         if truth:
             how = _SUCCESS if truth["success"] else _NO_SUCCESS
@@ -320,7 +322,7 @@ class Media:
             self._emit(Event("truth", _TRUTH(how=how), self._clock.now(), data=data))
 
     def _emit(self, event: Event) -> None:
-        """An event of media's own: to the coordinator, and into the episode."""
+        """Send an event of media to the coordinator, and record it in the episode."""
         self._send(event)
         self._dispatch(event)
 
@@ -330,7 +332,7 @@ class Media:
 
 
 def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = False) -> Recorder:
-    """The recorder of a deployment; `patient` waits for encoders, as lockstep may."""
+    """Create the recorder of a deployment; `patient` waits for encoders, for lockstep."""
     robot = spec.robot
     described = {
         "name": robot.name,
@@ -348,17 +350,17 @@ def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = F
 
 
 def main() -> None:
-    """Run media until the supervisor is gone."""
+    """Run media until the supervisor has ended."""
     heap.keep_freed_memory()
     descriptors.raise_file_limit()
     member = join_station("media", unread=_UNREAD)
     spec, shared = member.spec, member.shared
     clock = MonotonicClock()
     shared.beat("media", clock.now())
-    shared.set_unrecorded(False)  # a predecessor may have died with it
+    shared.set_unrecorded(False)  # a predecessor may have died with the flag set
     exports = ExportQueue(spec.deployment.data, spec.deployment.recording.export)
     start_repair(spec.deployment.episodes_dir, spec.deployment.station, exports.submit)
-    previews = LowPriorityWorker(Previews(spec))  # late on a busy machine, rather than what is recorded
+    previews = LowPriorityWorker(Previews(spec))  # previews may be late on a busy machine, recordings may not
     media = Media(shared, make_recorder(spec, clock.now), clock, previews, in_background, exports.submit)
     bell, rest = shared.bells["media"], rest_s(spec.deployment.control.heartbeat_timeout_s)
     try:

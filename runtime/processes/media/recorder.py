@@ -1,4 +1,4 @@
-"""Turns ticks, observations and answers into an episode: one row of the dataset grid per picture."""
+"""Recorder: turns ticks, observations and chunks into an episode with rows on the dataset grid."""
 
 from __future__ import annotations
 
@@ -33,16 +33,14 @@ _NO_OBSERVATION = fixed(
 )
 _NO_PICTURE = Pattern("recording.no_picture", "no picture has arrived from {cameras}")
 
-_OBSERVATIONS_KEPT = (
-    256  # ticks reach us within a few ms, after a stall of ours later; at 200 Hz this is a second
-)
+_OBSERVATIONS_KEPT = 256  # ticks arrive within a few ms, later after a stall; at 200 Hz this is one second
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetGrid:
-    """The robot's side of an episode: names, sizes and rates."""
+    """Robot and dataset grid of an episode: names, sizes and rates."""
 
-    robot: Mapping[str, Any]  # as the manifest has it
+    robot: Mapping[str, Any]  # in the form of the manifest
     cameras: tuple[str, ...]
     control_rate: float
     fps: float
@@ -52,7 +50,7 @@ class DatasetGrid:
 
 @dataclass(frozen=True, slots=True)
 class ClosedEpisode:
-    """A finished episode."""
+    """Finished episode."""
 
     uuid: str
     path: Path
@@ -60,15 +58,13 @@ class ClosedEpisode:
     reason: str
     rows: int
     error: str = ""
-    retry: Callable[[], ClosedEpisode] | None = (
-        None  # where its end waits for room on the disk: tries once more
-    )
+    retry: Callable[[], ClosedEpisode] | None = None  # if its end waits for room on the disk: tries again
 
 
 class Recorder:
-    """Samples on the dataset's grid: row k is the last tick not after k / fps since the first one recorded.
+    """Sampler on the dataset grid: row k is the last tick not later than k / fps after the first recorded tick.
 
-    A row that falls into a gap of missed ticks repeats the tick before it; its pictures are flagged repeats.
+    A row in a gap of missed ticks repeats the previous tick; its pictures are flagged repeats.
     """
 
     def __init__(self, journal: Journal, root: Path, grid: DatasetGrid, now: Callable[[], float]) -> None:
@@ -79,17 +75,20 @@ class Recorder:
         self._seen: deque[Observation] = deque(maxlen=_OBSERVATIONS_KEPT)
         self._uuid = ""
         self.rows = 0
-        self.repeated = 0  # pictures that rows of this episode had to repeat
+        self.repeated = 0  # number of pictures that rows of this episode repeated
 
     @property
     def recording(self) -> str:
-        """The uuid of the open episode, "" where none is."""
+        """uuid of the open episode, "" without one."""
         return self._uuid
 
     # --- the episode ---------------------------------------------------------------------------------------
 
     def begin(self, manifest: Mapping[str, Any], run: int) -> tuple[str, Path]:
-        """Open an episode; raises RecordingError. `run` 0 takes every tick, else those of that run alone."""
+        """Open an episode and return its uuid and folder. Raises RecordingError.
+
+        With `run` 0 it records every tick, else only those of that run.
+        """
         if self._uuid:
             raise RecordingError(_EPISODE_OPEN(episode=self._uuid))
         if not self._seen:
@@ -109,9 +108,9 @@ class Recorder:
         self._before: tuple[TickDone, Observation | None] | None = None
         self._complete = False
         self._news: list[Event] = []
-        self._applied: Float32 | None = None  # the newest action that the robot reported
-        self._lost: list[str] = []  # what was said of cameras whose video has ended
-        self._bench = ""  # what a simulated bench said of itself in the row before
+        self._applied: Float32 | None = None  # newest action that the robot reported
+        self._lost: list[str] = []  # sentences about cameras whose video has ended
+        self._bench = ""  # ground truth of a simulated bench in the previous row
         self._chunks = ChunkLog(self._journal)
         return identity, self._root / identity
 
@@ -136,10 +135,10 @@ class Recorder:
         }
 
     def end(self, status: Status, reason: str, details: Mapping[str, Any]) -> Callable[[], ClosedEpisode]:
-        """End the episode: nothing more is taken for it.
+        """End the episode: it accepts nothing more.
 
-        What is returned closes its files, on any thread, and may wait for the disk; until it is done no other
-        episode may begin. What could not be saved is named in `ClosedEpisode.error`.
+        The returned function closes its files, on any thread, and may wait for the disk; until it has returned no other
+        episode may begin. `ClosedEpisode.error` names the parts that could not be saved.
         """
         error, rows, lost = "", self.rows, self._lost
         identity, path = self._uuid, self._root / self._uuid
@@ -174,7 +173,7 @@ class Recorder:
         return partial(attempt, end_journal)
 
     def pop_events(self) -> list[Event]:
-        """Events of the open episode since the last call; they are in the episode already."""
+        """Return events of the open episode since the last call; they are already in its log."""
         if not self._uuid:
             return []
         for loss in self._journal.pop_lost_cameras():
@@ -185,29 +184,29 @@ class Recorder:
         told, self._news = self._news, []
         return told
 
-    # --- what comes in -------------------------------------------------------------------------------------
+    # --- input ---------------------------------------------------------------------------------------------
 
     def add_observation(self, observation: Observation) -> None:
-        """An observation from reception, before the record of a tick that has seen it."""
+        """Add an observation from reception, before the record of a tick that used it."""
         self._seen.append(observation)
 
     def add_event(self, event: Mapping[str, Any]) -> None:
-        """An event for the log; nothing where no episode is open."""
+        """Record an event, if an episode is open."""
         if self._uuid:
             self._journal.append_event(event)
 
     def add_answer(self, answer: PolicyAnswer) -> None:
-        """A chunk as the policy gave it."""
+        """Add a chunk as the policy returned it."""
         if self._uuid and answer.run == self._run:
             self._chunks.add_answer(answer)
 
     def add_merge(self, merged: ChunkMerged) -> None:
-        """Place that control gave a chunk; may come before the chunk itself."""
+        """Add the placement of a chunk by control, which may come before the chunk itself."""
         if self._uuid and merged.run == self._run:
             self._chunks.add_merge(merged)
 
     def add_tick(self, tick: TickDone) -> None:
-        """One control tick; writes the full-rate stream, and every row of the grid that is now known."""
+        """Record one control tick: the full-rate stream, and every grid row that is now known."""
         if not self._uuid or self._complete or (self._run and tick.run != self._run):
             return
         if self._schema.reported:
@@ -219,6 +218,7 @@ class Recorder:
             self._first_step = tick.step
         self._journal.append(_executed(tick))
         here = (tick, self._observation(tick.sequence))
+        # After a gap of missed ticks several rows may be complete; those within the gap repeat the tick before it.
         while (target := self._target(self.rows)) <= tick.step:
             chosen = here if target == tick.step or self._before is None else self._before
             self._write_row(*chosen)
@@ -226,9 +226,9 @@ class Recorder:
         self._complete = here[1] is not None and here[1].last
 
     def _reported_tick(self, tick: TickDone) -> TickDone | None:
-        """A tick of a robot that drives itself, as if we had sent what it reports; None before it reports anything.
+        """Return the tick with the action that a node-driven robot reported; None before its first report.
 
-        Where it reports nothing for this frame, the action is the one before, and nobody's.
+        If the node reported none for this frame, the last action is repeated with source "none".
         """
         seen = self._observation(tick.sequence)
         reported = None if seen is None else seen.reported_action
@@ -239,8 +239,9 @@ class Recorder:
         return replace(tick, executed=self._applied, source="none" if reported is None else "teleop")
 
     def _target(self, row: int) -> int:
-        """The step at or before which row `row` was sampled."""
+        """Return the step at or before which row `row` was sampled."""
         assert self._first_step is not None
+        # The tolerance prevents that rounding moves a row which falls exactly on a tick to the previous tick.
         return self._first_step + math.floor(row * self._grid.control_rate / self._grid.fps + 1e-9)
 
     def _observation(self, sequence: int) -> Observation | None:
@@ -250,7 +251,10 @@ class Recorder:
         return None
 
     def _write_row(self, tick: TickDone, seen: Observation | None) -> None:
-        """`seen` is what the tick saw, None where that is not known any more; its joints came with it."""
+        """Write one row; `seen` is the tick's observation, None if it is no longer available.
+
+        Joints come from the tick.
+        """
         action = tick.qpos if tick.executed is None else tick.executed
         measured = None if seen is None else seen.eef
         reported = None if seen is None else _reported_eef(seen, action)
@@ -269,7 +273,7 @@ class Recorder:
             action=action,
             captured={} if seen is None else seen.captured,
             pictures=pictures,
-            control_source=tick.source,  # type: ignore[arg-type]  # control writes nothing else
+            control_source=tick.source,  # type: ignore[arg-type]  # control sends only these sources
             qvel=None if seen is None else seen.qvel,
             effort=None if seen is None else seen.effort,
             eef=self._eef(measured, tick.qpos) if with_eef else None,
@@ -285,7 +289,7 @@ class Recorder:
         self.rows += 1
 
     def _bench_changed(self, seen: Observation | None) -> str | None:
-        """What a simulated bench says of itself where that is something new."""
+        """Return the ground truth of a simulated bench if it differs from the previous row, else None."""
         said = "" if seen is None or not seen.truth else truth_text(seen.truth)
         if not said or said == self._bench:
             return None
@@ -293,12 +297,12 @@ class Recorder:
         return said
 
     def _eef(self, told: Float32 | None, joints: Float32) -> Float32:
-        """Poses as the robot told them, else by forward kinematics."""
+        """Return the reported poses, else those of forward kinematics."""
         return self._grid.eef_of(joints) if told is None else told
 
 
 def _reported_eef(seen: Observation, action: Float32) -> Float32 | None:
-    """The poses that the robot reports for this very action; None where it reports another one, or none."""
+    """Return the poses that the robot reported for exactly this action; None otherwise."""
     if seen.reported_action is None or not np.array_equal(seen.reported_action, action):
         return None
     return seen.reported_action_eef

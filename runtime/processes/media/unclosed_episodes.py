@@ -1,4 +1,4 @@
-"""Episodes whose end found no room on the disk: tried again while the station lives, until there is some."""
+"""Episodes whose end did not fit on the disk: closed again and again until there is room."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from runtime.core.backoff import BackOff
 from runtime.processes.media.episode_closing import Close
 from runtime.processes.media.recorder import ClosedEpisode
 
-_FIRST_S, _MOST_S = 1.0, 30.0  # between two attempts, doubled each time
+_FIRST_S, _MOST_S = 1.0, 30.0  # pauses between attempts [s], doubled each time
 
 
 class UnclosedEpisodes:
-    """The oldest is tried first; a disk that takes its end takes the next one at once."""
+    """Queue of episodes to close, oldest first; after a success the next one is tried at once.
+
+    Call `poll` regularly.
+    """
 
     def __init__(self, closer: Callable[[Close], Future[ClosedEpisode]], now: Callable[[], float]) -> None:
         self._closer = closer
@@ -25,17 +28,17 @@ class UnclosedEpisodes:
 
     @property
     def errors(self) -> dict[str, str]:
-        """Error that each of them waits for to be over, by uuid."""
+        """Error of each waiting episode, by uuid."""
         return {episode.uuid: episode.error for episode in self._episodes}
 
     def add(self, episode: ClosedEpisode) -> None:
-        """One that has `again`."""
+        """Add an episode that has a `retry`."""
         if not self._episodes:
             self._back_off.record_failure(self._now())
         self._episodes.append(episode)
 
     def poll(self) -> ClosedEpisode | None:
-        """One that is closed now, None where none is; begins an attempt where one is due. Never waits for the disk."""
+        """Return an episode that is closed now, or None; start an attempt if one is due. Never waits for the disk."""
         if self._attempt is None and self._episodes and not self._back_off.remaining_delay(self._now()):
             again = self._episodes[0].retry
             assert again is not None
@@ -52,7 +55,7 @@ class UnclosedEpisodes:
         return None
 
     def finish(self, seconds: float) -> ClosedEpisode | None:
-        """Try once more, and wait at most so long; the same as `look`. What is left then, repair completes."""
+        """Try once more and wait at most `seconds` [s]; return as `poll`. Repair completes the others later."""
         self._back_off.reset()
         closed = self.poll()
         if closed is None and self._attempt is not None:

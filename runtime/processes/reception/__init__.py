@@ -1,1 +1,1 @@
-"""Process 5, receives every observation and puts it where the others find it."""
+"""Reception, process 5: receives every observation and puts it into shared state."""

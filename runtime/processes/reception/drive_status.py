@@ -1,4 +1,4 @@
-"""Drive state that a robot's node reports, frame by frame, and what is worth a line in the event log."""
+"""Drive state that a robot's node reports with each frame, and the changes that are worth an event."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ _DISABLED = fixed("drives.disabled", "drives disabled")
 _FAULT = Pattern("drives.fault", "drive fault: {fault}")
 _FAULT_GONE = Pattern("drives.fault_gone", "drive fault gone: {fault}")
 
-_QUIET_S = 0.2  # between two lines: a node that says something else in every frame floods no log
+_QUIET_S = 0.2  # shortest time between two events [s]: a node whose state flickers must not flood the log
 
 
 class DriveStatus:
-    """The newest state that was said: {"enabled": bool, "faults": [str]}, {} while the node does not say."""
+    """Newest reported drive state: {"enabled": bool, "faults": [str]}, {} if the node reports none."""
 
     def __init__(self) -> None:
         self.newest: Mapping[str, Any] = {}
-        self._enabled = True  # what is as it should be needs no line
+        self._enabled = True  # enabled drives are normal and need no event
         self._faults: tuple[str, ...] = ()
         self._told = -math.inf
 
     def update(self, said: Mapping[str, Any] | None, now: float) -> str:
-        """Take what one observation says; returns a sentence of what has changed since the last one, or "".
+        """Store the state of one observation; return a sentence about its changes, or "".
 
-        An observation that does not say is no change: one whose drive state could not be read is none either. A
-        change within 0.2 s of the last sentence is told after it, if it is still there.
+        An observation without a drive state is no change; its state may have been unreadable. A change within 0.2 s
+        of the last sentence is reported later, if it persists.
         """
         self.newest = said or {}
         if said is None or now - self._told < _QUIET_S:

@@ -1,4 +1,4 @@
-"""The process that receives every observation and puts it where control, the coordinator and media find it."""
+"""Reception process: receives every observation and puts it where control, the coordinator and media read it."""
 
 from __future__ import annotations
 
@@ -31,22 +31,24 @@ _CLASS_GIVEN_UP = Pattern(
     "receiving took more than a processor core for {seconds:g} s and gives its real-time class up: see "
     "what the robot's node and the cameras send; the class is back when the station is started anew",
 )
-# Of a deployment, what others make: what is wrong with its modules keeps nobody from seeing the robot.
+# Packages of a deployment that others may write: a fault in their modules must not prevent reception.
 _UNREAD = ("runtime.policies", "runtime.teleoperators", "runtime.kinematics", "runtime.strategies")
 _REPORT_PERIOD = 0.2
-_WAIT_S = 0.05  # at most for an observation, until media is heard again
-_RETRY_S = 1.0  # between two tries to connect
+_WAIT_S = 0.05  # longest wait for an observation, until media's messages are read again [s]
+_RETRY_S = 1.0  # pause between attempts to connect [s]
 _SHARE_S = 3.0
 
 
 class CpuShare:
-    """The processor time that this process takes, over and over for `_SHARE_S` seconds."""
+    """Processor time of this process, measured over periods of `_SHARE_S` seconds."""
 
     def __init__(self) -> None:
-        self._since: tuple[float, float] | None = None  # when, and what had been taken by then [s]
+        self._since: tuple[float, float] | None = (
+            None  # start of the period, and processor time at that moment [s]
+        )
 
     def exceeds_core(self, now: float, taken: float) -> bool:
-        """True if it was more than a core over the last whole stretch; `taken` since the start [s]."""
+        """Return True if the last whole period used more than one core; `taken` is the time since the start [s]."""
         since = self._since or (now, taken)
         if now - since[0] < _SHARE_S:
             self._since = since
@@ -56,32 +58,32 @@ class CpuShare:
 
 
 class Reception:
-    """One `pump` takes what there is; lockstep calls it tick by tick."""
+    """Reception of one station; `poll` handles all that waits. Lockstep calls it tick by tick."""
 
     def __init__(self, shared: SharedState, source: Source, clock: Clock, scheduling: str = "") -> None:
         self._shared_state = shared
         self._clock = clock
         self._scheduling = scheduling
         self._intake = ObservationReceiver(shared, source, clock, self._emit, self._hand_on)
-        self._begun: RunBegun | None = None  # media is not told yet
+        self._begun: RunBegun | None = None  # media has not been informed yet
         self._next_report = 0.0
-        self._missed = 0  # observations that media had no room for
+        self._missed = 0  # observations for which media had no room
         for _ in shared.rings["source"].drain():
             pass  # addressed to a predecessor that died
 
     def poll(self, timeout: float) -> None:
-        """Obey media, take one observation if there is one within `timeout` seconds, report when it is time."""
+        """Handle media's commands, receive one observation within `timeout` [s], and send a report if it is due."""
         self.poll_commands()
         self._intake.poll(timeout)
         self._report_in_time()
 
     def poll_disconnected(self) -> None:
-        """The same without an observation: the source is not connected."""
+        """Do the same without an observation, because the source is not connected."""
         self.poll_commands()
         self._report_in_time()
 
     def leave_realtime(self) -> None:
-        """No real-time class any more: what comes in would take the processors from guard and coordinator."""
+        """Leave the real-time class, because the incoming data would block guard and coordinator."""
         realtime.leave_realtime_all()
         self._scheduling = "ordinary"
         text = _CLASS_GIVEN_UP(seconds=_SHARE_S)
@@ -92,7 +94,7 @@ class Reception:
             self.report()
 
     def poll_commands(self) -> bool:
-        """Let the source begin its run, or end it, as media says; whether a run has begun."""
+        """Start or end the source's run as media requests; return True if a run has begun."""
         for payload in self._shared_state.rings["source"].drain():
             message = decode(payload)
             if isinstance(message, BeginRun):
@@ -106,7 +108,7 @@ class Reception:
         return True
 
     def report(self) -> None:
-        """Tell the coordinator how it goes; done by itself five times a second."""
+        """Send the coordinator a report; `poll` does this five times a second."""
         intake, now = self._intake, self._clock.now()
         self._next_report = now + _REPORT_PERIOD
         faults, rates = intake.faults(), intake.rates()
@@ -114,7 +116,7 @@ class Reception:
         self._send(ReceptionReport(now, rates, faults, *told))
 
     def _hand_on(self, observation: Observation, numbers: Mapping[str, int]) -> None:
-        """To media, before anybody else can see it: what a tick has seen is known there."""
+        """Send an observation to media before other processes can read it, so that media has those of all ticks."""
         if self._record(as_message(observation, numbers)):
             self._missed = 0
             return
@@ -123,7 +125,7 @@ class Reception:
             log.warning("media does not read: rows miss what is observed now")
 
     def _emit(self, event: Event) -> None:
-        """An event of reception's own: to the coordinator, and into the episode."""
+        """Send an event of reception to the coordinator, and to media for the episode."""
         self._send(event)
         if not self._record(event):
             log.warning("media does not read: %s is missing from the record", event.kind)
@@ -139,10 +141,10 @@ class Reception:
 def make_source(
     spec: StationSpec, clock: Clock, build: Callable[[Any, Robot, Clock], Source] | None = None
 ) -> Source:
-    """The observations, not yet connected: the transport's, with the cameras of the deployment's own.
+    """Create the source, not yet connected: the transport's, with the deployment's own cameras added.
 
-    The transport is told of a robot without these: it must not wait for them. What it leaves out itself stays.
-    `build` stands in for that of the transport's kind.
+    The transport gets a robot without these cameras, because it must not wait for them. Cameras that it omits by
+    itself stay. `build` replaces the constructor of the transport's kind.
     """
     settings = spec.deployment
     own = settings.cameras.keys() & set(delivered_cameras(settings, spec.robot))
@@ -157,12 +159,12 @@ def make_source(
 
 
 def main() -> None:
-    """Receive until the supervisor is gone, and control with it."""
+    """Receive until the supervisor has ended, and control with it."""
     heap.keep_freed_memory()
     member = join_station("reception", unread=_UNREAD)
     shared, clock = member.shared, MonotonicClock()
     shared.beat("reception", clock.now())
-    scheduling = _scheduling(member.spec)  # before there are other threads, which are to have the same
+    scheduling = _scheduling(member.spec)  # before other threads exist, which inherit the class
     log.info("receiving, scheduling %s", scheduling)
     source = make_source(member.spec, clock)
     reception = Reception(shared, source, clock, scheduling)
@@ -186,7 +188,7 @@ def main() -> None:
 
 
 def _scheduling(spec: StationSpec) -> str:
-    """The class that this process got; it asks for one only where what it sees is a robot."""
+    """Return the obtained scheduling class; the real-time class is requested only if the source is a robot."""
     settings = spec.deployment.control
     if settings.realtime == "off" or not spec.capabilities.moves_robot:
         return "ordinary"
@@ -194,7 +196,7 @@ def _scheduling(spec: StationSpec) -> str:
 
 
 def _connected(source: Source) -> bool:
-    """Connect the source; False where it could not be, and the log says why."""
+    """Connect the source; return False, after logging the reason, if that fails."""
     try:
         source.connect()
     except RuntimeFault as error:

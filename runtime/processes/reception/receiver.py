@@ -1,4 +1,4 @@
-"""Receiver of observations into shared state, with their rates, faults, ages, drives and truth."""
+"""Receiver of observations into shared state, with their rates, faults, ages, drives and ground truth."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from runtime.transports.base import Source
 log = logging.getLogger(__name__)
 _BECAUSE = Pattern("reception.because", "{what}: {why}")
 _SOURCE_FAULT = Pattern("reception.source_fault", "source: {fault} ({count} so far)")
-_RATE_WINDOW = 40  # arrivals per stream
-_AGES_KEPT = 2000  # over a minute at 30 Hz
-_SILENT_S = 2.0  # after which a stream has no rate any more
-_REPEAT_S = 5.0  # between two events of one fault: thousands of lost frames are not thousands of lines
-_STANDING = "_unusable"  # ends the names of faults that are in every message of a node: said once in each run
+_RATE_WINDOW = 40  # number of arrivals per stream
+_AGES_KEPT = 2000  # number of ages: over a minute at 30 Hz
+_SILENT_S = 2.0  # [s]; after that a stream's rate is 0
+_REPEAT_S = 5.0  # shortest time between two events of one fault [s], against log floods
+_STANDING = "_unusable"  # suffix of faults that occur in every message of a node: reported once per run
 
 
 class ObservationReceiver:
-    """The way of an observation: pictures into their slots, `hand_on` with their numbers, numbers into shared state.
+    """Path of an observation: pictures into shared slots, `hand_on` with their numbers, then publication.
 
-    Numbers of observations and of pictures go on where a predecessor in the same page ended. `truth` is what a
-    simulated bench last said of itself. Events are given to `say`.
+    Numbers of observations and pictures continue those of a predecessor in the same shared state. `truth` is the last
+    reported ground truth of a simulated bench. Events are passed to `say`.
     """
 
     def __init__(
@@ -50,12 +50,12 @@ class ObservationReceiver:
         self._source = source
         self._clock = clock
         self._say, self._hand_on = say, hand_on
-        self._before = int(shared.observation.read()["sequence"])  # observations of predecessors
+        self._before = int(shared.observation.read()["sequence"])  # number of observations by predecessors
         self._numbers = {camera: slots.newest for camera, slots in shared.pictures.items()}
-        self._ages, self._aged = np.zeros(_AGES_KEPT), 0  # [s], and how many there ever were
+        self._ages, self._aged = np.zeros(_AGES_KEPT), 0  # [s], and their total number
         self._captured: dict[str, float] = {}
         self._arrivals: dict[str, deque[float]] = {}
-        self._faults: dict[str, int] = {}  # as they were last said
+        self._faults: dict[str, int] = {}  # counts in the last events
         self._said_at: dict[str, float] = {}
         self._too_large: Counter[str] = Counter()
         self._failure = ""
@@ -64,41 +64,43 @@ class ObservationReceiver:
 
     @property
     def drives(self) -> Mapping[str, Any]:
-        """Drive state that the node last reported; {} while it does not say."""
+        """Drive state that the node last reported; {} without one."""
         return self._drives.newest
 
     @property
     def cameras(self) -> Mapping[str, Any]:
-        """Health of each camera of the deployment's own."""
+        """Health of each camera that the deployment opens itself."""
         return self._source.camera_health()
 
     def poll(self, timeout: float) -> None:
-        """Take one observation if there is one within `timeout` seconds."""
+        """Receive one observation, waiting at most `timeout` [s]."""
         observation = self._receive(timeout)
         if observation is not None:
             self._accept(observation)
 
     def begin_run(self) -> None:
-        """The source begins a run; its first frame is taken here, so that the run's first tick sees it."""
+        """Start the source's run, and receive its first frame so that the run's first tick uses it."""
         self._source.begin_run()
         self._said_at = {name: at for name, at in self._said_at.items() if not name.endswith(_STANDING)}
-        self._captured.clear()  # its pictures are new ones, even where time stands still between two frames
+        self._captured.clear()  # pictures are new although time may be paused between two frames
         self.poll(0.0)
 
     def end_run(self) -> None:
-        """Tell the source that the run is over."""
+        """End the source's run."""
         self._source.end_run()
 
     def faults(self) -> dict[str, int]:
-        """Counts of faults; one that has grown is an event, each fault's 5 s apart, and so is news.
+        """Return the counts of faults; emit an event for each count that has grown, at most every 5 s per fault.
 
-        What a node never sends in a usable form is an event once in each run.
+        A fault of every message of a node is an event once per run.
         """
         for event in self._source.pop_events():
             self._say(event)
         now, faults = self._clock.now(), {**self._source.faults(), **self._too_large}
         for name, count in faults.items():
-            known = self._faults[name] = min(count, self._faults.get(name, 0))  # a source begins anew at 0
+            known = self._faults[name] = min(
+                count, self._faults.get(name, 0)
+            )  # a restarted source counts from 0
             again = math.inf if name.endswith(_STANDING) else _REPEAT_S
             if count > known and now - self._said_at.get(name, -math.inf) >= again:
                 self._faults[name], self._said_at[name] = count, now
@@ -110,12 +112,12 @@ class ObservationReceiver:
         return faults
 
     def rates(self) -> dict[str, float]:
-        """Arrivals per second [Hz] by stream, over the newest 40; 0 after 2 s of silence."""
+        """Return the arrival rate of each stream over the newest 40 [Hz]; 0 after 2 s of silence."""
         now = self._clock.now()
         return {stream: _rate(times, now) for stream, times in self._arrivals.items()}
 
     def age_ms(self) -> dict[str, float]:
-        """Age of joints when they came into shared state: p50, p99 and max of the newest 2000 [ms]."""
+        """Return the age of joints when published: p50, p99 and max of the newest 2000 [ms]."""
         if not self._aged:
             return {}
         ages = self._ages[: min(self._aged, _AGES_KEPT)]
@@ -123,7 +125,7 @@ class ObservationReceiver:
         return {"p50": p50, "p99": p99, "max": worst}
 
     def _receive(self, timeout: float) -> Observation | None:
-        """Observation from the source; a failure is said once, and control holds when what it sees is old."""
+        """Receive from the source; a failure is reported once. Control then holds because joints become too old."""
         try:
             observation = self._source.receive(timeout)
         except TransportError as error:
@@ -139,6 +141,8 @@ class ObservationReceiver:
 
     def _accept(self, given: Observation) -> None:
         observation = self._drop_unknown_images(given)
+        # The order matters: pictures are in their slots before their numbers are published, and media has an
+        # observation before a tick can use it.
         for camera, picture in observation.pictures.items():
             captured = observation.captured.get(camera, observation.arrived)
             if captured != self._captured.get(camera):
@@ -156,7 +160,7 @@ class ObservationReceiver:
         self._aged += 1
 
     def _drop_unknown_images(self, observation: Observation) -> Observation:
-        """With its number in the page; without pictures of other cameras, or that have no room there."""
+        """Return it numbered for shared state, without pictures of unknown cameras and those that are too large."""
         most = self._shared_state.layout.picture_bytes
         ours = {camera: seen for camera, seen in observation.pictures.items() if camera in self._numbers}
         large = {camera for camera, picture in ours.items() if picture.nbytes > most}

@@ -1,1 +1,1 @@
-"""Parent of a station's processes: starts them, and starts again what dies."""
+"""Parent of a station's processes, which starts them and restarts those that die."""

@@ -1,4 +1,4 @@
-"""A process beside the family that may die without ending it: started again, less and less often."""
+"""Optional child process of a station, which may die without ending it and is restarted with back-off."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import time
 from collections.abc import Callable
 
 log = logging.getLogger(__name__)
-SHORTEST_S, LONGEST_S = 1.0, 30.0  # between two starts
-_STEADY_S = 60.0  # who lives that long has earned the shortest wait again
+SHORTEST_S, LONGEST_S = 1.0, 30.0  # shortest and longest pause before a restart [s]
+_STEADY_S = 60.0  # run time that resets the pause [s]
 
 
 class OptionalChild:
-    """`look` starts it again where it has ended; the robot does not depend on it."""
+    """Child process that is restarted with exponential back-off; a steady run resets it. Call `poll` regularly.
+
+    The robot does not depend on it.
+    """
 
     def __init__(
         self,
@@ -23,14 +26,14 @@ class OptionalChild:
     ) -> None:
         self._name, self._start, self._now = name, start, now
         self._pause = SHORTEST_S
-        self._due: float | None = None  # when it is started again
+        self._due: float | None = None  # time of the next start
         self._begin()
 
     def _begin(self) -> None:
         self.process, self._begun, self._due = self._start(), self._now(), None
 
     def poll(self) -> None:
-        """See whether it lives; start it again where its time has come."""
+        """Check whether it runs; restart it when its pause is over."""
         if self._due is not None:
             if self._now() >= self._due:
                 self._begin()

@@ -1,4 +1,4 @@
-"""The family's parent: starts the five processes, restarts what dies, ends what must end."""
+"""Supervisor of a station: starts the five processes, restarts those that die, and ends them."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ _MODULES = {
     "headless": "runtime.clients.headless",
 }
 _START_ORDER = ("guard", "reception", "media", "control", "coordinator")
-# Beside the family.
+# Optional companions.
 _CHANNEL, _LINK, _PANEL = "runtime.clients.channel", "runtime.link", "runtime.clients.panel"
 MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
-_PATIENCE_S = 9.0  # after the lifeline is cut; then what is left is killed
-_DRIVER_PATIENCE_S = 2.0  # for what drives a headless run, after it was told to end
-_LOOK_S = 0.2  # between two looks at what is beside the family
+_PATIENCE_S = 9.0  # time for children after the lifeline is cut [s]; then they are killed
+_DRIVER_PATIENCE_S = 2.0  # time for the driver of a headless run after its termination [s]
+_LOOK_S = 0.2  # period of checks for companions [s]
 
 
 class Supervisor:
-    """One family; everything it starts ends with it, however it ends."""
+    """Supervisor of one station; everything that it starts ends with it, however it ends."""
 
     def __init__(self, spec: StationSpec, lifeline: Lifeline | None = None) -> None:
         self._plan = spec
-        self._lifeline = lifeline  # of our own parent, where it wants us to end with it
+        self._lifeline = lifeline  # of a parent that wants this process to end with it
         self._station_dir = spec.deployment.station_dir
         self._endpoints = Endpoints(self._station_dir)
         self._environment = program_environment(os.environ)
@@ -63,22 +63,22 @@ class Supervisor:
         self.boot = str(uuid.uuid4())
 
     def run(self, headless: bool) -> int:
-        """Start, watch until a signal or the end of a headless run, end; returns the exit code."""
+        """Run the station until a signal or the end of a headless run; return the exit code."""
         lock = acquire_station_lock(self._plan.deployment)
         try:
             self._resolved = self._write_resolved()
         except OSError as error:
             raise unwritable_error(self._plan.deployment, error) from None
         self._endpoints.prepare()
-        Key(self._station_dir).secret()  # what is wrong with it is said before anything moves
+        Key(self._station_dir).secret()  # errors of the key are reported before anything moves
         self._shared_state, self._page_fd = SharedState.create(self._plan.layout)
         self._bells, self._signalled = [Bell.made() for _ in WOKEN], Bell.made()
-        # Children hold the reading end as their standard input: it ends when this process does, however it does.
+        # Children have the reading end as standard input: it closes when this process ends, however it ends.
         self._lifeline_out, self._lifeline_in = os.pipe()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._on_signal)
         try:
-            if headless:  # its output is for a person: what matters, without the log of every process
+            if headless:  # the terminal is for a person, so without the log of every process
                 self._environment.setdefault("EVA_LOG_LEVEL", "WARNING")
             for process in _START_ORDER:
                 self._start(process)
@@ -101,7 +101,7 @@ class Supervisor:
         return path
 
     def _start(self, process: str) -> None:
-        self._shared_state.beat(process, 0.0)  # not alive until it says so itself
+        self._shared_state.beat(process, 0.0)  # not alive before its own first heartbeat
         self._shared_state.set_generation(process, self._shared_state.generation(process) + 1)
         self._children[process] = self._spawn(process)
         self._write_endpoints()
@@ -123,7 +123,7 @@ class Supervisor:
             stdin=self._lifeline_out,
             pass_fds=inherited,
             env=self._environment,
-            start_new_session=True,  # Ctrl-C reaches the supervisor alone, which ends them in order
+            start_new_session=True,  # Ctrl-C reaches only the supervisor, which ends the children in order
         )
 
     def _reader_arguments(self, process: str) -> tuple[str, ...]:
@@ -135,7 +135,7 @@ class Supervisor:
         )
 
     def _guard_arguments(self) -> tuple[str, ...]:
-        """Values alone: the guard reads no deployment, which could name what fails to load."""
+        """Return plain values: the guard reads no deployment, because that may name modules that fail to load."""
         spec, control = self._plan, self._plan.deployment.control
         punctual = control.realtime == "auto" and spec.capabilities.moves_robot
         return (
@@ -146,7 +146,7 @@ class Supervisor:
         )
 
     def _spawn_companion(self, module: str) -> subprocess.Popen[bytes]:
-        """Control channel, link to a lab, panel: clients like any other, without a part in the shared state."""
+        """Start a companion (control channel, link to a lab, panel): a client without access to shared state."""
         station, data = self._plan.deployment.station, str(self._plan.deployment.data)
         return subprocess.Popen(
             [sys.executable, "-m", module, station, "--data-dir", data, "--lifeline"],
@@ -173,7 +173,7 @@ class Supervisor:
         return 130
 
     def _sleep(self) -> None:
-        """Until a process of the family ends, a signal comes, our own parent is gone, or it is time to look around."""
+        """Wait for the end of a child, a signal, the end of our own parent, or the next check."""
         children = [*self._children.values(), *([self._driver] if self._driver else [])]
         ends = [os.pidfd_open(child.pid) for child in children if child.returncode is None]
         try:
@@ -205,8 +205,10 @@ class Supervisor:
         self._signalled.ring()
 
     def _end(self) -> None:
-        """End the driver, which commands the others; cut the lifeline: each child closes its files, control holds
-        for its time; kill what does not end.
+        """End all children: first the driver, which commands the others, then the rest by cutting the lifeline.
+
+        Each child then closes its files, and control holds for its orphan time. Children that do not end in time are
+        killed.
         """
         if self._driver is not None and self._driver.poll() is None:
             self._driver.terminate()

@@ -1,1 +1,1 @@
-"""Common parts of both ROS transports: topics, reading of messages, alignment, commands."""
+"""Common parts of both ROS transports: topics, message decoding, alignment in time, commands."""

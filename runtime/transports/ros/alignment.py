@@ -1,4 +1,4 @@
-"""Brings streams of stamped messages together at one moment; knows nothing of what they carry."""
+"""Alignment of streams of stamped messages in time, independent of their content."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 Value = TypeVar("Value")
-DEPTH = 2000  # samples: two seconds of a stream at 1 kHz
+DEPTH = 2000  # [samples]; two seconds of a stream at 1 kHz
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,14 +29,14 @@ class Aligned(Generic[Value]):
 
 
 class Alignment(Generic[Value]):
-    """The newest messages of every stream; who reads takes nothing away, so there may be many readers.
+    """Newest messages of every stream, aligned on request. Reading removes nothing, so there may be many readers.
 
-    The moment of a frame is the newest that all streams have reached: the smallest of their newest stamps. Of
-    each stream the sample nearest to it counts, and where the nearest of one is further away than `window` [s]
-    there is no frame: a reader waits rather than being given what does not belong together.
+    The time of a frame is the newest that all streams have reached: the smallest of their newest stamps. Each stream
+    contributes its sample nearest to that time. If such a sample is further away than `window` [s], there is no
+    frame: a reader waits instead of receiving messages of different moments.
 
-    A stream keeps what is at most `history` [s] older than its newest sample, and at most as many as `depths` says,
-    or DEPTH, so that a stream that stalls makes no other one grow.
+    A stream drops samples more than `history` [s] older than its newest, and holds at most `depths[name]` (default
+    DEPTH) of them, so that one stalled stream does not let the others grow.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Alignment(Generic[Value]):
         }
 
     def add(self, stream: str, sample: Sample[Value]) -> bool:
-        """Take a sample; False for one that is not newer than the newest of its stream, which is left out."""
+        """Add a sample; return False, without adding it, if it is not newer than the newest of its stream."""
         kept = self._samples[stream]
         if kept and sample.stamp <= kept[-1].stamp:
             return False
@@ -64,23 +64,27 @@ class Alignment(Generic[Value]):
         return True
 
     def newest(self, stream: str) -> Sample[Value] | None:
-        """The newest sample of a stream."""
+        """Return the newest sample of a stream, or None."""
         kept = self._samples[stream]
         return kept[-1] if kept else None
 
     def clear(self) -> None:
-        """Forget everything: the senders' clock has been set."""
+        """Drop all samples, because the senders' clock has been set."""
         for kept in self._samples.values():
             kept.clear()
 
     def newest_common_time(self) -> float | None:
-        """The newest moment that all streams have reached; None while one has sent nothing."""
+        """Return the newest time that all streams have reached; None while one of them has no sample."""
         if not all(self._samples.values()):
             return None
         return min(kept[-1].stamp for kept in self._samples.values())
 
     def frame(self, after: Aligned[Value] | None = None) -> Aligned[Value] | None:
-        """The newest frame if it is later than `after`, the reader's last one, and has a sample that is not in that."""
+        """Return the newest frame, or None if there is none after `after`.
+
+        A frame counts as new if its time is later than that of `after`, the reader's last frame, and at least one of
+        its samples is not in `after`.
+        """
         time = self.newest_common_time()
         if time is None or (after is not None and time <= after.time):
             return None
@@ -92,7 +96,7 @@ class Alignment(Generic[Value]):
         return Aligned(time, chosen)
 
     def unaligned_streams(self) -> list[str]:
-        """The streams that have no sample near enough to the moment that all have reached."""
+        """Return the streams without a sample within the window around the newest common time."""
         time = self.newest_common_time()
         if time is None:
             return []
@@ -104,7 +108,8 @@ class Alignment(Generic[Value]):
 
 
 def _nearest(kept: deque[Sample[Value]], time: float) -> Sample[Value]:
-    """The sample nearest to `time`, the older one of two; the newest ones are looked at first."""
+    """Return the sample nearest to `time`, the older of two at the same distance. Searches from the newest on."""
+    # Stamps increase, so after the first sample that is further away all older ones are, too.
     best = kept[-1]
     for sample in reversed(kept):
         if abs(sample.stamp - time) > abs(best.stamp - time):

@@ -1,7 +1,7 @@
-"""ROS 2's bytes of the few messages that a robot speaks: CDR, the first version (XCDR1), plain.
+"""ROS 2 encoding of the messages used with robots: plain CDR version 1 (XCDR1).
 
-Source: OMG DDS-RTPS 2.5, section 10 (four bytes of header, alignment counted from behind it); rosidl's message
-definitions. Strings carry their terminating zero, sequences their length.
+Source: OMG DDS-RTPS 2.5, section 10 (header of four bytes, alignment counted from its end), and the message
+definitions of rosidl. Strings include their terminating zero; sequences start with their length.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ _HEADER = 4
 
 
 class Reader(fields.Reader):
-    """Reads plain CDR of either byte order."""
+    """Decoder of plain CDR in either byte order."""
 
-    SHORTEST_TEXT = 5  # a length and a zero byte
+    SHORTEST_TEXT = 5  # [bytes]; length and zero byte
 
     def __init__(self, payload: bytes) -> None:
         kind = payload[:2]
@@ -40,12 +40,12 @@ class Reader(fields.Reader):
         return raw[:-1]
 
     def header(self) -> tuple[int, str]:
-        """Seconds and nanoseconds, the frame."""
+        """Return the stamp [ns] and the frame."""
         return self.stamp(self.i32(), self.u32()), self.string()
 
 
 class Writer(fields.Writer):
-    """Writes plain CDR, little-endian."""
+    """Encoder of plain CDR, little-endian."""
 
     def __init__(self) -> None:
         super().__init__(_LITTLE + b"\0\0")
@@ -57,17 +57,17 @@ class Writer(fields.Writer):
         self._counted(text.encode("utf-8") + b"\0")
 
     def header(self, stamp: int, frame: str) -> None:
-        """Seconds and nanoseconds, the frame."""
+        """Write the stamp [ns], as seconds and nanoseconds, and the frame."""
         self._align(4)
         self._out += struct.pack("<iI", *divmod(stamp, SECOND))
         self.string(frame)
 
 
 def decode(name: MessageName, payload: bytes) -> Message:
-    """The message of that type; CodecError where the bytes are none. Bytes behind it (padding) do not matter."""
+    """Decode a message of the given type; trailing bytes (padding) are ignored. Raises CodecError for invalid bytes."""
     return fields.read(name, Reader(payload))
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a message; struct.error where a number does not fit."""
+    """Encode a message. Raises struct.error if a number is out of range."""
     return fields.write(message, Writer())

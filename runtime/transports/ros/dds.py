@@ -1,7 +1,7 @@
-"""ROS 2's topics over DDS without a ROS installation; needs the package cyclonedds.
+"""ROS 2 topics over DDS without a ROS installation; needs the package cyclonedds.
 
-Names, types and quality of service as ROS 2's own middlewares have them (design.ros2.org, "Topic and Service name
-mapping to DDS"): topic /a/b is rt/a/b, its type sensor_msgs::msg::dds_::JointState_, its bytes XCDR1, its type hash
+Names, types and quality of service follow ROS 2's own middlewares (design.ros2.org, "Topic and Service name mapping
+to DDS"): topic /a/b is rt/a/b, its type sensor_msgs::msg::dds_::JointState_, its encoding XCDR1, and its type hash
 part of the user data.
 """
 
@@ -27,11 +27,9 @@ from runtime.transports.ros.middleware import (
 
 log = logging.getLogger(__name__)
 LOOPBACK, ENVIRONMENT = "loopback", "environment"
-_WAKE_NS = 100_000_000  # how soon the reader notices that it is to end
+_WAKE_NS = 100_000_000  # time until the reader thread notices that it must end [ns]
 _TAKEN = 64
-_RECEIVED = (
-    "16MB"  # kept by the kernel, as far as it permits: three raw pictures are more than the usual 1 MB
-)
+_RECEIVED = "16MB"  # kernel buffer, if permitted: three raw pictures exceed the usual 1 MB
 _MOST_ENDPOINTS = 2000
 _POLICIES = {
     2: "durability", 4: "deadline", 5: "latency_budget", 6: "ownership", 8: "liveliness", 10: "partition",
@@ -40,12 +38,12 @@ _POLICIES = {
 
 
 def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
-    """Cyclone's configuration for a network interface by name or address; None: that of $CYCLONEDDS_URI.
+    """Return Cyclone's configuration for a network interface (name or address); None: $CYCLONEDDS_URI applies.
 
-    On loopback there is no multicast: participants look for each other by address, at the first 30 ports of the
-    domain. That finds nodes of Cyclone DDS 0.10 (Jazzy) and 11 so configured, and Fast DDS.
+    Loopback has no multicast: participants find each other by address, at the first 30 ports of the domain. This
+    finds Fast DDS nodes, and nodes of Cyclone DDS 0.10 (Jazzy) and 11 with the same configuration.
     """
-    from xml.sax.saxutils import quoteattr  # it brings HTTP and TLS along
+    from xml.sax.saxutils import quoteattr  # imported here: it also imports HTTP and TLS
 
     if network == ENVIRONMENT:
         return None
@@ -71,7 +69,7 @@ def _interface(network: str) -> str:
 
 
 class _Domains:
-    """The DDS domains of this process: each has one configuration, and lives while somebody uses it."""
+    """DDS domains of this process. Each has one configuration and exists while it has users."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -99,10 +97,10 @@ _domains = _Domains()  # state: the library has one of each per process, whoever
 
 
 class DdsMiddleware(Middleware):
-    """One participant; one thread waits for all of its readers."""
+    """DDS participant; one thread waits for all of its readers."""
 
     def __init__(self, domain: int, network: str, peers: tuple[str, ...] = ()) -> None:
-        """Join the domain; SetupError without the package, TransportError where the network cannot be used."""
+        """Join the domain. Raises SetupError without the package, TransportError if the network cannot be used."""
         require()
         from cyclonedds.core import DDSException, WaitSet
         from cyclonedds.domain import DomainParticipant
@@ -128,7 +126,7 @@ class DdsMiddleware(Middleware):
         self._thread: threading.Thread | None = None
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> None:
-        """Hear the topic from the middleware's one thread."""
+        """Subscribe to the topic; `deliver` is called from the middleware's one thread."""
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 
@@ -142,7 +140,7 @@ class DdsMiddleware(Middleware):
             self._thread.start()
 
     def advertise(self, topic: Topic) -> Publish:
-        """A writer that drops a message rather than wait for a slow reader."""
+        """Return the publisher of the topic. It drops a message instead of waiting for a slow reader."""
         from cyclonedds.core import DDSException
         from cyclonedds.pub import DataWriter
 
@@ -158,15 +156,15 @@ class DdsMiddleware(Middleware):
             except DDSException as error:
                 if (
                     error.code != DDSException.DDS_RETCODE_TIMEOUT
-                ):  # of a reader that is behind: the next one comes
+                ):  # a reader is behind; the next command follows
                     raise TransportError(f"{topic.name} cannot be published: {error}") from error
 
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Read off the statuses of readers and writers, and, where nobody matches, off what others announce.
+        """Return the matches from the statuses of readers and writers, or, without a match, from the discovery data.
 
-        A refusal is told for as long as the middleware lives: DDS counts those there have been.
+        A refusal is reported for the rest of the middleware's life, because DDS only counts refusals.
         """
         from cyclonedds.core import DDSException
 
@@ -187,14 +185,14 @@ class DdsMiddleware(Middleware):
         return found
 
     def close(self) -> None:
-        """End the thread, then the participant and all that it has."""
+        """End the thread, then the participant with all its readers and writers."""
         self._ending.set()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
         for entity in (*(r for _, r, _ in self._readers), *(w for _, w in self._writers), self._participant):
             if entity is not None:
-                entity.__del__()  # now, whoever still holds it; doing it again is harmless
+                entity.__del__()  # now, in spite of other references; a second call is harmless
         self._readers, self._writers = [], []
         self._waitset = self._participant = None
         self._leave()
@@ -205,7 +203,7 @@ class DdsMiddleware(Middleware):
             _domains.leave(self._domain)
 
     def _made(self, kind: Any, topic: Topic, life: bool) -> Any:
-        """A reader or a writer of the topic."""
+        """Create a reader or writer of the topic."""
         from cyclonedds.core import DDSException
         from cyclonedds.topic import Topic as DdsTopic
 
@@ -218,7 +216,7 @@ class DdsMiddleware(Middleware):
             raise TransportError(f"{topic.name} cannot be opened: {error}") from error
 
     def _read(self) -> None:
-        """The thread: hands over what has come; what goes wrong with one message does not end it."""
+        """Run the reader thread. An error with one message does not end it."""
         while not self._ending.is_set():
             try:
                 self._waitset.wait(_WAKE_NS)
@@ -232,12 +230,12 @@ class DdsMiddleware(Middleware):
 
     def _hand_over(self, topic: Topic, reader: Any, deliver: Deliver) -> None:
         for sample in reader.take(_TAKEN):
-            payload = getattr(sample, "payload", None)  # absent where a publisher says that it has gone
+            payload = getattr(sample, "payload", None)  # absent in the notice of a publisher that has left
             if payload is not None and sample.sample_info.valid_data:
                 deliver(payload)
 
     def _refused(self, topic: Topic, status: Any, peers: int, publishes: bool) -> str:
-        """Why somebody at the other side is none of our peers; "" where nobody is refused."""
+        """Return why a peer of the topic was refused, "" if none was."""
         other = "" if peers else self._otherwise_typed(topic, publishes)
         if other or not status.total_count:
             return other
@@ -246,7 +244,10 @@ class DdsMiddleware(Middleware):
         )
 
     def _otherwise_typed(self, topic: Topic, publishes: bool) -> str:
-        """Sentence on a different type at the topic's other side, "" for none; DDS reports it to no peer."""
+        """Return a sentence about peers with a different message type, "" if there is none.
+
+        DDS itself does not report it.
+        """
         from cyclonedds.builtin import (
             BuiltinDataReader,
             BuiltinTopicDcpsPublication,
@@ -256,7 +257,7 @@ class DdsMiddleware(Middleware):
         others = BuiltinTopicDcpsSubscription if publishes else BuiltinTopicDcpsPublication
         wanted = _type_name(topic)
         for endpoint in BuiltinDataReader(self._participant, others).read(_MOST_ENDPOINTS):
-            kind = getattr(endpoint, "type_name", wanted)  # absent where an endpoint has gone
+            kind = getattr(endpoint, "type_name", wanted)  # absent for an endpoint that has left
             if kind != wanted and endpoint.topic_name == f"rt{topic.name}":
                 verb = "subscribed to" if publishes else "published"
                 return f"{topic.name} is {verb} as {_ros_name(kind)}; expected {_ros_name(wanted)}"
@@ -264,7 +265,7 @@ class DdsMiddleware(Middleware):
 
 
 def require() -> None:
-    """SetupError with what to install where the package is absent or not the one that is needed."""
+    """Check that the package is installed in the needed version. Raises SetupError with an instruction if not."""
     try:
         importlib.import_module("runtime.transports.ros.idl")
     except ImportError as error:

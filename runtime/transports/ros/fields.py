@@ -1,6 +1,6 @@
-"""The fields of the few messages that a robot speaks, in their order, which both generations of ROS share.
+"""Fields of the messages used with robots, in the order that both generations of ROS share.
 
-How a number or a text is bytes is said by those who derive: `cdr` for ROS 2, `packed` for ROS 1.
+The subclasses define the encoding of numbers and strings: `cdr` for ROS 2, `packed` for ROS 1.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ SECOND = 1_000_000_000
 
 
 class Reader(ABC):
-    """Reads one message from front to back; CodecError for whatever does not fit into its bytes."""
+    """Decoder of one message from front to back. Raises CodecError for anything that does not fit its bytes."""
 
-    SHORTEST_TEXT: int  # bytes of an empty string
+    SHORTEST_TEXT: int  # [bytes] of an empty string
 
     def __init__(self, payload: bytes, order: str, start: int) -> None:
         self._payload, self._order, self._at = payload, order, start
 
     @abstractmethod
     def _gap(self, alignment: int) -> int:
-        """Count of bytes to skip before a value of this alignment."""
+        """Return the number of bytes to skip before a value with this alignment."""
 
     @abstractmethod
     def _text(self, raw: bytes, start: int) -> bytes:
-        """Content of a string's bytes."""
+        """Return the content of a string without its terminator."""
 
     @abstractmethod
     def header(self) -> tuple[int, str]:
-        """std_msgs/Header: the stamp [ns] and the frame."""
+        """Decode std_msgs/Header: the stamp [ns] and the frame."""
 
     def take(self, size: int, alignment: int) -> int:
-        """The place of the next `size` bytes."""
+        """Advance by `size` aligned bytes and return their offset."""
         start = self._at + self._gap(alignment)
         if size > len(self._payload) - start:
             raise CodecError(
@@ -84,7 +84,7 @@ class Reader(ABC):
         return tuple(self.string() for _ in range(count))
 
     def doubles(self, count: int | None = None) -> Float64:
-        """A sequence of float64, or an array of `count`, which has no length of its own."""
+        """Decode a sequence of float64, or with `count` an array of fixed length, which has no length prefix."""
         count = self.u32() if count is None else count
         if count == 0:  # an empty sequence is not aligned
             return np.zeros(0)
@@ -92,30 +92,30 @@ class Reader(ABC):
         return np.frombuffer(self._payload, self._order + "f8", count, start).astype(np.float64)
 
     def octets(self) -> UInt8:
-        """A sequence of uint8, a view."""
+        """Decode a sequence of uint8 as a view."""
         count = self.u32()
         return np.frombuffer(self._payload, np.uint8, count, self.take(count, 1))
 
     def stamp(self, seconds: int, nanoseconds: int) -> int:
-        """ROS time [ns]."""
+        """Return ROS time [ns]."""
         if nanoseconds >= SECOND:
             raise CodecError(f"a stamp has {nanoseconds} nanoseconds; expected less than a second")
         return seconds * SECOND + nanoseconds
 
 
 class Writer(ABC):
-    """Writes one message, little-endian."""
+    """Encoder of one message, little-endian."""
 
     def __init__(self, begin: bytes = b"") -> None:
         self._out = bytearray(begin)
 
     @abstractmethod
     def _align(self, alignment: int) -> None:
-        """Pass over what is unused before what is aligned so."""
+        """Write padding up to the given alignment."""
 
     @abstractmethod
     def header(self, stamp: int, frame: str) -> None:
-        """std_msgs/Header with a stamp [ns]."""
+        """Encode std_msgs/Header with a stamp [ns]."""
 
     @abstractmethod
     def string(self, text: str) -> None: ...
@@ -152,12 +152,12 @@ class Writer(ABC):
 
 
 def read(name: MessageName, given: Reader) -> Message:
-    """The message of that type."""
+    """Decode a message of the given type."""
     return _READ[name](given)
 
 
 def write(message: Message, out: Writer) -> bytes:
-    """The bytes of a message; struct.error where a number does not fit."""
+    """Encode a message. Raises struct.error if a number is out of range."""
     out.header(message.stamp, message.frame)
     if isinstance(message, JointState):
         out.strings(message.names)
@@ -186,7 +186,7 @@ def _joint_state(given: Reader) -> JointState:
 def _image(given: Reader) -> Image:
     stamp, frame = given.header()
     height, width, encoding = given.u32(), given.u32(), given.string()
-    given.u8()  # is_bigendian: of no meaning to bytes
+    given.u8()  # is_bigendian has no meaning for bytes
     return Image(stamp, frame, height, width, encoding, given.u32(), given.octets())
 
 

@@ -1,4 +1,4 @@
-"""Observations made of a robot's messages: read, aligned, put together in the robot's order."""
+"""Observations from a robot's messages: decoded, aligned, and put in the robot's order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joints:
-    """Numbers of a group, or of its gripper alone, in the order wanted; float64, None where they are not known."""
+    """Joint values of a group, or of its gripper alone, in the robot's order; float64 [joints], None if unknown."""
 
     position: Float64
     velocity: Float64 | None
@@ -35,14 +35,14 @@ Value: TypeAlias = Joints | Float32 | Image | CompressedImage
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StampedValue:
-    """Value of one message, and its time of making in our clock [s]."""
+    """Value of one message, with its capture time in our clock [s]."""
 
     value: Value
     captured: float
 
 
 class MessageReaders:
-    """Reads a message for the part of the frame that it is about; Unusable names what is wrong."""
+    """Decoders of messages for the streams of a frame. Raise UnusableMessage with the reason."""
 
     def __init__(self, robot: Robot, parts: tuple[StreamSpec, ...], names: Names) -> None:
         self._orders = {part.name: JointOrder(part, names) for part in parts if part.message == "JointState"}
@@ -60,7 +60,7 @@ class MessageReaders:
 
 
 class Assembly:
-    """Makes an observation of one aligned set of messages; a picture is decoded once, when it is first wanted."""
+    """Builder of observations from aligned messages. A picture is decoded once, when it is first needed."""
 
     def __init__(self, robot: Robot, parts: tuple[StreamSpec, ...], detect_frozen: bool) -> None:
         self._robot = robot
@@ -70,7 +70,7 @@ class Assembly:
         self._decoded: dict[str, tuple[StampedValue, UInt8]] = {}
 
     def observation(self, number: int, aligned: Aligned[StampedValue]) -> Observation:
-        """Raises Unusable where a picture cannot be decoded."""
+        """Build the observation. Raises UnusableMessage if a picture cannot be decoded."""
         samples = aligned.samples
         values = {name: sample.value for name, sample in samples.items()}
         pictures = {
@@ -90,7 +90,7 @@ class Assembly:
         )
 
     def newly_frozen(self, time: float) -> list[str]:
-        """Cameras whose messages go on and show the same for too long; each named once."""
+        """Return the cameras whose messages continue while the picture stays the same for too long; each once."""
         return self._freshness.newly_frozen(time) if self._detect_frozen else []
 
     def _stream(self, kind: str) -> list[StreamSpec]:
@@ -111,7 +111,7 @@ class Assembly:
     def _captured(
         self, values: Mapping[str, StampedValue], pictures: Mapping[str, UInt8]
     ) -> dict[str, float]:
-        """By stream; joints are as old as the oldest of their messages."""
+        """Return the capture time by stream; the oldest message counts for joints and for poses."""
         times = {
             "joints": min(values[p.name].captured for p in self._stream("joints") + self._stream("gripper"))
         }
@@ -125,7 +125,7 @@ class Assembly:
         return times
 
     def _vectors(self, values: Mapping[str, Value]) -> tuple[Float32, Float32 | None, Float32 | None]:
-        """Position, velocity and effort of the whole robot, the latter where every group says them."""
+        """Return position, velocity, effort of the whole robot [D]; the last two only if every group reports them."""
         positions, velocities, efforts = [], [], []
         for group in self._robot.groups:
             arm = values[f"{group.name} joints"]
@@ -149,7 +149,7 @@ class Assembly:
         return joined, _joined(velocities), _joined(efforts)
 
     def _eef(self, values: Mapping[str, Value], position: Float32) -> Float32 | None:
-        """The poses that were measured, each with its gripper from the joints: float32 [8 * arms]."""
+        """Return the measured poses, each with its gripper from the joints: float32 [8 * arms]; None without poses."""
         if not self._stream("eef"):
             return None
         vectors = np.zeros((len(self._robot.arms), EEF_WIDTH), np.float32)
@@ -162,7 +162,7 @@ class Assembly:
 
 
 def _insert_gripper(arm: Float64 | None, hand: Float64 | None, place: int | None) -> Float64 | None:
-    """A group's numbers, the gripper's at its place where it came by itself."""
+    """Return a group's values, with the gripper inserted at its index if it has a stream of its own."""
     return arm if arm is None or hand is None or place is None else np.insert(arm, place, hand[0])
 
 

@@ -1,8 +1,9 @@
-"""The four message types as DDS knows them, under ROS 2's names; their bytes are made elsewhere.
+"""The four message types for DDS, under ROS 2's names; their bytes are encoded elsewhere.
 
-cyclonedds needs classes to tell peers what a topic carries, and reads and writes them byte by byte in Python (62 ms
-for one picture). So their codec is replaced: an object holds the bytes of one message. Must not be imported without
-the package cyclonedds, nor begin with `from __future__ import annotations`, which it cannot resolve.
+cyclonedds needs classes to announce the type of a topic, and would encode and decode them byte by byte in Python (62
+ms per picture). Their codec is therefore replaced: an object holds the bytes of one message. The module must not be
+imported without the package cyclonedds, nor begin with `from __future__ import annotations`, which cyclonedds cannot
+resolve.
 """
 # mypy: disable-error-code="type-arg, misc, call-arg, untyped-decorator"
 
@@ -92,7 +93,10 @@ class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
 
 
 def _opaque(kind: Any) -> Any:
-    """The class with objects that hold a message's bytes as `payload`; a subclass would not be a type to DDS."""
+    """Replace the codec of a class: its objects hold a message's bytes as `payload`.
+
+    DDS would not accept a subclass.
+    """
 
     def hold(self: Any, payload: bytes) -> None:
         self.payload = payload
@@ -109,7 +113,7 @@ TYPES: dict[MessageName, Any] = {
     "CompressedImage": _opaque(CompressedImage),
     "PoseStamped": _opaque(PoseStamped),
 }
-# REP 2011; the same from Humble to Jazzy. Peers match without it, but rmw_cyclonedds warns.
+# Type hashes of REP 2011, the same from Humble to Jazzy. Peers match without them, but rmw_cyclonedds warns.
 HASHES: dict[MessageName, str] = {
     "JointState": "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
     "Image": "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47",

@@ -1,4 +1,4 @@
-"""The ROS messages that a robot's arms and cameras speak, free of any middleware."""
+"""ROS messages of arms and cameras, independent of the middleware."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _none() -> Float64:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
-    """sensor_msgs/JointState: numbers by joint, `stamp` in ROS time [ns]; velocity and effort may be empty."""
+    """sensor_msgs/JointState: values by joint, `stamp` in ROS time [ns]; velocity and effort may be empty."""
 
     stamp: int
     frame: str
@@ -43,7 +43,7 @@ class Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedImage:
-    """sensor_msgs/CompressedImage: a file of `format`, such as "jpeg" or "bgr8; png compressed bgr8"."""
+    """sensor_msgs/CompressedImage: an encoded picture of `format`, e.g. "jpeg" or "bgr8; png compressed bgr8"."""
 
     stamp: int
     frame: str
@@ -53,7 +53,7 @@ class CompressedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseStamped:
-    """geometry_msgs/PoseStamped: `pose` float64 [7] as on the wire, x, y, z [m], quaternion x, y, z, w."""
+    """geometry_msgs/PoseStamped: `pose` float64 [7] as transmitted: x, y, z [m], quaternion x, y, z, w."""
 
     stamp: int
     frame: str
@@ -76,9 +76,9 @@ PACKAGES: dict[MessageName, str] = {
 
 
 class Wire(Protocol):
-    """Messages as bytes on one generation of ROS: the functions of a codec module.
+    """Codec of messages for one generation of ROS: the functions of a codec module.
 
-    `decode` raises CodecError. Arrays of bytes that it returns are views into what was given.
+    `decode` raises CodecError. Arrays of bytes in its result are views into `payload`.
     """
 
     def decode(self, name: MessageName, payload: bytes) -> Message: ...

@@ -1,4 +1,4 @@
-"""Interface of a ROS transport to a middleware: four methods, bytes in and bytes out."""
+"""Interface between a ROS transport and a middleware: four methods that exchange bytes."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ class Quality(Settings):
     """How many messages are kept for a reader that is behind: 1 command, 5 of all else."""
 
     def merged_over(self, usual: Quality) -> Quality:
-        """This one, with what it leaves open as in `usual`."""
+        """Return these settings, with unset keys from `usual`."""
         return usual.model_copy(update=self.model_dump(exclude_none=True))
 
 
 SENSOR_QUALITY = Quality(reliability="best_effort", depth=5)
 COMMAND_QUALITY = Quality(reliability="reliable", depth=1)
-COMMAND_LIFE_S = 0.2  # after which a command that was not delivered is not delivered any more
+COMMAND_LIFE_S = 0.2  # [s]; an older command is no longer delivered
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic as ROS names it, "/joint_states", what it carries, and how."""
+    """Topic by its ROS name, e.g. "/joint_states", with its message type and quality of service."""
 
     name: str
     message: MessageName
@@ -48,34 +48,34 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """Peers at the other side of a topic: their count, and a sentence on why others are refused, or ""."""
+    """Number of connected peers of a topic, and a sentence on why another peer was refused, or ""."""
 
     peers: int
     refused: str = ""
 
 
 class Middleware(ABC):
-    """One node; `close` ends it. What it cannot do is a TransportError."""
+    """Node of a middleware; `close` ends it. Methods raise TransportError for operations that fail."""
 
     @abstractmethod
     def subscribe(self, topic: Topic, deliver: Deliver) -> None:
-        """Call `deliver` with the bytes of each message, from a thread of the middleware's."""
+        """Call `deliver` with the bytes of each message, from a thread of the middleware."""
 
     @abstractmethod
     def advertise(self, topic: Topic) -> Publish:
-        """Publisher of bytes on the topic, without waiting for any peer."""
+        """Return a publisher of bytes on the topic that waits for no peer."""
 
     @abstractmethod
     def matches(self) -> Mapping[str, Match]:
-        """By topic, for all that are subscribed or advertised."""
+        """Return the peers of each subscribed or advertised topic."""
 
     @abstractmethod
     def close(self) -> None:
-        """Release everything; nothing is delivered once it returns. Safe to call twice."""
+        """Release all resources. After it returns nothing is delivered. Safe to call twice."""
 
 
 def describe_incompatible(topic: Topic, policy: str, publishes: bool) -> str:
-    """The sentence for a peer that was refused for a policy of its quality of service."""
+    """Return the sentence about a peer that was refused because of a quality-of-service policy."""
     side, other = ("publish", "a subscriber") if publishes else ("subscribe to", "a publisher")
     ours = topic.quality.model_dump()
     given = ours.get(policy, "as is")

@@ -1,7 +1,7 @@
-"""ROS 1's bytes of the few messages that a robot speaks: little-endian, one field right behind the other.
+"""ROS 1 encoding of the messages used with robots: little-endian, fields without gaps.
 
-Source: genmsg's message definitions as genpy writes them. Strings and sequences carry their length, and nothing is
-aligned or terminated. A header begins with a number that the publisher counts up, which is no business of ours.
+Source: genmsg's message definitions as genpy writes them. Strings and sequences start with their length; nothing is
+aligned or terminated. A header begins with a number that the publisher counts up and that is not used here.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from runtime.transports.ros.messages import Message, MessageName
 
 
 class Reader(fields.Reader):
-    """Reads ROS 1's serialization."""
+    """Decoder of ROS 1's serialization."""
 
-    SHORTEST_TEXT = 4  # a length
+    SHORTEST_TEXT = 4  # [bytes]; the length
 
     def __init__(self, payload: bytes) -> None:
         super().__init__(payload, "<", 0)
@@ -29,34 +29,34 @@ class Reader(fields.Reader):
         return raw
 
     def header(self) -> tuple[int, str]:
-        """The publisher's count, seconds and nanoseconds, the frame."""
+        """Skip the publisher's count; return the stamp [ns] and the frame."""
         self.u32()
         return self.stamp(self.u32(), self.u32()), self.string()
 
     def end(self) -> None:
-        """CodecError unless all has been read: nothing pads a message here."""
+        """Check that all bytes have been read: ROS 1 has no padding. Raises CodecError."""
         left = len(self._payload) - self._at
         if left:
             raise CodecError(f"a message of {len(self._payload)} bytes has {left} behind its last field")
 
 
 class Writer(fields.Writer):
-    """Writes ROS 1's serialization."""
+    """Encoder of ROS 1's serialization."""
 
     def _align(self, alignment: int) -> None:
-        """Nothing is aligned."""
+        """Do nothing: ROS 1 has no alignment."""
 
     def string(self, text: str) -> None:
         self._counted(text.encode("utf-8"))
 
     def header(self, stamp: int, frame: str) -> None:
-        """A count of 0, which whoever publishes replaces by its own, seconds and nanoseconds, the frame."""
+        """Write a count of 0, which the publisher replaces by its own, then the stamp and the frame."""
         self._out += struct.pack("<III", 0, *divmod(stamp, SECOND))
         self.string(frame)
 
 
 def decode(name: MessageName, payload: bytes) -> Message:
-    """The message of that type; CodecError where the bytes are none, or more than one."""
+    """Decode a message of the given type. Raises CodecError for invalid or surplus bytes."""
     given = Reader(payload)
     message = fields.read(name, given)
     given.end()
@@ -64,5 +64,5 @@ def decode(name: MessageName, payload: bytes) -> Message:
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a message; struct.error where a number does not fit."""
+    """Encode a message. Raises struct.error if a number is out of range."""
     return fields.write(message, Writer())

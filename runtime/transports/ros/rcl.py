@@ -1,6 +1,6 @@
-"""ROS 2's topics through rclpy, where a ROS 2 installation comes with it for this Python.
+"""ROS 2 topics through rclpy, if a ROS 2 installation provides it for this Python.
 
-Messages pass as bytes both ways, as over plain DDS, so that nothing is converted field by field in Python.
+Messages pass as bytes in both directions, as over plain DDS, so that no field is converted in Python.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def require() -> None:
-    """SetupError with what to do where rclpy cannot be imported by this Python."""
+    """Check that this Python can import rclpy. Raises SetupError with an instruction if not."""
     try:
         for name in ("rclpy", *(f"{package}.msg" for package in set(PACKAGES.values()))):
             importlib.import_module(name)
@@ -40,10 +40,10 @@ def require() -> None:
 
 
 class RclMiddleware(Middleware):
-    """One node in a context of its own, so that other nodes of the process are not disturbed; one thread spins it."""
+    """ROS 2 node in a context of its own, which does not disturb other nodes of the process; one thread spins it."""
 
     def __init__(self, domain: int, name: str) -> None:
-        """Join the domain; SetupError without rclpy, TransportError where it cannot start."""
+        """Join the domain. Raises SetupError without rclpy, TransportError if it cannot start."""
         require()
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -52,7 +52,7 @@ class RclMiddleware(Middleware):
         try:
             rclpy.init(args=[], context=self._context, domain_id=domain)
             self._node: Any = rclpy.create_node(name, context=self._context, use_global_arguments=False)
-        except Exception as error:  # rclpy raises its own, of its C layer
+        except Exception as error:  # rclpy raises exceptions of its C layer
             self._context.try_shutdown()
             raise TransportError(f"ROS domain {domain} cannot be joined: {error}") from error
         self._executor: Any = SingleThreadedExecutor(context=self._context)
@@ -65,7 +65,7 @@ class RclMiddleware(Middleware):
         self._thread.start()
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> None:
-        """Hear the topic from the executor's thread, undecoded."""
+        """Subscribe to the topic; `deliver` receives the raw bytes from the executor's thread."""
         events, _ = _events()
         callbacks = events(incompatible_qos=lambda event: self._note(topic, event, publishes=False))
         self._node.create_subscription(
@@ -74,7 +74,7 @@ class RclMiddleware(Middleware):
         self._subscribed[topic.name] = topic
 
     def advertise(self, topic: Topic) -> Publish:
-        """A publisher of bytes."""
+        """Return a publisher of bytes on the topic."""
         _, events = _events()
         callbacks = events(incompatible_qos=lambda event: self._note(topic, event, publishes=True))
         publisher = self._node.create_publisher(
@@ -91,7 +91,7 @@ class RclMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Publishers are counted as the graph has them; those of another type are named."""
+        """Return the peers according to the ROS graph; publishers of another message type are named."""
         found = {}
         for name, topic in self._subscribed.items():
             wanted = f"{PACKAGES[topic.message]}/msg/{topic.message}"
@@ -119,7 +119,7 @@ class RclMiddleware(Middleware):
         while not self._ending.is_set() and self._context.ok():
             try:
                 self._executor.spin_once(timeout_sec=0.1)
-            except Exception:  # of one message: nobody else would hear the next
+            except Exception:  # an error with one message must not end the only reader
                 log.exception("reading from rclpy failed")
                 self._ending.wait(0.1)
 
@@ -135,7 +135,7 @@ def _kind(topic: Topic) -> Any:
 
 
 def _events() -> tuple[Any, Any]:
-    """The classes of callbacks for subscriptions and publishers; Humble has them elsewhere."""
+    """Return the classes of event callbacks for subscriptions and publishers; Humble has them in another module."""
     try:
         module = importlib.import_module("rclpy.event_handler")
     except ImportError:

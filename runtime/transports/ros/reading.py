@@ -1,4 +1,4 @@
-"""Content of a robot's messages: joints by name, pictures by encoding; anything doubtful is refused."""
+"""Content of messages: joints by name, pictures by encoding. Doubtful messages are refused."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
 
 class UnusableMessage(CodecError):
-    """A message that cannot be used; `fault` is the name under which it is counted."""
+    """Message that cannot be used; `fault` is the name under which it is counted."""
 
     def __init__(self, fault: str, text: str) -> None:
         super().__init__(text)
@@ -26,21 +26,24 @@ class UnusableMessage(CodecError):
 
 
 class JointOrder:
-    """Puts the numbers of a message into the order of `part.joints`.
+    """Order of a message's values: brings them into the order of `part.joints`.
 
-    Messages with names may have more joints and any order. Those without names need exactly as many numbers. With
-    names = "ignore" the first numbers count as they come.
+    Messages with names may contain more joints, in any order. Messages without names need exactly as many values.
+    With names = "ignore" the first values are used as they come.
     """
 
     def __init__(self, part: StreamSpec, names: Names, key: str = "transport.topics.groups") -> None:
         self._part = part
-        self._key = f"{key}.{part.source_key}.joints"  # of the deployment, for sentences
+        self._key = f"{key}.{part.source_key}.joints"  # configuration key, for messages
         self._check = names == "check"
         self._seen: tuple[str, ...] | None = None
         self._order: list[int] = []
 
     def read(self, message: JointState) -> tuple[Float64, Float64 | None, Float64 | None]:
-        """Position, and velocity and effort where the message has them: float64 [joints]."""
+        """Return position, velocity and effort, float64 [joints]; the last two None if the message lacks them.
+
+        Raises UnusableMessage if the joints do not fit or a position is not finite.
+        """
         order = self._indices(message)
         position = message.position[order]
         if not np.isfinite(position).all():
@@ -84,7 +87,7 @@ class JointOrder:
 
 
 def _optional_values(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
-    """Velocity or effort: drivers leave them empty, or shorter, where they do not know them."""
+    """Return velocity or effort in the given order; None if the driver leaves them empty or too short."""
     if len(numbers) != len(message.position):
         return None
     chosen = numbers[order]
@@ -92,7 +95,7 @@ def _optional_values(numbers: Float64, message: JointState, order: list[int]) ->
 
 
 def pose(message: PoseStamped, frame: str) -> Float32:
-    """x, y, z [m], quaternion w, x, y, z: float32 [7] in `frame`."""
+    """Return x, y, z [m], quaternion w, x, y, z as float32 [7] in `frame`. Raises UnusableMessage."""
     given = message.frame.lstrip("/")
     if frame and given and given != frame:
         raise UnusableMessage("wrong_frame", f"a pose is given in {given}; expected {frame}")
@@ -106,7 +109,7 @@ def pose(message: PoseStamped, frame: str) -> Float32:
 
 
 def check_picture(message: Image | CompressedImage) -> None:
-    """Refuse, without decoding, what `picture` could not use."""
+    """Check, without decoding, that `picture` can use the message. Raises UnusableMessage."""
     if isinstance(message, Image):
         _check_raw(message)
     elif _kind_of(message) is None:
@@ -118,7 +121,7 @@ def check_picture(message: Image | CompressedImage) -> None:
 
 
 def picture(message: Image | CompressedImage) -> UInt8:
-    """RGB uint8 [H, W, 3], read-only; Unusable where it cannot be decoded."""
+    """Decode to RGB uint8 [H, W, 3], read-only. Raises UnusableMessage if that fails."""
     rgb = _raw(message) if isinstance(message, Image) else _decompressed(message)
     rgb.flags.writeable = False
     return rgb
@@ -148,7 +151,7 @@ def _check_size(height: int, width: int) -> None:
 
 
 def _raw(message: Image) -> UInt8:
-    import cv2  # imported here, as control locks all that it imports
+    import cv2  # imported here because control locks its imports into memory
 
     _check_raw(message)
     channels, size = _CHANNELS[message.encoding], message.step * message.height
@@ -166,7 +169,7 @@ def _raw(message: Image) -> UInt8:
 
 
 def _kind_of(message: CompressedImage) -> Literal["jpeg", "png"] | None:
-    """Kind of picture by its first bytes; `format` differs from driver to driver."""
+    """Return the kind of picture from its first bytes; `format` differs between drivers."""
     if "compressedDepth" in message.format:
         return None
     start = bytes(message.data[:8])
@@ -177,11 +180,12 @@ def _decompressed(message: CompressedImage) -> UInt8:
     check_picture(message)
     try:
         decoded = _jpeg(message) if _kind_of(message) == "jpeg" else _png(message)
-    except (ValueError, OSError, SyntaxError) as error:  # SyntaxError: what Pillow calls a broken PNG
+    except (ValueError, OSError, SyntaxError) as error:  # SyntaxError: Pillow's error for a broken PNG
         raise UnusableMessage(
             "broken_picture", f"a {message.format!r} picture cannot be decoded: {error}"
         ) from error
-    # image_transport hands its files to OpenCV, which takes red for blue unless it swaps, as "compressed bgr8" says.
+    # image_transport encodes with OpenCV, which expects BGR: after "compressed rgb8", red and blue are swapped in the
+    # file.
     return np.ascontiguousarray(decoded[..., ::-1]) if "compressed rgb" in message.format else decoded
 
 

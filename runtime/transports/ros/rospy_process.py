@@ -1,8 +1,8 @@
-"""A process of its own for rospy, which a process can have but once and which would take its logging and signals.
+"""Child process for rospy, which a process can start only once and which changes its logging and signals.
 
-The child is a program of its own (rospy_node), run by a Python that has rospy. Two sockets lead to it: a stream of
-what it hears, each piece behind a head (kind, topic, size), and packets of commands (kind, topic, when it was made),
-which are handed over without waiting. Words are JSON. When the sockets close, the child ends.
+The child is a separate program (rospy_node), run by a Python that has rospy. Two sockets connect it: a stream of
+received messages, each after a head (kind, topic, size), and packets of commands (kind, topic, creation time), which
+are sent without waiting. Control words are JSON. When the sockets close, the child ends.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from typing import Any
 from runtime.core.errors import SetupError, TransportError
 from runtime.transports.ros.middleware import COMMAND_LIFE_S
 
-MESSAGE, WORD = 1, 2  # as in rospy_node, which imports nothing of ours
+MESSAGE, WORD = 1, 2  # the same numbers as in rospy_node, which cannot import this module
 _HEAD = struct.Struct("<BxHI")
 _COMMAND = struct.Struct("<BxHd")
 _PROGRAM = Path(__file__).parent / "rospy_node" / "__main__.py"
-_ROOM = 4 << 20  # bytes of a socket's buffer, where the system permits: a picture fits
+_ROOM = 4 << 20  # socket buffer [bytes], if the system permits: one picture fits
 _START_S = 20.0
 _END_S = 2.0
 _INSTALL = (
@@ -38,7 +38,7 @@ _INSTALL = (
 
 @dataclass(frozen=True, slots=True)
 class RosEnvironment:
-    """ROS 1: the Python that has rospy, the master, the address under which nodes reach this machine."""
+    """ROS 1 environment: the Python that has rospy, the master, and this machine's address for other nodes."""
 
     python: str
     master: str
@@ -46,7 +46,7 @@ class RosEnvironment:
 
     @property
     def environment(self) -> dict[str, str]:
-        """This process's, with what rospy reads of it."""
+        """Environment variables of this process, with those that rospy reads replaced."""
         kept = {
             name: value
             for name, value in os.environ.items()
@@ -57,7 +57,7 @@ class RosEnvironment:
 
 @functools.cache  # cache: to look starts a process
 def require(python: str) -> None:
-    """SetupError with what to install where that Python does not exist or has no rospy; a success is remembered."""
+    """Check that `python` exists and has rospy; a success is cached. Raises SetupError with an instruction if not."""
     line = [python, str(_PROGRAM), json.dumps({"check": True})]
     try:
         done = subprocess.run(
@@ -71,10 +71,10 @@ def require(python: str) -> None:
 
 
 class RospyProcess:
-    """One life of the child: a node that the master knows, once it is made."""
+    """One child process with a node that is registered at the master."""
 
     def __init__(self, site: RosEnvironment, name: str) -> None:
-        """Start it; SetupError without rospy, TransportError where the master does not answer."""
+        """Start the child. Raises SetupError without rospy, TransportError if the master does not answer."""
         require(site.python)
         self._telling, telling = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -94,7 +94,7 @@ class RospyProcess:
                 stdout=subprocess.DEVNULL,
                 env=site.environment,
                 pass_fds=(telling.fileno(), commands.fileno()),
-                start_new_session=True,  # Ctrl-C is for its parent, which may still have to bring a robot to a stand
+                start_new_session=True,  # Ctrl-C goes to the parent, which may still have to stop a robot
             )
         try:
             self._await_ready(site)
@@ -104,16 +104,16 @@ class RospyProcess:
 
     @property
     def pid(self) -> int:
-        """The child's process."""
+        """Process id of the child."""
         return self._process.pid
 
     def request(self, **word: Any) -> None:
-        """Have a topic opened; nothing where the child has ended, which `hear` says."""
+        """Request the child to open a topic. Does nothing if the child has ended: `read_messages` then returns."""
         with contextlib.suppress(OSError):
             self._commands.send(bytes([WORD]) + json.dumps(word).encode())
 
     def publish(self, index: int, payload: bytes) -> bool:
-        """Hand over a command without waiting; False where the child has ended or takes no more."""
+        """Send a command without waiting; return False if the child has ended or its socket is full."""
         packet = _COMMAND.pack(MESSAGE, index, time.monotonic()) + payload
         try:
             self._commands.send(packet, socket.MSG_DONTWAIT)
@@ -124,7 +124,7 @@ class RospyProcess:
     def read_messages(
         self, message: Callable[[int, bytes], None], word: Callable[[dict[str, Any]], None]
     ) -> None:
-        """Hand over all that the child tells, until it ends or is ended."""
+        """Call `message` or `word` for each message of the child, until it ends or `interrupt` is called."""
         with contextlib.suppress(EOFError, OSError):
             while True:
                 kind, index, payload = self._next()
@@ -134,13 +134,13 @@ class RospyProcess:
                     word(json.loads(payload))
 
     def interrupt(self) -> None:
-        """Let `hear` return, from another thread."""
+        """Make `read_messages` return; call it from another thread."""
         for one in (self._telling, self._commands):
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
 
     def stop(self) -> int:
-        """Close the sockets and wait for the child, which takes leave of the master; returns how it ended."""
+        """Close the sockets and wait until the child has deregistered; return its exit code."""
         self.interrupt()
         self._telling.close()
         self._commands.close()
@@ -151,7 +151,7 @@ class RospyProcess:
             return self._process.wait()
 
     def _await_ready(self, site: RosEnvironment) -> None:
-        """Wait for its first word."""
+        """Wait for the child's first control word. Raises TransportError if it did not start or found no master."""
         self._telling.settimeout(_START_S)
         try:
             _, _, payload = self._next()
@@ -172,7 +172,7 @@ class RospyProcess:
             )
 
     def _next(self) -> tuple[int, int, bytes]:
-        """Kind, topic and bytes of what comes next."""
+        """Return kind, topic and bytes of the next message."""
         kind, index, size = _HEAD.unpack(self._exactly(_HEAD.size))
         return kind, index, self._exactly(size)
 
@@ -186,4 +186,4 @@ class RospyProcess:
             size -= len(part)
         return (
             parts[0] if len(parts) == 1 else b"".join(parts)
-        )  # one, unless a signal came: no picture is copied
+        )  # a single part unless a signal interrupted: pictures are not copied

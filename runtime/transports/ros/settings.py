@@ -1,4 +1,4 @@
-"""A deployment's settings of a robot's topics, for either generation of ROS."""
+"""Deployment settings of a robot's ROS topics, for both generations of ROS."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class RosSettings(Settings):
 
     @model_validator(mode="after")
     def _command_each_once(self) -> RosSettings:
-        """Each target is told once."""
+        """Check that each target is named once."""
         if len(set(self.commands_to)) != len(self.commands_to):
             raise ConfigurationError(
                 f"transport.commands_to = {self.commands_to}; allowed: each at most once"
@@ -53,7 +53,7 @@ class RosSettings(Settings):
 
     @property
     def acceptance_limits(self) -> AcceptanceLimits:
-        """Terms on which this deployment takes messages."""
+        """Limits within which this deployment accepts messages."""
         return AcceptanceLimits(
             self.max_skew_s,
             self.stalled_after_s,
@@ -64,14 +64,14 @@ class RosSettings(Settings):
 
     @property
     def capabilities(self) -> Capabilities:
-        """Capabilities of the transport: a robot is attached to it."""
+        """Abilities of the transport: it commands a robot."""
         spaces = frozenset({"joint", "eef"}) if self.eef_commands else frozenset({"joint"})
         return Capabilities(moves_robot=True, measures_eef=self.eef, spaces=spaces, poses=(PoseFormat(),))
 
     def streams(
         self, robot: Robot, version: Literal[1, 2]
     ) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:
-        """Topics that are listened to and those that are spoken on, the simulation's first."""
+        """Return the subscribed streams and the command topics, those of the simulation first."""
         plan = TopicPlan(robot, version, self.topics, self.disabled_cameras)
         parts = plan.streams(self.eef)
         chosen: list[Target] = [target for target in ("simulation", "robot") if target in self.commands_to]
@@ -79,5 +79,5 @@ class RosSettings(Settings):
 
 
 def camera_keys(parts: tuple[StreamSpec, ...]) -> tuple[str, ...]:
-    """Keys of the cameras among what is listened to."""
+    """Return the keys of the cameras among the subscribed streams."""
     return tuple(part.source_key for part in parts if part.kind == "camera")

@@ -1,4 +1,4 @@
-"""Commands to a robot's topics: one message per group, all with the same stamp."""
+"""Sink of commands to a robot's topics: one message per group, all with the same stamp."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 class RosSink(Sink):
-    """Publishes every command on all its topics, those of the simulation first; nothing waits for a subscriber.
+    """Publisher of every command on all its topics, those of the simulation first, without waiting for a subscriber.
 
-    `stamp` of a message is when the command was made, in ROS time, which is this machine's wall clock.
+    The `stamp` of a message is the time of the command, in ROS time, which is this machine's wall clock.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class RosSink(Sink):
         self._publish: list[tuple[CommandTopic, Publish]] = []
 
     def connect(self) -> None:
-        """Advertise every topic; subscribers that are not there yet are found by themselves when they come."""
+        """Advertise every topic. Subscribers that start later connect by themselves."""
         self.close()
         self._middleware = middleware = self._open()
         self._publish = [
@@ -53,7 +53,10 @@ class RosSink(Sink):
         ]
 
     def send(self, command: RobotCommand) -> None:
-        """Hand over one absolute target; TransportError for a vector that no robot may be given."""
+        """Publish one absolute target.
+
+        Raises TransportError for a wrong width, numbers that are not finite, or no poses.
+        """
         if self._middleware is None:
             raise TransportError("the command topics are not advertised; connect before sending")
         action = _finite(command.action, self._robot.dim, "a command").astype(np.float64)
@@ -65,14 +68,15 @@ class RosSink(Sink):
                 )
             width = EEF_WIDTH * len(self._robot.arms)
             eef = _finite(command.eef, width, "a command's poses").astype(np.float64).reshape(-1, EEF_WIDTH)
+        # `command.time` is on our monotonic clock; the stamp is the wall clock at the same moment.
         stamp = self._wall() - round((self._clock.now() - command.time) * 1e9)
-        # All are made before the first is sent: a command reaches every group or none.
+        # Encode all messages before sending the first: a command reaches every group or none.
         messages = [self._wire.encode(self._message(one, stamp, action, eef)) for one, _ in self._publish]
         for (_, publish), payload in zip(self._publish, messages, strict=True):
             publish(payload)
 
     def missing_subscribers(self) -> dict[str, str]:
-        """The command topics to which nobody listens, and why not where that is known, or ""."""
+        """Map command topics that have no subscriber, or a refused one, to the reason, "" if unknown."""
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
 

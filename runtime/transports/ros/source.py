@@ -1,4 +1,4 @@
-"""A robot's topics as a source of observations: aligned in time, checked, its silences named."""
+"""Source of observations from a robot's topics: aligned in time, checked, with silent topics reported."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from robots import Robot
 
 log = logging.getLogger(__name__)
-_PICTURES_DEPTH = 32  # of a camera; a second of them at 30 Hz
+_PICTURES_DEPTH = 32  # [messages] of a camera; one second at 30 Hz
 _HISTORY_S = 1.0
-_LOOK_S = 0.5  # how often it is looked who is at the other side of silent topics
-_GRACE_S = 1.0  # for publishers and us to find each other
+_LOOK_S = 0.5  # period of checks for the peers of silent topics [s]
+_GRACE_S = 1.0  # time for publishers and us to find each other [s]
 _BACK = Pattern(
     "ros.clock_back",
     "the clock that stamps {stream} went back: it was set, or its node was started anew",
@@ -56,7 +56,7 @@ _APART = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class Subscription:
-    """A subscription: its topic, and the parts of a frame that its messages have."""
+    """Subscribed topic with the streams that its messages contain."""
 
     topic: Topic
     parts: tuple[StreamSpec, ...]
@@ -64,24 +64,24 @@ class Subscription:
 
 @dataclass(frozen=True, slots=True)
 class AcceptanceLimits:
-    """Terms on which messages are taken."""
+    """Limits within which messages are accepted."""
 
-    skew: float  # s, window of the alignment
-    stalled: float  # s, after which a stream counts as stalled
+    skew: float  # window of the alignment [s]
+    stalled: float  # time after which a stream counts as stalled [s]
     names: Names
-    stamped: bool  # by their senders; else by their arrival here
+    stamped: bool  # True: stamps of the senders count; False: arrival here
     detect_frozen: bool
 
 
 class RosSource(Source):
-    """Delivers the newest frame of aligned messages; waits where streams do not belong together.
+    """Source of the newest frame of aligned messages; it waits while streams are too far apart.
 
-    Messages are checked as they come, on the middleware's thread, and counted by what is wrong with them. Reading
-    takes nothing away: this source is one reader of `alignment`, with a cursor of its own. What keeps frames from
-    coming is news, once for each reason.
+    Messages are checked on the middleware's thread when they arrive, and faults are counted by name. Reading removes
+    nothing: this source is one reader of `alignment`, with a cursor of its own. Each reason why no frame arrives is
+    reported once as an event.
     """
 
-    _cursor: Aligned[StampedValue] | None  # the frame delivered last
+    _cursor: Aligned[StampedValue] | None  # last delivered frame
     _count: int
     _news: list[Event]
 
@@ -103,7 +103,7 @@ class RosSource(Source):
         self._forget()
 
     def connect(self) -> None:
-        """Subscribe to everything; publishers that are not there yet are found by themselves when they come."""
+        """Subscribe to all topics. Publishers that start later are found by themselves."""
         self.close()
         self._forget()
         self._began = self._framed_at = self._clock.now()
@@ -112,7 +112,7 @@ class RosSource(Source):
             self._middleware.subscribe(one.topic, self._make_callback(one))
 
     def receive(self, timeout: float) -> Observation | None:
-        """The newest frame not yet delivered, as RGB; None after `timeout` seconds without one."""
+        """Return the newest frame that was not delivered yet, as RGB; None after `timeout` [s] without one."""
         if self._middleware is None:
             raise TransportError("the ROS topics are not subscribed; connect before receiving")
         with self._changed:
@@ -142,7 +142,7 @@ class RosSource(Source):
             self._middleware = None
 
     def faults(self) -> dict[str, int]:
-        """Refused messages by reason, `stalled_<stream>`, `frozen_<camera>`, jumps of the senders' clock."""
+        """Return refused messages by reason, `stalled_<stream>`, `frozen_<camera>` and jumps of the senders' clock."""
         with self._changed:
             self._notice_stalls()
             counts = dict(self._faults)
@@ -150,22 +150,22 @@ class RosSource(Source):
         return counts | {name: count for name, count in jumps.items() if count}
 
     def describe_fault(self, fault: str) -> str:
-        """The newest sentence of a fault."""
+        """Return the newest sentence about a fault."""
         with self._changed:
             return self._sentences.get(fault, "")
 
     def pop_events(self) -> list[Event]:
-        """Why no frame comes: a stream that is silent, with its age, and who is at the other side of its topic."""
+        """Return why no frame arrives: silent streams with their age and peers, or streams too far apart in time."""
         told, self._news = self._news, []
         return told
 
     @property
     def last_fault(self) -> str:
-        """The sentence of the newest fault; empty where there was none."""
+        """Sentence about the newest fault; "" if there was none."""
         return self._last_fault
 
     def stalled(self) -> dict[str, float]:
-        """The streams without a usable message for too long, with the age of their newest, or of the link [s]."""
+        """Return streams without a usable message for too long: age of the newest, or of the connection [s]."""
         now, began = self._clock.now(), self._began
         ages = {part.name: now - self._heard_at.get(part.name, began + _GRACE_S) for part in self._parts}
         return {
@@ -187,8 +187,10 @@ class RosSource(Source):
         self._assembly = Assembly(self._robot, self._parts, self._terms.detect_frozen)
         self._faults: Counter[str] = Counter()
         self._last_fault = ""
-        self._sentences: dict[str, str] = {}  # by fault, the newest
-        self._refusals: dict[str, tuple[str, str]] = {}  # by stream: why its newest message is unusable
+        self._sentences: dict[str, str] = {}  # newest sentence by fault
+        self._refusals: dict[
+            str, tuple[str, str]
+        ] = {}  # by stream: fault and sentence of an unusable newest message
         self._heard_at: dict[str, float] = {}
         self._stalled: set[str] = set()
         self._told: set[str] = set()
@@ -213,7 +215,7 @@ class RosSource(Source):
         return take
 
     def _take(self, part: StreamSpec, message: Message, arrived: float) -> None:
-        """Keep one message; whatever is wrong with it is counted and ends nothing."""
+        """Store one message; any error is counted and does not end the thread."""
         try:
             value = self._readers.read(part, message)
             stamp = self._stamp(message, arrived)
@@ -253,7 +255,7 @@ class RosSource(Source):
         return message.stamp * 1e-9
 
     def _notice_stalls(self) -> None:
-        """Count each stream that has just stalled."""
+        """Count each stream that has stalled since the last call."""
         now = self.stalled()
         for name in now.keys() - self._stalled:
             fault = f"stalled_{name.replace(' ', '_')}"
@@ -262,7 +264,7 @@ class RosSource(Source):
         self._stalled = set(now)
 
     def _report_no_frame(self) -> None:
-        """Tell why no frame comes, once per reason; says nothing while streams are merely on their way."""
+        """Report why no frame arrives, once per reason; nothing is reported while streams are merely delayed."""
         with self._changed:
             stalled = self.stalled()
             apart = (
@@ -304,7 +306,7 @@ class RosSource(Source):
         return {self._reason(name) for name in names}
 
     def _reason(self, name: str) -> str:
-        """Reason that is logged once: a stream's silence, or what is wrong with its messages."""
+        """Return the key under which a cause is reported once: a stream's silence, or the fault of its messages."""
         return f"{name}: {self._refusals.get(name, ('', ''))[0]}"
 
     def _silence(self, name: str, age: float, match: Match) -> str:
@@ -334,7 +336,10 @@ class RosSource(Source):
 def subscriptions(
     parts: tuple[StreamSpec, ...], quality: Callable[[str], Quality]
 ) -> tuple[Subscription, ...]:
-    """One per topic: several groups may be on the same one, as on /joint_states."""
+    """Group the streams into one subscription per topic: several groups may share one, e.g. /joint_states.
+
+    Raises ConfigurationError if the streams of one topic need different message types.
+    """
     by_topic: dict[str, list[StreamSpec]] = defaultdict(list)
     for part in parts:
         by_topic[part.topic].append(part)

@@ -1,8 +1,8 @@
-"""ROS 1's topics through rospy in a process of its own, which is started again when it ends or the master is another.
+"""ROS 1 topics through rospy in a child process, which is restarted when it ends or the master is replaced.
 
-A master that was restarted knows nobody, and no node of ROS 1 tells it of itself again. So a new child registers
-anew; nodes that are as old as the first master have to be restarted too. A master that is not there yet is waited
-for, and named meanwhile.
+A restarted master knows no nodes, and ROS 1 nodes do not register again by themselves. A new child therefore
+registers anew; other nodes that are older than the master must be restarted, too. If no master is there yet, the
+middleware waits for it and reports that meanwhile.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publis
 from runtime.transports.ros.rospy_process import RosEnvironment, RospyProcess, require
 
 log = logging.getLogger(__name__)
-_PAUSES_S = (0.2, 0.5, 1.0, 2.0)  # between two tries to start it again; the last one for all that follow
+_PAUSES_S = (0.2, 0.5, 1.0, 2.0)  # pauses between attempts to start it again [s]; the last one repeats
 
 
 class TcpRosMiddleware(Middleware):
-    """One node at a time; one thread hears it and replaces it."""
+    """Middleware with one rospy node at a time; one thread reads from it and replaces it."""
 
     def __init__(self, site: RosEnvironment, name: str) -> None:
-        """Become a node behind the caller's back, as soon as the master answers; SetupError without rospy."""
+        """Start a node in the background as soon as the master answers. Raises SetupError without rospy."""
         require(site.python)
         self._site, self._name = site, name
-        self._topics: list[tuple[Topic, Deliver | None]] = []  # None: one that is spoken on
+        self._topics: list[tuple[Topic, Deliver | None]] = []  # None: a command topic
         self._peers: dict[int, tuple[int, str]] = {}
         self._unopened: dict[int, str] = {}
-        self._trouble = ""  # why there is no child, or no master
-        self._farewell = ""  # why the child ended
+        self._trouble = ""  # reason why there is no child or no master
+        self._farewell = ""  # reason why the child ended
         self._stale = self._lost = 0
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -42,18 +42,18 @@ class TcpRosMiddleware(Middleware):
         self._thread.start()
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> None:
-        """Hear the topic from the middleware's one thread."""
+        """Subscribe to the topic; `deliver` is called from the middleware's one thread."""
         self._open(topic, deliver)
 
     def advertise(self, topic: Topic) -> Publish:
-        """Commands for a child that has ended or takes no more are left out: they would be old when it is back."""
+        """Return a publisher that drops commands while the child is absent or behind: later they would be old."""
         index = self._open(topic, None)
 
         def publish(payload: bytes) -> None:
             child = self._child
             if child is None or not child.publish(index, payload):
                 self._lost += 1
-                if self._lost.bit_count() == 1:  # 1, 2, 4, 8, ...
+                if self._lost.bit_count() == 1:  # at 1, 2, 4, 8, ...
                     log.warning(
                         "commands did not leave, %d so far: %s", self._lost, self._trouble or "behind"
                     )
@@ -61,7 +61,7 @@ class TcpRosMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """As the child told it last, and why nobody is there where that is known."""
+        """Return the peers from the child's last report, with the reason for a missing peer if it is known."""
         with self._lock:
             found = {}
             for index, (topic, _) in enumerate(self._topics):
@@ -72,7 +72,7 @@ class TcpRosMiddleware(Middleware):
 
     @property
     def pid(self) -> int | None:
-        """The process of rospy, None while there is none."""
+        """Process id of rospy; None while there is no child."""
         child = self._child
         return None if child is None else child.pid
 
@@ -100,11 +100,11 @@ class TcpRosMiddleware(Middleware):
         )
 
     def _start(self) -> RospyProcess:
-        # A master that is told of a second node of a name ends the first one.
+        # A master ends the first node when a second one registers under the same name.
         return RospyProcess(self._site, f"{self._name}_{uuid.uuid4().hex[:12]}")
 
     def _run(self) -> None:
-        """The thread: hears one child after the other."""
+        """Run the thread: read from one child after the other."""
         child = self._start_child(0.0)
         while child is not None:
             self._farewell = ""
@@ -119,7 +119,7 @@ class TcpRosMiddleware(Middleware):
             child = self._start_child(_PAUSES_S[0])
 
     def _start_child(self, pause: float) -> RospyProcess | None:
-        """A child that knows all topics, after `pause` [s] and as many more as it takes; None where none is wanted."""
+        """Start a child that opens all topics, after `pause` [s] and as many attempts as needed; None when closing."""
         later = iter(_PAUSES_S)
         while not self._ending.wait(pause):
             pause = next(later, _PAUSES_S[-1])
@@ -133,7 +133,7 @@ class TcpRosMiddleware(Middleware):
                 self._child = child
                 for index in range(len(self._topics)):
                     self._request(child, index)
-            if self._ending.is_set():  # whoever ended it did not see the child
+            if self._ending.is_set():  # `close` ran before it could see this child
                 child.interrupt()
             log.info("rospy is a node of the master at %s", self._site.master)
             return child
@@ -150,11 +150,11 @@ class TcpRosMiddleware(Middleware):
             return
         try:
             deliver(payload)
-        except Exception:  # of one message: nobody else would hear the next
+        except Exception:  # an error with one message must not end the only reader
             log.exception("reading %s failed", self._topics[index][0].name)
 
     def _handle_word(self, word: dict[str, Any]) -> None:
-        """Obey a word of the child that is no message."""
+        """Handle a control word of the child."""
         if "peers" in word:
             self._take_status(word)
         elif "log" in word:

@@ -1,4 +1,4 @@
-"""Which topics a deployment listens to and speaks on: the robot's own, unless the deployment names others."""
+"""Topics of a deployment: those of the robot's description, unless the deployment names others."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ class Topics(Settings):
 
 @dataclass(frozen=True, slots=True)
 class StreamSpec:
-    """One stream of a frame: what kind it is, of which group or camera (key), on which topic.
+    """One stream of a frame: its kind, its group or camera key, and its topic.
 
-    `joints` are the names in the message of the numbers that are wanted, in the group's order.
+    `joints` are the names of the wanted values in the message, in the group's order.
     """
 
     kind: Literal["joints", "gripper", "eef", "camera"]
@@ -64,15 +64,15 @@ class StreamSpec:
 
     @property
     def name(self) -> str:
-        """The stream's name: a camera's key, or "left_arm joints"."""
+        """Name of the stream: a camera's key, or e.g. "left_arm joints"."""
         return self.source_key if self.kind == "camera" else f"{self.source_key} {self.kind}"
 
 
 @dataclass(frozen=True, slots=True)
 class CommandTopic:
-    """One topic of commands: the places in the robot's vector that go there, under these joint names.
+    """Command topic: the dimensions of the robot's vector that are published there, under these joint names.
 
-    For a pose, `arm` is the arm's place among the robot's arms, and `frame` what the pose is expressed in.
+    For a pose, `arm` is the arm's index among the robot's arms, and `frame` is the frame of the pose.
     """
 
     topic: str
@@ -84,7 +84,7 @@ class CommandTopic:
 
 
 class TopicPlan:
-    """The topics for one robot; ConfigurationError names what is missing or not the robot's."""
+    """Topics of one robot. Raises ConfigurationError for topics that are missing or do not fit the robot."""
 
     def __init__(self, robot: Robot, version: Literal[1, 2], given: Topics, disabled: list[str]) -> None:
         self._robot, self._given = robot, given
@@ -97,7 +97,7 @@ class TopicPlan:
             self._check_joints(group)
 
     def streams(self, eef: bool) -> tuple[StreamSpec, ...]:
-        """Everything that a frame consists of, with poses where `eef`."""
+        """Return all streams of a frame, with poses if `eef`."""
         made = [self._camera(camera) for camera in self.cameras]
         for group in self._robot.groups:
             made += self._state(group)
@@ -107,7 +107,7 @@ class TopicPlan:
         return tuple(made)
 
     def command_topics(self, targets: Sequence[Target], eef: bool) -> tuple[CommandTopic, ...]:
-        """Outlets of commands, in the order of the targets, with poses where `eef`; one message per topic."""
+        """Return the command topics in the order of the targets, with poses if `eef`; one message per topic."""
         merged: dict[str, CommandTopic] = {}
         for target in targets:
             for group in self._robot.groups:
@@ -155,7 +155,10 @@ class TopicPlan:
     def _joint_commands(
         self, group: Group, names: tuple[str, ...], dims: tuple[int, ...], posed: bool
     ) -> Iterator[CommandTopic]:
-        """The group's joints, its gripper by itself where it has a topic; a posed arm needs the latter alone."""
+        """Yield the command topics of joints, with a separate gripper topic if there is one.
+
+        If the arm is commanded by poses (`posed`), a gripper topic is enough.
+        """
         apart = self._topic(group, "gripper_command")
         index = None if group.gripper is None else group.gripper.index
         topic = self._topic(group, "command")
@@ -180,7 +183,7 @@ class TopicPlan:
             )
 
     def _topic(self, group: Group, field: str) -> str:
-        """The topic, "" where there is none."""
+        """Return the topic, "" if there is none."""
         given = getattr(self._given.groups.get(group.name), field, None)
         if given is None and self._own is not None:
             given = getattr(self._own.groups.get(group.name), field, None)
@@ -197,7 +200,7 @@ class TopicPlan:
 
 
 def _merged(before: CommandTopic | None, outlet: CommandTopic) -> CommandTopic:
-    """One message of both: groups may share a topic of commands where their joints have names of their own."""
+    """Merge two command topics into one message: groups may share a topic if their joint names differ."""
     if before is None:
         return outlet
     joints = before.joints + outlet.joints

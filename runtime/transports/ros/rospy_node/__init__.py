@@ -1,1 +1,1 @@
-"""A program for another Python, run by its path; nothing here is imported."""
+"""Program for another Python, run by its path and never imported."""

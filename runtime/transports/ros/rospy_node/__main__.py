@@ -1,8 +1,8 @@
-"""One ROS 1 node for a process that cannot have rospy itself: `PYTHON THIS_FILE OPTIONS`, run by its path.
+"""ROS 1 node for a process that cannot run rospy itself: `PYTHON THIS_FILE OPTIONS`, run by its path.
 
-It is run by whatever Python has rospy, so it knows the standard library (Python 3.8 and later) and ROS alone, and is
-never imported. Messages pass as the bytes that they are on the wire. What goes over the two sockets is said in
-runtime/transports/ros/rospy_process.py. The node lives until its parent closes them, or until the master is another.
+It runs in any Python that has rospy, so it uses only the standard library (Python 3.8 and later) and ROS, and is never
+imported. Messages pass in their encoded form. The protocol of the two sockets is described in
+runtime/transports/ros/rospy_process.py. The node lives until its parent closes them, or until the master changes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from typing import Any
 
 MESSAGE, WORD = 1, 2
 HEAD = struct.Struct("<BxHI")  # kind, topic, size
-COMMAND = struct.Struct("<BxHd")  # kind, topic, when it was made on the machine's monotonic clock [s]
+COMMAND = struct.Struct("<BxHd")  # kind, topic, creation time on the machine's monotonic clock [s]
 LARGEST_COMMAND = 1 << 20
-ANSWER_S = 2.0  # of the master and of other nodes
-LOOK_S, MASTER_S, WHY_S = 0.2, 1.0, 2.0  # how often peers are counted, the master asked, absence explained
+ANSWER_S = 2.0  # timeout of the master and of other nodes [s]
+LOOK_S, MASTER_S, WHY_S = 0.2, 1.0, 2.0  # periods [s]: peers reported, master polled, missing peers explained
 LEAVE_S = 1.0
 LONGEST_SAYING, SAYINGS_KEPT = 300, 100
 BUFFER = {"Image": 1 << 24, "CompressedImage": 1 << 22}
@@ -35,11 +35,11 @@ LOGGING = "version: 1\ndisable_existing_loggers: false\n"
 
 
 class NoXmlRpcAnswer(Exception):
-    """Somebody did not answer as the ROS master and nodes do."""
+    """Error for a peer that does not answer like a ROS master or node."""
 
 
 class _Bounded(xmlrpc.client.Transport):
-    """HTTP that does not wait for ever."""
+    """HTTP transport with a timeout."""
 
     def make_connection(self, host: Any) -> Any:
         connection = super().make_connection(host)
@@ -48,7 +48,10 @@ class _Bounded(xmlrpc.client.Transport):
 
 
 def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None) -> Any:
-    """Answer of the master or a node; `default`, where there is one, for what it does not know."""
+    """Call a method of the master or a node; return `default`, if given, when the call reports failure.
+
+    Raises NoXmlRpcAnswer.
+    """
     try:
         with xmlrpc.client.ServerProxy(address, transport=_Bounded()) as proxy:
             code, said, value = getattr(proxy, method)("/eva_web", *arguments)
@@ -66,14 +69,14 @@ def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None)
 
 
 class Parent:
-    """The process that this one works for; what is told to it is whole, whoever tells."""
+    """Link to the parent process. Messages stay whole although several threads send."""
 
     def __init__(self, telling: socket.socket, commands: socket.socket) -> None:
         self._telling, self.commands = telling, commands
         self._lock = threading.Lock()
 
     def message(self, index: int, payload: bytes) -> None:
-        """Hand over a message; waits while the parent is behind, so that nothing piles up here."""
+        """Send a message; waits while the parent is behind, so that nothing accumulates here."""
         self._send(HEAD.pack(MESSAGE, index, len(payload)), payload)
 
     def word(self, **fields: Any) -> None:
@@ -86,12 +89,12 @@ class Parent:
                 sent = self._telling.sendmsg([head, payload])
                 if sent < len(head) + len(payload):
                     self._telling.sendall((head + payload)[sent:])
-            except OSError:  # it has ended, and so this has no purpose
+            except OSError:  # the parent has ended, so this process has no purpose
                 os._exit(0)
 
 
 class WarningForwarder(logging.Handler):
-    """Warnings of rospy, for the parent's log, once each."""
+    """Log handler that forwards rospy's warnings to the parent, each text once."""
 
     def __init__(self, parent: Parent) -> None:
         super().__init__(logging.WARNING)
@@ -106,13 +109,13 @@ class WarningForwarder(logging.Handler):
 
 
 class Topics:
-    """Topics that the node listens to and speaks on, by the parent's numbers."""
+    """Subscribed and advertised topics, by the parent's indices."""
 
     def __init__(self, parent: Parent) -> None:
         self._parent = parent
-        self.open: dict[int, tuple[str, Any, Any]] = {}  # name, class of messages, Subscriber or Publisher
+        self.open: dict[int, tuple[str, Any, Any]] = {}  # name, message class, Subscriber or Publisher
         self._counts: dict[int, int] = {}
-        self.stale = 0  # commands that were too old to be published
+        self.stale = 0  # number of commands that were too old to be published
 
     def subscribe(self, index: int, name: str, kind: str, queue: int) -> None:
         import rospy
@@ -133,7 +136,7 @@ class Topics:
         self._counts[index] = 0
 
     def publish(self, index: int, payload: bytes) -> None:
-        """Publish a message, counted in its header as rospy counts."""
+        """Publish a message, with the count in its header that rospy would write."""
         self._counts[index] = (self._counts[index] + 1) % (1 << 32)
         _, made, publisher = self.open[index]
         message = made()
@@ -144,7 +147,7 @@ class Topics:
         return index in self._counts
 
     def peers(self, index: int) -> int:
-        """Count of connected peers; one that has refused, or is just being called, does not count."""
+        """Return the number of connected peers, without refused and still connecting peers."""
         opened = self.open[index][2]
         if opened is None:
             return 0
@@ -153,7 +156,7 @@ class Topics:
 
 
 def raw(kind: str) -> Any:
-    """A class of rospy's for messages that stay bytes, which says of itself what messages of `kind` say."""
+    """Create a rospy class for messages that stay bytes, with the type and checksum of `kind`."""
     import importlib
 
     import rospy
@@ -165,7 +168,7 @@ def raw(kind: str) -> Any:
 
 
 class PeerMonitor:
-    """Tells the parent who is at the other side of each topic; ends the process when the master is another."""
+    """Monitor that reports the peers of each topic to the parent and ends the process when the master changes."""
 
     def __init__(self, parent: Parent, topics: Topics, master: str, address: str) -> None:
         import rospy
@@ -211,12 +214,12 @@ class PeerMonitor:
             os._exit(0)
 
     def _explain(self) -> None:
-        """Say of each topic without a peer what the master knows of others."""
+        """Record for each topic without a peer why the nodes known to the master are not connected."""
         lonely = [index for index in list(self._topics.open) if not self._topics.peers(index)]
         self._refused = {}
         if not lonely or self._trouble:
             return
-        with contextlib.suppress(NoXmlRpcAnswer):  # the next look says it
+        with contextlib.suppress(NoXmlRpcAnswer):  # the next round reports it
             publishers, subscribers, _ = call_xmlrpc(self._master, "getSystemState")
             for index in lonely:
                 spoken = self._topics.publishes(index)
@@ -229,7 +232,7 @@ class PeerMonitor:
                     self._refused[index] = self._absence(index, others[0], spoken)
 
     def _absence(self, index: int, node: str, spoken: bool) -> str:
-        """Why a node that the master has on the topic is not connected."""
+        """Return why a node that the master lists for the topic is not connected."""
         name, made, _ = self._topics.open[index]
         verb = "subscribes to" if spoken else "publishes"
         try:
@@ -255,7 +258,7 @@ class PeerMonitor:
         )
 
     def _tell(self) -> None:
-        """The parent hears what has changed."""
+        """Report the status to the parent if it has changed."""
         found = {
             str(index): [self._topics.peers(index), self._refused.get(index, "")]
             for index in list(self._topics.open)
@@ -267,7 +270,7 @@ class PeerMonitor:
 
 
 def run_commands(parent: Parent, topics: Topics, life: float) -> None:
-    """Do what the parent says until it has ended; a command that is older than `life` seconds is left undone."""
+    """Execute the parent's requests until it has ended; commands older than `life` [s] are dropped."""
     while True:
         packet = parent.commands.recv(LARGEST_COMMAND)
         if not packet:
@@ -277,7 +280,7 @@ def run_commands(parent: Parent, topics: Topics, life: float) -> None:
             act = topics.advertise if asked.pop("publish") else topics.subscribe
             try:
                 act(**asked)
-            except Exception as error:  # rospy's own, of a name or a definition
+            except Exception as error:  # exceptions of rospy for a bad name or definition
                 parent.word(unopened=[asked["index"], f"{asked['name']} cannot be opened: {error}"])
             continue
         _, index, made = COMMAND.unpack_from(packet)
@@ -288,7 +291,7 @@ def run_commands(parent: Parent, topics: Topics, life: float) -> None:
 
 
 def start_node(options: dict[str, Any], parent: Parent) -> None:
-    """Become a node; ends the process with a word where that cannot be."""
+    """Start the node; report the failure to the parent and end the process if that is impossible."""
     master = options["master"]
     try:
         call_xmlrpc(master, "getPid")  # init_node would wait for a master for ever
@@ -310,7 +313,7 @@ def start_node(options: dict[str, Any], parent: Parent) -> None:
 
 
 def shut_down() -> None:
-    """Take leave of the master, and end whether or not it answers."""
+    """Deregister from the master, and end even if it does not answer."""
     import rospy
 
     ending = threading.Thread(target=rospy.signal_shutdown, args=("the parent has ended",), daemon=True)
@@ -320,13 +323,13 @@ def shut_down() -> None:
 
 
 def main() -> None:
-    """Run for the parent, or say whether that would be possible."""
+    """Run for the parent, or with the option "check" only test the imports."""
     for kind in ("sensor_msgs/JointState", "geometry_msgs/PoseStamped"):
         raw(kind)
     options = json.loads(sys.argv[1])
     if options.get("check"):
         return
-    for number in (signal.SIGINT, signal.SIGTERM):  # the parent's end is this one's, and nothing before
+    for number in (signal.SIGINT, signal.SIGTERM):  # the parent decides when this process ends
         signal.signal(number, signal.SIG_IGN)
     parent = Parent(socket.socket(fileno=options["telling"]), socket.socket(fileno=options["commands"]))
     start_node(options, parent)
