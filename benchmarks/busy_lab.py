@@ -44,14 +44,14 @@ def main() -> int:
     given = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
-    from evaweb.lab.lab import a_lab
-    from evaweb.lab.lifetime import Ended
+    from evaweb.lab.lab import open_lab
+    from evaweb.lab.lifetime import StopRequested
 
     try:
-        with a_lab("127.0.0.1", 0) as lab:
+        with open_lab("127.0.0.1", 0) as lab:
             _up(lab, given)
             lab.watch()
-    except Ended:  # as it should
+    except StopRequested:  # as it should
         return 0
     return 1
 
@@ -59,13 +59,13 @@ def main() -> int:
 def _up(lab: Any, given: argparse.Namespace) -> None:
     from evaweb.lab import programs, seed
     from evaweb.lab.benches import Bench
-    from evaweb.lab.processes import Program
+    from evaweb.lab.processes import ProgramSpec
     from evaweb.roles import Role
     from runtime.sim.standin import announce_ready
 
     node = lab.processes.start(programs.tabletop(ROBOT, programs.bench(1, 640, 480)))
     serving = ("-m", "runtime.sim.serve", "openpi", *_POLICY)
-    policy = lab.processes.start(Program("policy", serving, announces=True))
+    policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
     assignments = [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',
         f'transport.pub_endpoint="{node["action_endpoint"]}"',
@@ -73,7 +73,7 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
         *PATIENT,
         *given.assignments,
     ]
-    url = lab.up([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])
+    url = lab.start([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])
     login = seed.demo_login(username="operator", role=Role.OPERATOR)
     facts = {"url": url, "passwords": {login.username: login.password}, "node": node["obs_endpoint"]}
     announce_ready({**facts, "pids": lab.processes.pids()}, given.ready_file)

@@ -32,8 +32,8 @@ from benchmarks.lab import enrol, two_free_ports
 from benchmarks.labs import RunningLab, lab
 from benchmarks.report import Figure, Report
 from benchmarks.start import started
-from evaweb.lab.patience import NoReply, VisitFailed
-from evaweb.lab.visitor import Visitor
+from evaweb.lab.patience import DemoFailed, NoReply
+from evaweb.lab.visitor import RestClient
 from tests.crash.lab import ROOT, Lab
 
 SECONDS = 600.0
@@ -108,7 +108,7 @@ class _Operator(threading.Thread):
         self.said: Counter[str] = Counter()  # refusals and lost answers
         self.over = threading.Event()
         self.voided = 0  # at rest, because no score was taken
-        self._visitor = Visitor(running.visitor.url)
+        self._visitor = RestClient(running.visitor.url)
         self._password = running.announced["passwords"]["operator"]
         self._chance, self._page, self._logged_in = chance, uuid4().hex, False
 
@@ -120,7 +120,7 @@ class _Operator(threading.Thread):
         """One trial, or whatever is open, to its end; True where it came to one."""
         try:
             return self._trial()
-        except VisitFailed as fault:  # refused, or no answer came for long: as a person, look anew
+        except DemoFailed as fault:  # refused, or no answer came for long: as a person, look anew
             self.said[str(fault)[:160]] += 1
             time.sleep(_AGAIN_S)
             return False
@@ -130,13 +130,13 @@ class _Operator(threading.Thread):
         try:
             self._end(number)
             return ""
-        except VisitFailed as fault:
+        except DemoFailed as fault:
             self.said[f"at rest: {fault}"[:160]] += 1
         try:
             self._ask("post", f"trials/{number}/void", {"reason": "left behind"})
             self.voided += 1
             return ""
-        except VisitFailed as fault:
+        except DemoFailed as fault:
             return str(fault)
 
     def _trial(self) -> bool:
@@ -162,7 +162,7 @@ class _Operator(threading.Thread):
         until = time.monotonic() + _PATIENCE_S
         while (status := self._ask("get", f"trials/{number}")["status"]) in ("running", "paused"):
             if time.monotonic() > until:
-                raise VisitFailed(f"trial {number} stays {status}")
+                raise DemoFailed(f"trial {number} stays {status}")
             if "stop" in (self._look()["snapshot"] or {}).get("allowed", ()):
                 self._command("stop")
             time.sleep(_AGAIN_S)
@@ -205,7 +205,7 @@ class _Operator(threading.Thread):
                     self._logged_in = True
                 found: Mapping[str, Any] = getattr(self._visitor, verb)(*given)
                 return found
-            except VisitFailed as fault:
+            except DemoFailed as fault:
                 unknown = isinstance(fault, NoReply) or "HTTP 50" in str(fault)
                 self._logged_in = self._logged_in and "HTTP 401" not in str(fault)
                 if not (unknown and again) or time.monotonic() > until:

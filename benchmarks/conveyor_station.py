@@ -50,7 +50,7 @@ def _places(robot: str) -> PlaceMap:
     return PlaceMap(robots.load_robot(robot), CONVEYOR.belt)
 
 
-class Gallery(Environment):
+class DeferredPicturesEnvironment(Environment):
     """The conveyor, with a stamp for each picture: the number of its frame, of which `develop` draws the picture."""
 
     def __init__(self, robot: Robot, conveyor: Conveyor) -> None:
@@ -71,7 +71,7 @@ class Gallery(Environment):
         digits = np.frombuffer(frame.to_bytes(4, "big"), np.uint8)
         return {key: np.broadcast_to(digits[:, None, None], (4, 4, 3)).copy() for key in self._keys}
 
-    def develop(self, stamp: UInt8) -> dict[str, UInt8]:
+    def render(self, stamp: UInt8) -> dict[str, UInt8]:
         """The picture from above, RGB [H, W, 3] by its key, of the frame that a stamp names."""
         q, state = self._frames[int.from_bytes(stamp[:, 0, 0].tobytes(), "big")]
         drawn = self._renderer.draw(q, state)
@@ -86,10 +86,10 @@ class Gallery(Environment):
         self.conveyor.reset(wish)
 
 
-class Seeing(Policy):
+class ScriptPolicy(Policy):
     """A script as a policy in this process, which is shown developed pictures."""
 
-    def __init__(self, script: ChaseScript, gallery: Gallery) -> None:
+    def __init__(self, script: ChaseScript, gallery: DeferredPicturesEnvironment) -> None:
         self._script, self._gallery = script, gallery
         self._answer = script.begin()
 
@@ -99,7 +99,7 @@ class Seeing(Policy):
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
         """The rows of the script for this observation, after those that the robot is committed to."""
-        pictures = self._gallery.develop(observation.pictures[self._script.overhead.key])
+        pictures = self._gallery.render(observation.pictures[self._script.overhead.key])
         rows = self._answer(observation.qpos.astype(np.float64), pictures, observation.prompt)
         if conditioning is not None:
             left = conditioning.remaining_rows.astype(np.float64)
@@ -129,13 +129,14 @@ def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -
         "lockstep": {"delay_ticks": delay},
     }
     made = check_deployment(loader.resolve_deployment(tree, {}, "moving_target"))
-    gallery = Gallery(made.robot, Conveyor(made.robot, seed))
+    gallery = DeferredPicturesEnvironment(made.robot, Conveyor(made.robot, seed))
     clock = VirtualClock()
     options = parser().parse_args(
         ["--robot", made.robot.name, "--bench", "conveyor", "--start-pose", "ready"]
     )
     script = ChaseScript(made.robot, HORIZON, made.rate, clock=clock, places=_places(made.robot.name))
     peers = replace(
-        in_process_peers(made, clock, gallery, options), policy=lambda spec, clock: Seeing(script, gallery)
+        in_process_peers(made, clock, gallery, options),
+        policy=lambda spec, clock: ScriptPolicy(script, gallery),
     )
     return gallery.conveyor, Lockstep(made, clock, peers=peers)

@@ -24,9 +24,18 @@ from numpy.typing import NDArray
 from benchmarks import coverage
 from benchmarks.report import Figure, Report
 from evaweb.plans.schedule import RANDOM, Condition, Unit, counts_of, schedule
-from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness
-from evaweb.statistics.courses import course
-from evaweb.statistics.designs import ANYTIME, FIXED, SCORE, conclude, design, findings, in_blocks, unbeaten
+from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness_of
+from evaweb.statistics.courses import design_power
+from evaweb.statistics.designs import (
+    ANYTIME,
+    FIXED,
+    SCORE,
+    design,
+    evaluate_design,
+    findings,
+    in_blocks,
+    unbeaten,
+)
 from evaweb.statistics.difference import barnard
 from evaweb.statistics.stagewise import stagewise
 
@@ -313,7 +322,7 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
     """The least extreme table that Barnard's test says something of: it says it of all that are more so."""
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),
-        key=lambda table: operator.truediv(*extremeness(table[0], n, table[1], n, None)),
+        key=lambda table: operator.truediv(*extremeness_of(table[0], n, table[1], n, None)),
     )
     low, high = 0, len(tables)
     while low < high:
@@ -382,11 +391,11 @@ def _runs(case: Case) -> int:
 def _found(case: Case, rates: Rates, pairs: int) -> Found:
     """How it ends at these rates, exact where it can be."""
     if exact := boundary_of(case, pairs):
-        ended = exact.course(*rates)
+        ended = exact.operating_characteristics(*rates)
         return Found(ended.power, ended.median // 2)
     if case.outcome == SCORE:
         return _simulated(case, rates, pairs)
-    of_runs = course(case.rule, pairs, *rates, case.alpha)
+    of_runs = design_power(case.rule, pairs, *rates, case.alpha)
     return Found(of_runs.power, of_runs.median, _error(of_runs.power, _RUNS_OF_RATES))
 
 
@@ -395,9 +404,13 @@ def _simulated(case: Case, rates: Rates, pairs: int) -> Found:
     chance = np.random.default_rng(pairs)
     planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, outcome=case.outcome)
     scores = chance.binomial(_STEPS, rates, size=(_RUNS, pairs, 2)) / _STEPS
-    ended = [conclude(planned, in_blocks([(one, other) for one, other in run])) for run in scores.tolist()]
+    ended = [
+        evaluate_design(planned, in_blocks([(one, other) for one, other in run])) for run in scores.tolist()
+    ]
     power = sum(found.winner is not None for found in ended) / _RUNS
-    return Found(power, float(np.median([found.at or pairs for found in ended])), _error(power, _RUNS))
+    return Found(
+        power, float(np.median([found.ended_at_pair or pairs for found in ended])), _error(power, _RUNS)
+    )
 
 
 def _error(share: float, runs: int) -> float:

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.estop_presses import OpenPage, Press, Program, loads
-from benchmarks.estop_station import Station, Watching
+from benchmarks.estop_presses import OpenPage, Press, RestPresser, page_load_time
+from benchmarks.estop_station import Station, StationWatch
 from benchmarks.labs import ROOT, RunningLab, lab
 from benchmarks.report import Figure, Report
 from benchmarks.results_postgresql import server, why_not
-from evaweb.lab.visitor import Visitor
+from evaweb.lab.visitor import RestClient
 from runtime.core.errors import RuntimeFault
 
 ATTACKS = (
@@ -66,7 +66,7 @@ class Bench:
     lab: RunningLab
     ready_file: Path
     database: Path | None
-    operator: Visitor
+    operator: RestClient
     station: Station
 
 
@@ -75,7 +75,7 @@ def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
     rows = []
     for attack in attacks:
         with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as found:
-            rows.append(once(found, attack, seconds))
+            rows.append(measure_attack(found, attack, seconds))
     missing = why_not()
     if missing:
         print(f"not measured on PostgreSQL: {missing}", file=sys.stderr)
@@ -91,7 +91,7 @@ def _on_postgresql(seconds: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "postgresql"
         with server(database) as url, bench(Path(folder) / "lab", database, url) as found:
-            return once(found, "database_hangs", seconds) | {"attack": "database_hangs.postgresql"}
+            return measure_attack(found, "database_hangs", seconds) | {"attack": "database_hangs.postgresql"}
 
 
 @contextmanager
@@ -107,25 +107,25 @@ def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator
         yield Bench(running, ready, database, running.visitor, station)
 
 
-def once(
+def measure_attack(
     found: Bench, attack: str, seconds: float, share: float = 1.0, moving: bool = True
 ) -> dict[str, Any]:
     """A run that goes on if `moving`, the attack, presses for `seconds`; `share` of the attack in its full strength."""
     facts = found.lab.announced
-    program = Program(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
+    program = RestPresser(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
     with closing(OpenPage(found.operator, facts["stops"])) as page:
         ways = dict(zip(WAYS, (page.press, page.over_the_socket, program.press), strict=True))
-        found.station.appeared()
+        found.station.wait_until_up()
         if moving:
             _warmed(found, *ways.values())
             found.station.run()
-        watching = Watching(found.station, facts["pids"]["web"])
+        watching = StationWatch(found.station, facts["pids"]["web"])
         with _under(found, attack, share) as did:
             time.sleep(seconds / 4.0)  # for which nobody presses, and the run is to go on
             pressed = {
                 name: _presses(found.station, press, seconds / len(ways)) for name, press in ways.items()
             }
-    recovery = loads(found.operator, _GIVEN_UP_S)
+    recovery = page_load_time(found.operator, _GIVEN_UP_S)
     beside = watching.end()
     return {
         "attack": attack,
@@ -142,7 +142,7 @@ def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
     """Do everything once: the first costs are neither lateness nor growth."""
     for press in ways:
         press("to begin with")
-    loads(found.operator, _GIVEN_UP_S)
+    page_load_time(found.operator, _GIVEN_UP_S)
 
 
 def _interruption(station: Station) -> str:
@@ -193,10 +193,10 @@ def _presses(station: Station, press: Callable[[str], Press], seconds: float) ->
                 station.release() or station.release()
             )  # a press's copy may come late, by the other way
         time.sleep(_PAUSE_S)
-    return judged(made, lost) | {"released": releases}
+    return summarize_presses(made, lost) | {"released": releases}
 
 
-def judged(presses: Sequence[Press], lost: int) -> dict[str, Any]:
+def summarize_presses(presses: Sequence[Press], lost: int) -> dict[str, Any]:
     """Results of presses, `lost` of which the station never had."""
     ms = np.array([press.ms for press in presses])
     undone = [

@@ -15,7 +15,9 @@ from typing import Any
 from robots.broken_pipe import exit_on_broken_pipe
 
 PRESSED, OTHER = "pressed-1", "other-1"
-GUESSED = "guessed"  # a viewer whose password is guessed: other attackers log in while that name is locked
+GUESSED_ACCOUNT = (
+    "guessed"  # a viewer whose password is guessed: other attackers log in while that name is locked
+)
 _ROBOT = "agilex_piper"
 _DEPLOYMENTS = Path(__file__).parents[1] / "deployments"
 _FILES = 1024  # that Debian lets a process have open, where its administrator says nothing
@@ -39,15 +41,15 @@ def main() -> int:
     given = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
-    from evaweb.lab.lab import a_lab
-    from evaweb.lab.lifetime import Ended
+    from evaweb.lab.lab import open_lab
+    from evaweb.lab.lifetime import StopRequested
 
     _limit_files()
     try:
-        with a_lab("127.0.0.1", 0) as lab:
+        with open_lab("127.0.0.1", 0) as lab:
             _up(lab, given.ready_file)
             lab.watch()
-    except Ended:  # as it should
+    except StopRequested:  # as it should
         return 0
     return 1
 
@@ -59,18 +61,20 @@ def _limit_files() -> None:
 
 def _up(lab: Any, ready_file: Path) -> None:
     from evaweb.lab.benches import Bench
-    from evaweb.lab.processes import Program
+    from evaweb.lab.processes import ProgramSpec
     from runtime.sim.standin import announce_ready
 
     small = ("--robot", _ROBOT, "--width", "64", "--height", "48")
     free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
-    node = lab.processes.start(Program("bench", ("-m", "runtime.sim.node", *small, *free), announces=True))
+    node = lab.processes.start(
+        ProgramSpec("bench", ("-m", "runtime.sim.node", *small, *free), announces=True)
+    )
     serving = ("-m", "runtime.sim.serve", "openpi", "--robot", _ROBOT, "--port", "0", "--latency-ms", "80")
-    policy = lab.processes.start(Program("policy", serving, announces=True))
+    policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
     # Programs are named after their files: each station has one of its own.
     pressed = _bench("demo.toml", PRESSED, node["obs_endpoint"], node["action_endpoint"], policy["url"])
     other = _bench("tabletop.toml", OTHER, _NOWHERE, _NOWHERE, "ws://127.0.0.1:1")
-    url = lab.up([Bench(*pressed), Bench(*other)])
+    url = lab.start([Bench(*pressed), Bench(*other)])
     announce_ready({"url": url, "stops": lab.stops, **_people(), "pids": lab.processes.pids()}, ready_file)
 
 
@@ -83,16 +87,16 @@ def _people() -> dict[str, Any]:
     """One of each role and GUESSED with fresh passwords, and a token of the operator's."""
     from django.contrib.auth.models import User
 
-    from evaweb.api.tokens import token_create
+    from evaweb.api.tokens import create_token
     from evaweb.lab.seed import demo_login
     from evaweb.roles import Role
 
-    people = {str(role): role for role in Role} | {GUESSED: Role.VIEWER}
+    people = {str(role): role for role in Role} | {GUESSED_ACCOUNT: Role.VIEWER}
     logins = [demo_login(username=name, role=role) for name, role in people.items()]
     operator = User.objects.get(username=Role.OPERATOR)
     return {
         "passwords": {login.username: login.password for login in logins},
-        "token": token_create(user=operator, name="presses"),
+        "token": create_token(user=operator, name="presses"),
     }
 
 

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 from benchmarks.estop_lab import PRESSED
-from evaweb.lab.patience import NoReply, VisitFailed
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.patience import DemoFailed, NoReply
+from evaweb.lab.visitor import LivePage, RestClient
 
 PATIENCE_S = 10.0
 _DONE = "done"
@@ -44,7 +44,7 @@ class Press:
 class _Page(LivePage):
     """A page that hears what becomes of its presses."""
 
-    def __init__(self, visitor: Visitor, station: str) -> None:
+    def __init__(self, visitor: RestClient, station: str) -> None:
         self._acks: dict[str, queue.SimpleQueue[tuple[float, Mapping[str, Any]]]] = {}  # by uuid
         super().__init__(visitor, station)
 
@@ -64,10 +64,10 @@ class _Page(LivePage):
             return Press(said["status"], said["reason"], (at - begun) * 1000.0)
         return Press("", self.broken or "no answer", (time.monotonic() - begun) * 1000.0)
 
-    def _told(self, message: Mapping[str, Any]) -> None:
+    def _on_message(self, message: Mapping[str, Any]) -> None:
         if message.get("type") == "ack" and message["uuid"] in self._acks:
             self._acks[message["uuid"]].put((time.monotonic(), message))
-        super()._told(message)
+        super()._on_message(message)
 
 
 class OpenPage:
@@ -76,10 +76,10 @@ class OpenPage:
     Where its connection breaks it is opened again.
     """
 
-    def __init__(self, visitor: Visitor, stops: str, station: str = PRESSED) -> None:
+    def __init__(self, visitor: RestClient, stops: str, station: str = PRESSED) -> None:
         self._visitor, self._station = visitor, station
         self._page, self._opening = _Page(visitor, station), threading.Lock()
-        self._way = Program(stops, {"Cookie": visitor.cookies}, station)
+        self._way = RestPresser(stops, {"Cookie": visitor.cookies}, station)
         self._way.ready()
 
     def press(self, why: str) -> Press:
@@ -101,7 +101,7 @@ class OpenPage:
                 self.close()
                 try:
                     self._page = _Page(self._visitor, self._station)
-                except VisitFailed as fault:
+                except DemoFailed as fault:
                     return Press("", str(fault), 0.0)
             page = self._page
         return page.press(why, identity or str(uuid4()))
@@ -110,7 +110,7 @@ class OpenPage:
         self._page.close()
 
 
-class Program:
+class RestPresser:
     """A program with these headers, which opens a connection for each press."""
 
     def __init__(self, url: str, headers: Mapping[str, str], station: str = PRESSED) -> None:
@@ -140,7 +140,7 @@ class Program:
             return found
 
 
-def loads(visitor: Visitor, seconds: float) -> float | None:
+def page_load_time(visitor: RestClient, seconds: float) -> float | None:
     """After how long the station's page is there [s]; None: not within `seconds`."""
     begun = time.monotonic()
     while time.monotonic() - begun < seconds:
@@ -153,7 +153,7 @@ def loads(visitor: Visitor, seconds: float) -> float | None:
     return None
 
 
-def _page_of(visitor: Visitor, timeout: float) -> None:
+def _page_of(visitor: RestClient, timeout: float) -> None:
     address = urlsplit(visitor.url).netloc
     with closing(http.client.HTTPConnection(address, timeout=max(0.1, timeout))) as connection:
         cookies = {"Cookie": visitor.cookies}

@@ -46,7 +46,7 @@ class Station:
         found = Endpoints(self._folder).read("supervisor")
         return [int(found[name]) for name in _FAMILY]
 
-    def appeared(self) -> Mapping[str, Any]:
+    def wait_until_up(self) -> Mapping[str, Any]:
         """Its status, as soon as it answers; raises the RuntimeFault of the last try."""
         until = time.monotonic() + _READY_S
         while True:
@@ -74,7 +74,7 @@ class Station:
 
     def _tried(self) -> Mapping[str, Any]:
         """State after a second of a run, or wherever it came to instead."""
-        state_is = self.appeared()["state_is"]
+        state_is = self.wait_until_up()["state_is"]
         if state_is["latched"]:
             self.release()
         elif state_is["held"]:
@@ -101,7 +101,7 @@ class Station:
 
     def interruption(self) -> str:
         """Event that ended the run before the press, "" for none; raises RuntimeFault where all is mute."""
-        self.appeared()
+        self.wait_until_up()
         events = self.client.events_since(self._newest_event)
         left = [event["text"] for event in events if event["kind"] in ("state", "family_died")]
         return "" if not left or "e-stop" in left[0] else left[0]
@@ -110,7 +110,7 @@ class Station:
         self.client.close()
 
 
-class Beside(NamedTuple):
+class AttackLoad(NamedTuple):
     """Measures of web and station during an attack."""
 
     main_late_ms: float  # the longest that a snapshot was overdue
@@ -118,7 +118,7 @@ class Beside(NamedTuple):
     station_growth_mb: float
 
 
-class Watching:
+class StationWatch:
     """Listens to the coordinator, keeps the lease and looks at memory until it is ended."""
 
     def __init__(self, station: Station, web: int) -> None:
@@ -138,14 +138,14 @@ class Watching:
         for thread in self._threads:
             thread.start()
 
-    def end(self) -> Beside:
+    def end(self) -> AttackLoad:
         """End the watch and return its measures."""
         self._ended.set()
         for thread in self._threads:
             thread.join()
         gaps = [b - a for a, b in zip(self._heard, [*self._heard[1:], time.monotonic()], strict=True)]
         web, family = ((most - before) / 1e6 for most, before in zip(self._most, self._before, strict=True))
-        return Beside(max(0.0, max(gaps) - _STATE_S) * 1000.0, web, family)
+        return AttackLoad(max(0.0, max(gaps) - _STATE_S) * 1000.0, web, family)
 
     def _listen(self, client: StationClient) -> None:
         with closing(client.subscribe("state")) as subscriber:

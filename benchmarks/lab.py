@@ -50,10 +50,10 @@ class _Page(LivePage):
 
     link_ok = False
 
-    def _told(self, message: Mapping[str, Any]) -> None:
+    def _on_message(self, message: Mapping[str, Any]) -> None:
         if message.get("type") == "link":
             self.link_ok = bool(message["ok"])
-        super()._told(message)
+        super()._on_message(message)
 
 
 def measure(seconds: float) -> Report:

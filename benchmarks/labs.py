@@ -16,7 +16,7 @@ from typing import Any
 
 import psutil
 
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.visitor import LivePage, RestClient
 from runtime.recording.reader import Episode, open_episode
 
 ROOT = Path(__file__).parents[1]
@@ -29,7 +29,7 @@ _END_S = 60.0
 class RunningLab:
     """A lab that is up, somebody logged in to it, and what it announced."""
 
-    visitor: Visitor
+    visitor: RestClient
     announced: Mapping[str, Any]
     process: psutil.Process
     data: Path
@@ -53,7 +53,7 @@ def lab(
                 raise SystemExit(f"the lab ended with {child.returncode} before it was ready")
             time.sleep(0.1)
         announced = json.loads(ready_file.read_text())
-        visitor = Visitor(announced["url"])
+        visitor = RestClient(announced["url"])
         visitor.login("operator", announced["passwords"]["operator"])
         yield RunningLab(visitor, announced, psutil.Process(child.pid), data, environment)
     finally:
@@ -75,7 +75,9 @@ def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Ite
         yield running
 
 
-def watch(visitor: Visitor, seconds: float, station: str = STATION, **counts: int) -> subprocess.Popen[str]:
+def watch(
+    visitor: RestClient, seconds: float, station: str = STATION, **counts: int
+) -> subprocess.Popen[str]:
     """Pages open on the station for so long, in a process of their own; `reading` or `stalled` of them."""
     options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
     command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, station, visitor.cookies]
@@ -83,7 +85,7 @@ def watch(visitor: Visitor, seconds: float, station: str = STATION, **counts: in
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
 
 
-class Processors:
+class ProcessorUsage:
     """Processor time of the processes of a lab, and of all others of the machine, from now on."""
 
     def __init__(self, lab: psutil.Process) -> None:

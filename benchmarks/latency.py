@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 import zmq
 
-from benchmarks.labs import STATION, Processors, RunningLab, busy_lab, only_episode, set_up, watch
+from benchmarks.labs import STATION, ProcessorUsage, RunningLab, busy_lab, only_episode, set_up, watch
 from benchmarks.report import Figure, Report
-from evaweb.lab.patience import VisitFailed
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.patience import DemoFailed
+from evaweb.lab.visitor import LivePage, RestClient
 from runtime.core import msgpack_arrays
 from runtime.recording.reader import Episode
 
@@ -49,7 +49,7 @@ _WANTED = {
 class PressingPage(LivePage):
     """A page that knows when it pressed and when it had the answer, on the monotonic clock [s]."""
 
-    def __init__(self, visitor: Visitor, station: str) -> None:
+    def __init__(self, visitor: RestClient, station: str) -> None:
         self._answers: dict[str, tuple[float, str]] = {}  # when, and the status, by uuid
         self._answered = threading.Condition()
         self._renewed = threading.Event()
@@ -63,13 +63,13 @@ class PressingPage(LivePage):
         self._send({"type": kind, "uuid": identity, "epoch": self.epoch})
         with self._answered:
             if not self._answered.wait_for(lambda: identity in self._answers, _ACK_S):
-                raise VisitFailed(f"{kind}: no answer within {_ACK_S:g} s")
+                raise DemoFailed(f"{kind}: no answer within {_ACK_S:g} s")
             answered, status = self._answers[identity]
         if status not in ("accepted", "done"):
-            raise VisitFailed(f"{kind} was {status}")
+            raise DemoFailed(f"{kind} was {status}")
         return pressed, answered
 
-    def _told(self, message: Mapping[str, Any]) -> None:
+    def _on_message(self, message: Mapping[str, Any]) -> None:
         now = time.monotonic()
         if message.get("type") == "ack":
             with self._answered:
@@ -78,7 +78,7 @@ class PressingPage(LivePage):
         elif message.get("type") == "renewed":
             self._renewed_at = now
             self._renewed.set()
-        super()._told(message)
+        super()._on_message(message)
 
     def _renew(self) -> None:
         """More often than a page does, and each only when the one before was answered."""
@@ -125,7 +125,7 @@ def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], 
         page.wait(lambda state: state["state_is"]["going"], 10.0, "starting the run")
         time.sleep(_MARGIN_S)
         page.renewals.clear()
-        processors, end = Processors(lab.process), time.monotonic() + seconds
+        processors, end = ProcessorUsage(lab.process), time.monotonic() + seconds
         while time.monotonic() < end:
             pressed, answered = page.press("halt")
             presses.append(pressed)

@@ -25,16 +25,16 @@ def main() -> int:
     given = parser.parse_args()
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     django.setup()
-    from evaweb.lab.lab import a_lab
-    from evaweb.lab.lifetime import Ended
+    from evaweb.lab.lab import open_lab
+    from evaweb.lab.lifetime import StopRequested
 
     try:
-        with a_lab("127.0.0.1", 0) as lab:
-            url = lab.up([])
+        with open_lab("127.0.0.1", 0) as lab:
+            url = lab.start([])
             pids = lab.processes.pids()
             _announce(given.ready_file, url, lab.stops, pids)
             lab.watch()
-    except Ended:
+    except StopRequested:
         return 0
     return 1
 

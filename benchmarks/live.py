@@ -20,8 +20,8 @@ import psutil
 
 from benchmarks.labs import STATION, lab, watch
 from benchmarks.report import Figure, Report
-from evaweb.lab.once import Choice, start
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.once import TrialChoice, start
+from evaweb.lab.visitor import LivePage, RestClient
 
 _VIEWERS, _STALLED = 20, 10
 
@@ -49,10 +49,10 @@ def measure(seconds: float) -> Report:
     return Report("live", figures, rows)
 
 
-def _run(visitor: Visitor, seconds: float, viewers: int) -> Mapping[str, Any]:
+def _run(visitor: RestClient, seconds: float, viewers: int) -> Mapping[str, Any]:
     """One trial of `seconds` while so many watch; it is voided afterwards."""
     with closing(LivePage(visitor, STATION)) as page:
-        trial = start(visitor, page, Choice(STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
+        trial = start(visitor, page, TrialChoice(STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
         found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
         state = page.wait(lambda state: True, 10, "looking")
         page.command("stop")
@@ -67,19 +67,19 @@ def _wait(seconds: float) -> dict[str, Any]:
     return {}
 
 
-def _void(visitor: Visitor, trial: int) -> None:
+def _void(visitor: RestClient, trial: int) -> None:
     while visitor.get(f"trials/{trial}")["status"] not in ("ended", "interrupted"):
         time.sleep(0.1)
     visitor.post(f"trials/{trial}/void", {"reason": "a benchmark"})
 
 
-def _viewers(visitor: Visitor, seconds: float, **counts: int) -> dict[str, Any]:
+def _viewers(visitor: RestClient, seconds: float, **counts: int) -> dict[str, Any]:
     child = watch(visitor, seconds, STATION, **counts)
     found: dict[str, Any] = json.loads(child.communicate()[0])
     return found
 
 
-def _stalled(visitor: Visitor, web: int, seconds: float) -> float:
+def _stalled(visitor: RestClient, web: int, seconds: float) -> float:
     """Growth of the web per viewer that never reads [MB], at its largest."""
     process = psutil.Process(web)
     _viewers(visitor, 3.0, reading=1)  # what the first viewer costs once is no growth

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.labs import (
     ROOT,
     STATION,
-    Processors,
+    ProcessorUsage,
     RunningLab,
     Scheduling,
     busy_lab,
@@ -99,7 +99,7 @@ def _run(
         shared.command("run")
         shared.wait(lambda state: state["state_is"]["going"], 10.0, "starting the run")
         processors, scheduler = (
-            Processors(lab.process),
+            ProcessorUsage(lab.process),
             Scheduling(lab.process, "runtime.processes.control.process"),
         )
         state = shared.wait(lambda state: not state["state_is"]["going"], seconds + 30.0, "the run")

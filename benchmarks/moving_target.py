@@ -55,7 +55,7 @@ _ARRIVING_S = 10.0  # until fingertips have to be beside the block that stands
 
 
 @dataclass(frozen=True, slots=True)
-class Chased:
+class ChaseResult:
     """One episode: lengths in mm, `share` of the time of the course on target, `state` of the station at its end.
 
     `acceleration` [rad/s2] is that of the joint whose commands change most, exceeded in 5 % of the ticks.
@@ -98,7 +98,7 @@ def table(seconds_budget: float) -> list[dict[str, Any]]:
     ]
 
 
-def _row(episodes: list[Chased]) -> dict[str, Any]:
+def _row(episodes: list[ChaseResult]) -> dict[str, Any]:
     first = episodes[0]
     figures = {"success_rate": "success", "on_target": "share", "mean_mm": "mean", "p95_mm": "p95"}
     figures["acceleration_p95"] = "acceleration"
@@ -111,12 +111,12 @@ def _row(episodes: list[Chased]) -> dict[str, Any]:
     return row | {"shares": shares, "held": held}
 
 
-def _chased(asked: tuple[str, int, int]) -> Chased:
+def _chased(asked: tuple[str, int, int]) -> ChaseResult:
     strategy, delay, seed = asked
-    return chase({"kind": strategy, **STRATEGIES[strategy]}, delay, seed)
+    return run_chase({"kind": strategy, **STRATEGIES[strategy]}, delay, seed)
 
 
-def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
+def run_chase(strategy: Mapping[str, Any], delay: int, seed: int) -> ChaseResult:
     """One episode in lockstep, to the end of the course; one that never begins has no share of it."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -125,7 +125,7 @@ def chase(strategy: Mapping[str, Any], delay: int, seed: int) -> Chased:
             commanded = _follow(station, course)
             state, rate = str(station.coordinator.session.state), station.spec.rate
     escort = course.escort
-    return Chased(
+    return ChaseResult(
         strategy=str(strategy["kind"]),
         delay=delay,
         seed=seed,

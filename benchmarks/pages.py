@@ -20,7 +20,7 @@ from typing import Any
 
 from benchmarks.labs import ROOT, STATION, RunningLab, lab
 from benchmarks.report import Figure, Report
-from evaweb.lab.once import Choice, perform
+from evaweb.lab.once import TrialChoice, run_one_trial
 
 PLANS, TRIALS = 200, 100_000
 LOADS = 5
@@ -193,7 +193,7 @@ def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS) -> Report:
         _seed(folder / "data", plans, trials)
         ready = folder / "ready.json"
         with lab(["manage.py", "demo", "--port", "0", "--ready-file", str(ready)], ready) as demo:
-            done = perform(demo.visitor, Choice(STATION, "block-on-plate", 1, "pick-place-40k", 1))
+            done = run_one_trial(demo.visitor, TrialChoice(STATION, "block-on-plate", 1, "pick-place-40k", 1))
             rows, sought = _visits(demo, pages(done.episode, done.trial))
     return Report("pages", [*figures(rows), Figure("seek_ms", sought, "ms", "<= 150")], rows)
 

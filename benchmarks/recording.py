@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks import recording_busy, recording_frames, recording_station
 from benchmarks.busy_lab import PATIENT
 from benchmarks.labs import ROOT
-from benchmarks.recording_kills import Many, food, kill_recording, kill_worker
+from benchmarks.recording_kills import KillCount, kill_recording, kill_worker, make_episodes
 from benchmarks.report import Figure, Report
 
 SECONDS = 60.0
@@ -182,9 +182,9 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
     """Each process at 10 moments, 50 where it may be long; fewer on a slow machine, but 10 in all."""
     recording, working = (
-        (Many(150, 150, 0.0), Many(50, 50, 0.0))
+        (KillCount(150, 150, 0.0), KillCount(50, 50, 0.0))
         if long
-        else (Many(30, 8, _KILLED_S[0]), Many(10, 2, _KILLED_S[1]))
+        else (KillCount(30, 8, _KILLED_S[0]), KillCount(10, 2, _KILLED_S[1]))
     )
     lab = recording_station.PatientLab(_made(folder / "kills"))
     try:
@@ -194,7 +194,7 @@ def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
     finally:
         lab.close()
     data = folder / "published"  # apart: what was interrupted is not published before somebody has scored it
-    food(data, frames)
+    make_episodes(data, frames)
     return {"rows": [*rows, *kill_worker(data, working, seed)]}
 
 

@@ -9,7 +9,7 @@ import uuid
 from pathlib import Path
 from typing import Any
 
-from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, finish, give, joints
+from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, feed_frames, finish, joints
 from runtime.datasets.published import publish
 from runtime.recording.base import ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
@@ -58,7 +58,9 @@ def main(path: str, count: str, folder: str) -> None:
     root = Path(folder)
     journal = EpisodeJournal(root / "episodes", RecordingSettings(min_free_bytes=0))
     journal.begin(told := manifest())
-    given = give(Frames(Path(path)), int(count), lambda index, pictures: append(journal, index, pictures))
+    given = feed_frames(
+        Frames(Path(path)), int(count), lambda index, pictures: append(journal, index, pictures)
+    )
     closed: list[float] = []
 
     def save() -> None:

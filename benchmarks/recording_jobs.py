@@ -20,12 +20,12 @@ def main() -> None:
 
     from evaweb.episodes.models import Episode, EpisodeStatus
     from evaweb.episodes.reconcile import reconcile
-    from evaweb.episodes.services import publish_asked
+    from evaweb.episodes.services import request_publish
 
     call_command("migrate", verbosity=0)
     reconcile()
     closed = Episode.objects.filter(status=EpisodeStatus.FINISHED, frames__gt=0)
-    asked = [str(episode.uuid) for episode in closed if publish_asked(episode=episode)]
+    asked = [str(episode.uuid) for episode in closed if request_publish(episode=episode)]
     json.dump(asked, sys.stdout)
 
 

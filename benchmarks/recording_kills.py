@@ -46,7 +46,7 @@ RUNNING = "select key, owner from jobs_job where status = 'running'"
 
 
 @dataclass(frozen=True, slots=True)
-class Many:
+class KillCount:
     """Count of kills: `most`, or fewer but at least `least` where `seconds` are over before."""
 
     most: int
@@ -62,7 +62,7 @@ class Many:
             yield drawn.uniform(*between)
 
 
-def kill_recording(lab: Lab, many: Many, seed: int) -> list[dict[str, Any]]:
+def kill_recording(lab: Lab, many: KillCount, seed: int) -> list[dict[str, Any]]:
     """One row per kill: process, moment, what was lost [s], how the episode ended."""
     kills: deque[float] = deque(maxlen=MOST_RESTARTS)
     moments = enumerate(many.moments(seed, _SPREAD_S))
@@ -118,7 +118,7 @@ def _loss(episode: Episode, killed: float) -> dict[str, Any]:
 # --- the worker ------------------------------------------------------------------------------------------------
 
 
-def food(data: Path, frames: Path, episodes: int = EPISODES) -> None:
+def make_episodes(data: Path, frames: Path, episodes: int = EPISODES) -> None:
     """Finished episodes of two seconds for the worker to publish."""
     pictures = Frames(frames)
     for _ in range(episodes):
@@ -129,7 +129,7 @@ def food(data: Path, frames: Path, episodes: int = EPISODES) -> None:
         journal.end(Outcome("finished", "the frames have ended", time.time()))
 
 
-def kill_worker(data: Path, many: Many, seed: int) -> list[dict[str, Any]]:
+def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
     """Kill the worker while it works off a queue, then let one finish: rows per kill, the last of what came of it.
 
     `problems` are the sentences of what did not open.

@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, finish, give, joints
+from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, feed_frames, finish, joints
 
 MODES: dict[str, dict[str, Any]] = {
     "default": {"image_writer_threads": 4 * len(CAMERAS)},  # as its lerobot-record has it
@@ -44,7 +44,7 @@ def main(path: str, count: str, folder: str, mode: str) -> None:
         made.save_episode()
         made.finalize()
 
-    written = finish(give(Frames(Path(path)), int(count), add), save, root)
+    written = finish(feed_frames(Frames(Path(path)), int(count), add), save, root)
     del operators
     print(json.dumps({**written.fields(), "version": version("lerobot")}))
 

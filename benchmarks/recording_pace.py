@@ -40,7 +40,7 @@ def joints(index: int) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class RecorderCost:
     """Cost of an episode to one recorder; processor times with its children's [s]."""
 
     frames: int
@@ -59,7 +59,7 @@ class Written:
         return asdict(self)
 
 
-def give(frames: Frames, count: int, add: Callable[[int, dict[str, Any]], None]) -> dict[str, Any]:
+def feed_frames(frames: Frames, count: int, add: Callable[[int, dict[str, Any]], None]) -> dict[str, Any]:
     """Call `add` for `count` frames at 30 Hz; the first half of a Written."""
     took, late = [], 0
     before = processor_s()
@@ -85,11 +85,11 @@ def give(frames: Frames, count: int, add: Callable[[int, dict[str, Any]], None])
     }
 
 
-def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> Written:
+def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> RecorderCost:
     """Call `save` and put the whole together; `folder` holds what was saved."""
     before, begun = processor_s(), time.monotonic()
     save()
-    return Written(
+    return RecorderCost(
         **given,
         save_cpu_s=processor_s() - before,
         save_s=time.monotonic() - begun,

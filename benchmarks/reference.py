@@ -17,7 +17,7 @@ _PHASES = 2.0 * np.pi * np.arange(DIM) / DIM
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 _SEAM = 8  # rows within which the stand-in of a real-time chunking model goes over to what it means now
 
-Meant = Callable[[int], Float64]  # observation step -> rows [H, DIM]
+IntendedRows = Callable[[int], Float64]  # observation step -> rows [H, DIM]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +43,12 @@ class Reference:
         return made
 
 
-def chunks_of(table: Float64, horizon: int) -> Meant:
+def chunks_of(table: Float64, horizon: int) -> IntendedRows:
     """Rows of `table` [N, DIM], from the observation step on."""
     return lambda step: table[step : step + horizon]
 
 
-def disagreeing(meant: Meant) -> Meant:
+def with_disagreement(meant: IntendedRows) -> IntendedRows:
     """The same, each chunk off by a constant of its own of at most DISAGREEMENT: nothing random, no two alike."""
 
     def rows(step: int) -> Float64:
@@ -58,7 +58,7 @@ def disagreeing(meant: Meant) -> Meant:
     return rows
 
 
-def answering(meant: Meant) -> Callable[[int, Conditioning | None], Float64]:
+def make_policy(meant: IntendedRows) -> Callable[[int, Conditioning | None], Float64]:
     """A policy that means `meant`, and continues its last chunk where it is told what the robot is committed to.
 
     A stand-in for a model with real-time chunking: the rows that will have been executed when the answer arrives

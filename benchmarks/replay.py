@@ -20,8 +20,8 @@ from typing import Any
 
 from benchmarks.labs import ROOT, STATION, lab
 from benchmarks.report import Figure, Report
-from evaweb.lab.once import Choice, start
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.once import TrialChoice, start
+from evaweb.lab.visitor import LivePage, RestClient
 
 SECONDS = 30.0  # of the recording
 _AGAIN = 9
@@ -63,13 +63,13 @@ def measure(seconds: float) -> Report:
     return Report("replay", figures, rows)
 
 
-def _recorded(visitor: Visitor, seconds: float) -> str:
+def _recorded(visitor: RestClient, seconds: float) -> str:
     """The episode of a run of so long, once its videos can be played."""
     with closing(LivePage(visitor, STATION)) as page:
         scene = visitor.get("scenes")["items"][0]
         checkpoint = visitor.get("checkpoints")["items"][0]["name"]
         trial = start(
-            visitor, page, Choice(STATION, scene["name"], scene["positions"][0]["number"], checkpoint, 1)
+            visitor, page, TrialChoice(STATION, scene["name"], scene["positions"][0]["number"], checkpoint, 1)
         )
         time.sleep(seconds)
         page.command("stop", trial)

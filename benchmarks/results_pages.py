@@ -56,7 +56,7 @@ def main() -> None:
         "seed_s": time.perf_counter() - began,
         "pages": pages(seeded, given.rounds),
         "exports": exports(seeded),
-        "handing": handing(seeded),
+        "handing": measure_allocation(seeded),
         "planner": planner(seeded),
     }
     given.out.write_text(json.dumps(found), "utf-8")
@@ -76,7 +76,7 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
     found = {}
     for page, address in _addresses(seeded).items():
         _ask(client, address(seeded.plans[0]))  # templates are read, scipy is imported
-        caching.forget()
+        caching.clear_caches()
         cold: list[float] = []
         warm: list[float] = []
         busy: list[float] = []
@@ -86,7 +86,7 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
             with CaptureQueriesContext(connection) as captured:
                 _ask(client, address(plan))
             queries = max(queries, len(captured))
-        caching.forget()
+        caching.clear_caches()
         for times in (cold, warm):
             for plan in asked:
                 began, worked = time.perf_counter(), time.process_time()
@@ -186,10 +186,10 @@ def _parquet_rows(content: bytes) -> int:
     return int(parquet.read_metadata(io.BytesIO(content)).num_rows)
 
 
-def handing(seeded: Seeded) -> dict[str, float]:
+def measure_allocation(seeded: Seeded) -> dict[str, float]:
     """All operators ask for trials of one plan at all stations at once until none is left."""
     from evaweb.plans.models import Plan
-    from evaweb.plans.services import plan_freeze
+    from evaweb.plans.services import freeze_plan
 
     source = seeded.plans[0]
     plan = Plan.objects.create(
@@ -203,7 +203,7 @@ def handing(seeded: Seeded) -> dict[str, float]:
     )
     plan.checkpoints.set(source.checkpoints.all())
     plan.positions.set(source.positions.all())
-    plan_freeze(user=plan.owner, plan=plan)
+    freeze_plan(user=plan.owner, plan=plan)
     times: list[float] = []
     locked: list[str] = []
     faults: list[str] = []
@@ -274,10 +274,10 @@ def _operator(
 
 
 def _asked(plan: Any, operator: Any, station: Any, times: list[float]) -> Any:
-    from evaweb.plans.allocation import hand_out
+    from evaweb.plans.allocation import allocate_trial
 
     began = time.perf_counter()
-    trial = hand_out(user=operator, station=station, plan=plan).trial
+    trial = allocate_trial(user=operator, station=station, plan=plan).trial
     times.append((time.perf_counter() - began) * _MS)
     return trial
 
@@ -287,7 +287,7 @@ def _made(trial: Any, operator: Any) -> None:
     from django.utils import timezone
 
     from evaweb.trials.models import Milestone, Trial, TrialStatus
-    from evaweb.trials.services import trial_score
+    from evaweb.trials.services import score_trial
 
     prepared = Trial.objects.filter(pk=trial.pk, status=TrialStatus.PREPARED)
     if prepared.exists():
@@ -296,7 +296,7 @@ def _made(trial: Any, operator: Any) -> None:
         prepared.update(status=TrialStatus.ENDED, duration_s=10.0, episode=episode)
     trial.refresh_from_db()
     ticks = dict.fromkeys(Milestone.objects.filter(scene=trial.scene).values_list("pk", flat=True), True)
-    trial_score(user=operator, trial=trial, milestones=ticks)
+    score_trial(user=operator, trial=trial, milestones=ticks)
 
 
 def _out_of_order(handed: Sequence[tuple[int, int, int]]) -> int:

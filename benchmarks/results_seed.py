@@ -139,7 +139,7 @@ def _plan(
     running: bool,
 ) -> Any:
     from evaweb.plans.models import Plan, PlanState
-    from evaweb.plans.services import plan_freeze
+    from evaweb.plans.services import freeze_plan
     from evaweb.trials.models import Position
 
     chosen = chance.sample(list(checkpoints), chance.choice((2, 2, 3, 4)))
@@ -156,7 +156,7 @@ def _plan(
     )
     plan.checkpoints.set(chosen)
     plan.positions.set(Position.objects.filter(scene__in=places))
-    plan_freeze(user=plan.owner, plan=plan)
+    freeze_plan(user=plan.owner, plan=plan)
     _trials(plan, chance, operators, stations, _BEGIN + timedelta(days=3 * i), 0.7 if running else 1.0)
     if not running:
         row, at = Plan.objects.filter(pk=plan.pk), _BEGIN + timedelta(days=3 * i + 2)
@@ -284,10 +284,10 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
 
 def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
     """Write how each trial was handed out, in the order of the schedule."""
-    from evaweb.plans.commitment import codes
+    from evaweb.plans.commitment import draw_codes
     from evaweb.plans.models import Handout
 
-    known = codes(bytes(plan.key), len(slots))
+    known = draw_codes(bytes(plan.key), len(slots))
     _written(
         [
             Handout(plan=plan, number=n, slot=slot, trial=trial, code=code)

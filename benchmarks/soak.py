@@ -29,7 +29,7 @@ _ROUNDS = 200  # from which on that is more than noise, and everything has been 
 Fuzzer = Callable[[int], list[str]]
 
 
-class Held(NamedTuple):
+class HeldResources(NamedTuple):
     """Resources that this process holds."""
 
     files: int
@@ -52,7 +52,7 @@ def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: i
     begun, seed = time.monotonic(), first
     found = dict.fromkeys(chosen, 0)
     rows: list[dict[str, object]] = [{"first_seed": first}]
-    settled: list[Held] = []  # after each round since then
+    settled: list[HeldResources] = []  # after each round since then
     while not settled or time.monotonic() - begun < seconds:
         for name, once in chosen.items():
             with _quiet():
@@ -61,7 +61,7 @@ def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: i
             rows += [{"fuzzer": name, "seed": seed, "violation": said} for said in violations]
         seed += 1
         if settled or time.monotonic() - begun >= _SETTLED * seconds:
-            settled.append(held())
+            settled.append(held_resources())
     figures = [Figure(f"violations.{name}", found[name], "", "== 0") for name in chosen]
     figures += [Figure(f"scenarios.{name}", seed - first, "") for name in chosen]
     return Report("soak", [*figures, *_grown(settled)], rows)
@@ -79,17 +79,17 @@ def _quiet() -> Iterator[None]:
         log.setLevel(before)
 
 
-def held() -> Held:
+def held_resources() -> HeldResources:
     """Resources that this process holds now, without what the C library only has not given back yet."""
     gc.collect()
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
         trim(0)
     process = psutil.Process(os.getpid())
     memory = process.memory_info().rss / 1e6
-    return Held(process.num_fds(), threading.active_count(), len(process.children()), memory)
+    return HeldResources(process.num_fds(), threading.active_count(), len(process.children()), memory)
 
 
-def _grown(settled: Sequence[Held]) -> list[Figure]:
+def _grown(settled: Sequence[HeldResources]) -> list[Figure]:
     """Growth from round to round; memory is reported on only where the rounds are too few to tell."""
     before, after = settled[0], settled[-1]
     memory = [held.memory_mb for held in settled]

@@ -152,7 +152,7 @@ class StepLoop:
         self._joining = self._joining and bool(merged.dropped)
         chunk = ActionChunk(request.rows.astype(np.float32))
         self._commitment.add_chunk(request.number, chunk, request.step, request.waited)
-        self._commitment.on_merged(_as_told(merged))
+        self._commitment.on_merged(_to_message(merged))
 
     def _execute(self) -> None:
         planned = self.timeline.at(self.step)
@@ -163,7 +163,7 @@ class StepLoop:
         self.log.executed.append(Executed(self.step, self.commanded, makers, self._starved))
 
 
-def _as_told(merged: MergeResult) -> ChunkMerged:
+def _to_message(merged: MergeResult) -> ChunkMerged:
     """Control's message to the coordinator about it."""
     return ChunkMerged(
         merged.chunk_id,

@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import moving_target
-from benchmarks.reference import DIM, Meant, Reference, answering, chunks_of, disagreeing
+from benchmarks.reference import DIM, IntendedRows, Reference, chunks_of, make_policy, with_disagreement
 from benchmarks.report import Figure, Report
 from benchmarks.step_loop import Executed, Log, StepLoop
 from benchmarks.strategy_station import Case, compare
@@ -80,14 +80,14 @@ class Cell(Case):
         )
         return made
 
-    def loop(self, meant: Meant, start: Float64, spike: int = 0) -> StepLoop:
+    def loop(self, meant: IntendedRows, start: Float64, spike: int = 0) -> StepLoop:
         """A run of it; request number _SLOW takes `spike` ticks instead."""
         module = variants("runtime.strategies")[self.strategy]
 
         def delay(number: int) -> int:
             return spike if spike and number == _SLOW else self.delay
 
-        return StepLoop(module, self.config, answering(meant), delay, self.control_hz, start)
+        return StepLoop(module, self.config, make_policy(meant), delay, self.control_hz, start)
 
 
 CHECKED = [
@@ -149,9 +149,9 @@ def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
 
 def _row(cell: Cell) -> dict[str, Any]:
     """Everything of one cell."""
-    exact, other = track(cell, False), track(cell, True)
-    spike = track(cell, False, spike=cell.horizon + 5)
-    reaction = react(cell) if cell.feasible else (None, None, None)
+    exact, other = measure_tracking(cell, False), measure_tracking(cell, True)
+    spike = measure_tracking(cell, False, spike=cell.horizon + 5)
+    reaction = measure_reaction(cell) if cell.feasible else (None, None, None)
     return asdict(cell) | {
         "interval": cell.interval,
         "feasible": cell.feasible,
@@ -170,14 +170,14 @@ def _row(cell: Cell) -> dict[str, Any]:
     }
 
 
-def track(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
+def measure_tracking(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
     """Follow the reference for _SECONDS after everything has begun."""
     reference = Reference(cell.control_hz)
     begin = 2 * cell.cycle
     ticks = begin + 4 * spike + int(_SECONDS * cell.control_hz)
     table = reference.at(np.arange(ticks + 5 * cell.cycle + spike, dtype=float))
     meant = chunks_of(table, cell.horizon)
-    loop = cell.loop(disagreeing(meant) if disagree else meant, table[0], spike)
+    loop = cell.loop(with_disagreement(meant) if disagree else meant, table[0], spike)
     log = loop.run(ticks)
     for _ in range(4 * cell.cycle):  # a gap at the end is given the time to end
         if not log.executed[-1].starved:
@@ -228,7 +228,7 @@ class _Mind:
         return np.full((self._horizon, DIM), self.value)
 
 
-def react(cell: Cell) -> tuple[int, int, int]:
+def measure_reaction(cell: Cell) -> tuple[int, int, int]:
     """Steps until 50, 90 and 99 % of a change of mind are published, each the worst of _CHANGES changes."""
     mind = _Mind(cell.horizon)
     loop = cell.loop(mind, np.zeros(DIM))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.reference import DIM, Reference, answering, chunks_of, disagreeing
+from benchmarks.reference import DIM, Reference, chunks_of, make_policy, with_disagreement
 from benchmarks.step_loop import Policy as Answering
 from benchmarks.step_loop import StepLoop
 from robots import Robot
@@ -30,7 +30,7 @@ _SCALE = 0.3  # of the reference: so slow that safety has nothing to change
 _TICKS = 300
 
 
-class Obedient(Source, Sink):
+class InstantRobot(Source, Sink):
     """A robot that is at once where it is told to be."""
 
     def __init__(self, robot: Robot, clock: Clock) -> None:
@@ -62,7 +62,7 @@ class Obedient(Source, Sink):
         """Nothing to release."""
 
 
-class Known(Policy):
+class TablePolicy(Policy):
     """Answers by the number of control steps since the first observation after a reset."""
 
     def __init__(self, answer: Answering, horizon: int) -> None:
@@ -90,7 +90,7 @@ class Known(Policy):
 
 def station_of(
     spec: StationSpec,
-    robot: Obedient,
+    robot: InstantRobot,
     policy: Policy,
     clock: VirtualClock,
     around: LockstepEnvironment | None = None,
@@ -124,7 +124,7 @@ def compare(case: Case) -> tuple[int, int]:
         spec = _plan(Path(folder), case)
         start = spec.robot.poses["ready"].astype(np.float64)
         answer = _answer(start, case)
-        first, planned = _run(spec, Known(answer, case.horizon))
+        first, planned = _run(spec, TablePolicy(answer, case.horizon))
     module = variants("runtime.strategies")[case.strategy]
     config = module.Config.model_validate(case.section)
     loop = StepLoop(module, config, answer, lambda number: case.delay, spec.rate, start, spec.dims)
@@ -137,11 +137,11 @@ def compare(case: Case) -> tuple[int, int]:
     return len(meant), len(other)
 
 
-def _run(spec: StationSpec, policy: Known) -> tuple[int, Mapping[int, Float32]]:
+def _run(spec: StationSpec, policy: TablePolicy) -> tuple[int, Mapping[int, Float32]]:
     """The step of the run's first observation, and by control step what was planned, before safety."""
     planned: dict[int, Float32] = {}
     clock = VirtualClock()
-    with closing(station_of(spec, Obedient(spec.robot, clock), policy, clock)) as station:
+    with closing(station_of(spec, InstantRobot(spec.robot, clock), policy, clock)) as station:
         session = station.coordinator.session
         station.connect()
         station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
@@ -163,14 +163,14 @@ def _answer(start: Float64, case: Case) -> Answering:
     """Policy of both: chunks that disagree, around `start`, in the float32 of the wire."""
     steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
     reference = Reference(case.control_hz)
-    meant = disagreeing(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
+    meant = with_disagreement(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
 
     def rows(step: int) -> Float64:
         made = np.tile(start, (case.horizon, 1))
         made[:, :DIM] += _SCALE * meant(step)
         return made
 
-    known = answering(rows)
+    known = make_policy(rows)
     return lambda step, given: known(step, given).astype(np.float32).astype(np.float64)
 
 

@@ -30,7 +30,7 @@ _MOST_DECODED_HZ = 200.0
 
 
 @dataclass(slots=True)
-class Stage:
+class CaseSetup:
     """Setting of a case: its processes, its folder, and its way of sending."""
 
     stack: contextlib.ExitStack
@@ -71,7 +71,7 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True)
-class Wired:
+class CaseEndpoints:
     """Transport and cameras to receive; a picture is dated by its number in a "strip" or "bar", or "due"."""
 
     transport: Mapping[str, Any]
@@ -88,7 +88,7 @@ class Case:
 
     name: str
     needs: str
-    open: Callable[[Stage], Wired]
+    open: Callable[[CaseSetup], CaseEndpoints]
     robot: str = ROBOT
     played: bool = False  # of a recording, as fast as its reader goes
     program: str = ""
@@ -152,25 +152,25 @@ def end(child: subprocess.Popen[str]) -> None:
         child.wait()
 
 
-def _node(stage: Stage, *more: str) -> dict[str, Any]:
+def _node(stage: CaseSetup, *more: str) -> dict[str, Any]:
     """The transport of a simulated node."""
     free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
     said = stage.send("node", "--robot", stage.robot, *free, *more)
     return {"kind": "zmq", "sub_endpoint": said["obs_endpoint"], "pub_endpoint": said["action_endpoint"]}
 
 
-def _zmq(stage: Stage) -> Wired:
-    return Wired(_node(stage, *stage.sized()))
+def _zmq(stage: CaseSetup) -> CaseEndpoints:
+    return CaseEndpoints(_node(stage, *stage.sized()))
 
 
-def _ros2(stage: Stage) -> Wired:
+def _ros2(stage: CaseSetup) -> CaseEndpoints:
     """As the robot publishes: JPEG."""
     domain = stage.stack.enter_context(free_domain())
     stage.send("ros2_node", "--robot", stage.robot, "--domain", str(domain), *stage.sized())
-    return Wired({"kind": "ros2", "domain": domain})
+    return CaseEndpoints({"kind": "ros2", "domain": domain})
 
 
-def _ros2_raw(stage: Stage) -> Wired:
+def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
     """The same robot, whose cameras publish pixels."""
     folder = stage.folder / stage.robot
     shutil.copytree(ROOT / "robots" / stage.robot, folder)
@@ -180,7 +180,7 @@ def _ros2_raw(stage: Stage) -> Wired:
     return _ros2(stage)
 
 
-def _ros1(stage: Stage) -> Wired:
+def _ros1(stage: CaseSetup) -> CaseEndpoints:
     """rospy at both ends, and a master of its own."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -189,7 +189,7 @@ def _ros1(stage: Stage) -> Wired:
     around = {"ROS_MASTER_URI": master, "ROS_IP": "127.0.0.1", "ROS_HOME": str(stage.folder)}
     stage.stack.enter_context(_master(port, os.environ | around))
     stage.send("ros1_node", "--robot", stage.robot, "--master", master, *stage.sized())
-    return Wired({"kind": "ros1", "master": master})
+    return CaseEndpoints({"kind": "ros1", "master": master})
 
 
 @contextlib.contextmanager
@@ -211,24 +211,24 @@ def _master(port: int, environment: Mapping[str, str]) -> Iterator[None]:
         child.wait(PATIENCE_S)
 
 
-def _dataset(stage: Stage) -> Wired:
-    return Wired(_recorded(stage)[0], born="due")
+def _dataset(stage: CaseSetup) -> CaseEndpoints:
+    return CaseEndpoints(_recorded(stage)[0], born="due")
 
 
-def _file_cameras(stage: Stage) -> Wired:
+def _file_cameras(stage: CaseSetup) -> CaseEndpoints:
     """Videos in place of the recording's own, of which its joints remain."""
     transport, videos = _recorded(stage)
     cameras = {key: {"kind": "file", "path": str(path)} for key, path in videos.items()}
-    return Wired(transport, cameras, born="due")
+    return CaseEndpoints(transport, cameras, born="due")
 
 
-def _recorded(stage: Stage) -> tuple[dict[str, Any], dict[str, Path]]:
+def _recorded(stage: CaseSetup) -> tuple[dict[str, Any], dict[str, Path]]:
     path = stage.folder / "dataset"
     videos = record(path, robots.load_robot(stage.robot), int(_SECONDS_OF_VIDEO * FPS), int(FPS), *stage.size)
     return {"kind": "dataset", "path": str(path)}, videos
 
 
-def _mjpeg_cameras(stage: Stage) -> Wired:
+def _mjpeg_cameras(stage: CaseSetup) -> CaseEndpoints:
     """Cameras of the network beside a node, whose own pictures are as small as can be.
 
     What comes faster than it is decoded is passed over, so that no pictures may come as fast as they go.
@@ -239,4 +239,4 @@ def _mjpeg_cameras(stage: Stage) -> Wired:
     height, width = stage.size
     said = stage.send("cameras", str(len(keys)), rate, str(width), str(height))
     cameras = {key: {"kind": "mjpeg", "url": url} for key, url in zip(keys, said["urls"], strict=True)}
-    return Wired(transport, cameras, born="bar")
+    return CaseEndpoints(transport, cameras, born="bar")

@@ -53,7 +53,7 @@ class Pace:
         self._ahead += 1
 
 
-class Noting:
+class TimestampingNode:
     """A node that notes when each of its ticks begins."""
 
     def __init__(self, ticking: node.Ticking, clock: Clock, pace: Pace | None) -> None:
@@ -67,7 +67,7 @@ class Noting:
         self._ticking.tick(seconds)
 
 
-class NotingServer(MjpegServer):
+class TimestampingCameraServer(MjpegServer):
     """A camera that notes when each of its pictures leaves."""
 
     def __init__(self, width: int, height: int, rate: float) -> None:
@@ -88,7 +88,7 @@ def main(file: str, shared: str, module: str, *arguments: str) -> int:
     plain = simulated.run
 
     def run(ticking: node.Ticking, clock: Clock, rate: float, told: Event) -> None:
-        noting = Noting(ticking, clock, _pace(shared, arguments, clock) if shared else None)
+        noting = TimestampingNode(ticking, clock, _pace(shared, arguments, clock) if shared else None)
         plain(noting, clock, rate, told)
         Path(file).write_text(json.dumps(noting.times), "utf-8")
 
@@ -105,7 +105,7 @@ def _pace(shared: str, arguments: Sequence[str], clock: Clock) -> Pace:
 
 def _cameras(file: Path, arguments: Sequence[str]) -> int:
     count, rate, width, height = int(arguments[0]), float(arguments[1]), int(arguments[2]), int(arguments[3])
-    servers = [NotingServer(width, height, rate) for _ in range(count)]
+    servers = [TimestampingCameraServer(width, height, rate) for _ in range(count)]
     told = standin.stop_event(lifeline=True)
     standin.announce_ready({"urls": [server.start() for server in servers]}, None)
     told.wait()

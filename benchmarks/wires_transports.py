@@ -27,7 +27,7 @@ import numpy as np
 import psutil
 
 import robots
-from benchmarks.wires_cases import PATIENCE_S, Case, Stage, Wired, absent, cases, end, process
+from benchmarks.wires_cases import PATIENCE_S, Case, CaseEndpoints, CaseSetup, absent, cases, end, process
 from benchmarks.wires_receiver import FPS, Receiving, layout
 from runtime.core.clock import MonotonicClock
 from runtime.core.types import UInt8
@@ -71,7 +71,7 @@ def live(case: Case, seconds: float) -> Row:
         took = time.monotonic() - begun
         used = (_processor(watched) - before) / took
         faults, sent = _ended(receiver), stage.sent()
-        known = [age for age in ages(looks, wired.born, sent) if age is not None]
+        known = [age for age in image_ages(looks, wired.born, sent) if age is not None]
     return {
         "cpu_percent": 100.0 * used,
         "age_ms": {f"p{q}": 1e3 * float(np.percentile(known, q)) for q in (50, 99)},
@@ -104,15 +104,15 @@ def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
 @contextlib.contextmanager
 def _staged(
     case: Case, rate: float, size: tuple[int, int], hurried: bool = False
-) -> Iterator[tuple[Stage, SharedState]]:
+) -> Iterator[tuple[CaseSetup, SharedState]]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         shared, descriptor = SharedState.create(layout(robots.load_robot(case.robot)))
         stack.callback(os.close, descriptor)
-        yield Stage(stack, folder, rate, size, case.robot, descriptor, hurried), shared
+        yield CaseSetup(stack, folder, rate, size, case.robot, descriptor, hurried), shared
 
 
-def _receiving(stage: Stage, wired: Wired, fast: bool) -> subprocess.Popen[str]:
+def _receiving(stage: CaseSetup, wired: CaseEndpoints, fast: bool) -> subprocess.Popen[str]:
     """The process that fills the page."""
     given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
     command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
@@ -155,17 +155,17 @@ def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
         for index, camera in enumerate(shared.layout.cameras):
             picture = shared.pictures[camera].read(int(record["picture_number"][index]))
             captured = float(record["picture_captured"][index])
-            look.append((None if picture is None else marks(picture), captured, now))
+            look.append((None if picture is None else number_marks(picture), captured, now))
         looks.append(look)
     return looks, int(shared.observation.read()["sequence"]) - first
 
 
-def marks(picture: UInt8) -> UInt8:
+def number_marks(picture: UInt8) -> UInt8:
     """Parts of a picture that tell its number: the strip at its head and the bar at its foot."""
     return np.concatenate([picture[:16], picture[-16:]])
 
 
-def ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
+def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
     """Of the oldest picture that each tick saw [s]; None where one was being overwritten."""
     found: list[float | None] = []
     for look in looks:

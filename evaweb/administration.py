@@ -12,12 +12,12 @@ from django.contrib.auth.forms import AuthenticationForm
 from django.http import HttpRequest, HttpResponseRedirect
 from django.shortcuts import redirect
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.errors import NotAllowed
 from evaweb.roles import Role, role_of
 
 # Pages that say which checkpoint a trial, a recording, a command or a job is about.
-_TELLING = (
+_REVEALING_PAGES = (
     "trials_trial_",
     "trials_score_",
     "stations_command_",
@@ -50,9 +50,9 @@ class LabAdminSite(AdminSite):
         def seen(request: HttpRequest, *given: Any, **named: Any) -> Any:
             match = request.resolver_match
             name = str(match.url_name or "") if match else ""
-            if name.startswith(_TELLING) and self.has_permission(request):
-                hidden = sight_of(request.user)
-                if not hidden.clear:
+            if name.startswith(_REVEALING_PAGES) and self.has_permission(request):
+                hidden = visibility_for_user(request.user)
+                if not hidden.sees_everything:
                     raise NotAllowed(f"this page tells which checkpoint a trial is of, and {hidden.plans}")
             return inner(request, *given, **named)
 

@@ -27,33 +27,35 @@ class AppendOnly:
 
     message: str
     columns: tuple[str, ...] = ()
-    but: tuple[str, ...] = ()
-    only: str = ""
-    moves: Mapping[str, Mapping[str, Sequence[str]]] = field(default_factory=dict)
+    except_columns: tuple[str, ...] = ()
+    condition: str = ""
+    allowed_changes: Mapping[str, Mapping[str, Sequence[str]]] = field(default_factory=dict)
     never: tuple[str, ...] = ()
-    late: str = ""
+    forbidden_inserts: str = ""
 
-    def guard(self, model: type[Model]) -> Guard:
+    def guard(self, model: type[Model]) -> TriggerSpec:
         """The same as the database knows it."""
-        for name in (*self.columns, *self.but, *self.moves):
+        for name in (*self.columns, *self.except_columns, *self.allowed_changes):
             model._meta.get_field(name)  # or FieldDoesNotExist
         columns = tuple(
             field.column
             for field in model._meta.concrete_fields
             if field.primary_key
-            or (field.name in self.columns if self.columns else field.name not in self.but)
+            or (field.name in self.columns if self.columns else field.name not in self.except_columns)
         )
         moved = tuple(
             f'OLD."{name}" = \'{before}\' AND NEW."{name}" NOT IN ({", ".join(map(repr, (before, *after)))})'
-            for name, table in self.moves.items()
+            for name, table in self.allowed_changes.items()
             for before, after in table.items()
         )
         never = (*moved, *self.never)
-        return Guard(model._meta.db_table, columns, self.message, self.only, never, self.late)
+        return TriggerSpec(
+            model._meta.db_table, columns, self.message, self.condition, never, self.forbidden_inserts
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class Guard:
+class TriggerSpec:
     """What of `table` stays: the values of `columns`, and the row. `message` is what whoever tries is told."""
 
     table: str
@@ -84,7 +86,7 @@ class Guard:
         )
 
 
-def install(connection: Any, guards: Iterable[Guard]) -> None:
+def install(connection: Any, guards: Iterable[TriggerSpec]) -> None:
     """Make the triggers anew, as they are declared now; other databases than SQLite and PostgreSQL are refused."""
     make = {"sqlite": _sqlite, "postgresql": _postgresql}.get(connection.vendor)
     if make is None:
@@ -95,7 +97,7 @@ def install(connection: Any, guards: Iterable[Guard]) -> None:
                 cursor.execute(statement)
 
 
-def laid_aside(apps: Any, editor: Any) -> None:
+def triggers_suspended(apps: Any, editor: Any) -> None:
     """For a migration: SQLite rebuilds no table that a trigger of another one names. They come back once it is done."""
     if editor.connection.vendor != "sqlite":
         return
@@ -114,20 +116,20 @@ def protect(app: AppConfig) -> None:
     post_migrate.connect(install_guards, sender=app, weak=False, dispatch_uid=f"guards of {app.name}")
 
 
-def guards(app: AppConfig) -> tuple[Guard, ...]:
+def guards(app: AppConfig) -> tuple[TriggerSpec, ...]:
     """What the models of `app` declare."""
     return tuple(
         model.append_only.guard(model) for model in app.get_models() if hasattr(model, "append_only")
     )
 
 
-def removal(connection: Any, guard: Guard) -> list[str]:
+def removal(connection: Any, guard: TriggerSpec) -> list[str]:
     """What takes the triggers of a guard away."""
     of = f" ON {guard.table}" if connection.vendor == "postgresql" else ""
     return [f"DROP TRIGGER IF EXISTS {name}{of}" for name in guard.names.values()]
 
 
-def _sqlite(guard: Guard) -> list[str]:
+def _sqlite(guard: TriggerSpec) -> list[str]:
     """REPLACE removes a row too: settings has recursive_triggers, with which that is refused."""
     return [
         f"CREATE TRIGGER {guard.names[event]} BEFORE {event} ON {guard.table} WHEN {refused} "
@@ -136,7 +138,7 @@ def _sqlite(guard: Guard) -> list[str]:
     ]
 
 
-def _postgresql(guard: Guard) -> list[str]:
+def _postgresql(guard: TriggerSpec) -> list[str]:
     """A function for each trigger: the conditions of triggers themselves know no other rows."""
     refused = {**guard.refused("IS DISTINCT FROM"), "TRUNCATE": "TRUE"}
     return [

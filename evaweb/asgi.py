@@ -15,15 +15,15 @@ from channels.security.websocket import AllowedHostsOriginValidator
 from channels.sessions import CookieMiddleware
 from django.conf import settings
 
-from evaweb.api.door import StopDoor
+from evaweb.api.door import StopGateway
 from evaweb.console.origins import SameOrigin
 from evaweb.console.routing import websocket_urlpatterns
-from evaweb.slots import Slots
+from evaweb.slots import RequestLimiter
 from evaweb.static_files import StaticFiles
 
 application = ProtocolTypeRouter(
     {
-        "http": StopDoor(StaticFiles(Slots(http), settings.STATIC_DIGEST)),
+        "http": StopGateway(StaticFiles(RequestLimiter(http), settings.STATIC_DIGEST)),
         "websocket": SameOrigin(
             AllowedHostsOriginValidator(CookieMiddleware(URLRouter(websocket_urlpatterns)))
         ),

@@ -16,36 +16,38 @@ from django.contrib.auth.signals import user_logged_in, user_logged_out, user_lo
 from django.dispatch import receiver
 from django.http import HttpRequest
 
-from evaweb.callers import address_of
-from evaweb.rarely import Rarely
+from evaweb.callers import client_address
+from evaweb.rarely import LogThrottle
 
 log = logging.getLogger(__name__)
 _MOST = 1000  # addresses that are remembered
 _EVERY_S = 60.0
-_refused = Rarely(_EVERY_S, _MOST)
-_unverified = Rarely(10.0, 16)  # a crowd presses more often than a disk writes
+_refused = LogThrottle(_EVERY_S, _MOST)
+_unverified = LogThrottle(10.0, 16)  # a crowd presses more often than a disk writes
 
 
 @receiver(user_logged_in)
-def _came(sender: Any, request: HttpRequest, user: Any, **named: Any) -> None:
+def _on_login(sender: Any, request: HttpRequest, user: Any, **named: Any) -> None:
     log.info("%a has logged in from %s", user.get_username(), _where(request))
 
 
 @receiver(user_logged_out)
-def _went(sender: Any, request: HttpRequest, user: Any, **named: Any) -> None:
+def _on_logout(sender: Any, request: HttpRequest, user: Any, **named: Any) -> None:
     if user is not None:
         log.info("%a has logged out from %s", user.get_username(), _where(request))
 
 
 @receiver(user_login_failed)
-def _failed(
+def _on_login_failed(
     sender: Any, credentials: dict[str, Any], request: HttpRequest | None = None, **named: Any
 ) -> None:
     log.warning("login of %s failed from %s", _named(credentials.get("username")), _where(request))
 
 
 @receiver(user_locked_out)
-def _locked(sender: Any, request: HttpRequest, username: str, ip_address: str | None, **named: Any) -> None:
+def _on_lockout(
+    sender: Any, request: HttpRequest, username: str, ip_address: str | None, **named: Any
+) -> None:
     minutes = settings.AXES_COOLOFF_TIME.total_seconds() / 60
     log.warning(
         "login of %s is locked from %s for up to %.0f minutes",
@@ -55,17 +57,17 @@ def _locked(sender: Any, request: HttpRequest, username: str, ip_address: str | 
     )
 
 
-def token_refused(address: str | None, why: str) -> None:
+def log_token_refused(address: str | None, why: str) -> None:
     """A token did not open anything; once a minute per address, with how many there were."""
     where = address or "nowhere"
-    before = _refused.due(where)
+    before = _refused.suffix_if_due(where)
     if before is not None:
         log.warning("a token from %s %s%s", where, why, before)
 
 
 def estop_unverified(station: str, why: Exception) -> None:
     """An e-stop was obeyed of nobody knows whom; once in 10 s per station, with how many there were."""
-    before = _unverified.due(station)
+    before = _unverified.suffix_if_due(station)
     if before is not None:
         log.error("an e-stop of %a is obeyed, of nobody knows whom: %s%s", station[:80], why, before)
 
@@ -77,4 +79,4 @@ def _named(username: Any) -> str:
 
 
 def _where(request: HttpRequest | None) -> str:
-    return (address_of(request) if request is not None else None) or "nowhere"
+    return (client_address(request) if request is not None else None) or "nowhere"

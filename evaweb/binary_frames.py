@@ -50,7 +50,9 @@ def encode(streams: Mapping[str, Stream], **header: Any) -> bytes:
     """
     body = _Body()
     entries = {name: _entry(name, stream, body) for name, stream in streams.items()}
-    text = json.dumps(plain({**header, "streams": entries}), separators=(",", ":"), allow_nan=False).encode()
+    text = json.dumps(
+        to_json_value({**header, "streams": entries}), separators=(",", ":"), allow_nan=False
+    ).encode()
     start = _LENGTH.size + len(text)
     return b"".join([_LENGTH.pack(len(text)), text, bytes(-start % _ALIGNMENT), *body.pieces])
 
@@ -91,14 +93,14 @@ class _Body:
         return offset
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """`value` for JSON: mappings and sequences as they are, numbers that are not finite as None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_value(item) for item in value]
     if isinstance(value, np.generic | np.ndarray):
-        return plain(value.tolist())
+        return to_json_value(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -51,7 +51,7 @@ _HARMLESS = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class Visibility:
     """Data hidden from one user: checkpoints by id and by name, in trials, episodes and at stations.
 
     `stations` are those, by name, at which a trial of such a plan was handed out; `at_work` those at which one is not
@@ -61,13 +61,13 @@ class Sight:
     checkpoints: frozenset[int] = frozenset()
     names: frozenset[str] = frozenset()
     stations: frozenset[str] = frozenset()
-    at_work: frozenset[str] = frozenset()
+    busy_stations: frozenset[str] = frozenset()
     keys: frozenset[int] = frozenset()
     plans: str = ""
     user: int | None = None
 
     @property
-    def clear(self) -> bool:
+    def sees_everything(self) -> bool:
         """True if nothing is hidden."""
         return not self.checkpoints
 
@@ -84,7 +84,7 @@ class Sight:
         """True if the checkpoint of this trial is hidden."""
         return trial.checkpoint_id in self.checkpoints
 
-    def label(self, trial: Any) -> str:
+    def checkpoint_label(self, trial: Any) -> str:
         """Shown name of a trial's checkpoint: its own; of a hidden one the code of the trial."""
         if not self.hides(trial):
             return str(trial.checkpoint.name)
@@ -94,9 +94,9 @@ class Sight:
         """Why the trial is where it is. What a person wrote is theirs; what the station said may tell."""
         if not self.hides(trial) or trial.status in ("voided", "abandoned"):
             return str(trial.reason)
-        return self.told(trial.reason)
+        return self.redact_text(trial.reason)
 
-    def told(self, text: str, covered: str = HIDDEN) -> str:
+    def redact_text(self, text: str, covered: str = HIDDEN) -> str:
         """A station's sentence as a user may read it from whom something is hidden; with its id if it is all shown.
 
         `covered` stands for what may not be read.
@@ -107,9 +107,9 @@ class Sight:
             shown = covered if said is None else said
         return shown if shows(shown, identity(shown)["arguments"]) else plain(shown)
 
-    def open(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
+    def filter_visible(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
         """The rows of a query that are of no hidden checkpoint; `checkpoint` leads to it."""
-        if self.clear:
+        if self.sees_everything:
             return rows
         return rows.exclude(**{f"{checkpoint}__in": self.checkpoints})
 
@@ -125,7 +125,7 @@ class Sight:
         trial = getattr(episode, "trial", None)
         if not self.hides_episode(episode):
             return str(trial.checkpoint.name if trial is not None else episode.checkpoint)
-        return self.label(trial) if trial is not None else HIDDEN
+        return self.checkpoint_label(trial) if trial is not None else HIDDEN
 
     def tags_of(self, episode: Any) -> list[str]:
         """Tags of a recording, without those of others before the reveal, and those that name a hidden checkpoint."""
@@ -149,38 +149,38 @@ class Sight:
 
     # --- stations -----------------------------------------------------------------------------------------------
 
-    def veils(self, station: str, snapshot: Mapping[str, Any] | None) -> bool:
+    def redacts_snapshot(self, station: str, snapshot: Mapping[str, Any] | None) -> bool:
         """True if the station's state is shown without what tells which checkpoint it is set up for."""
-        if self.clear:
+        if self.sees_everything:
             return False
         loaded = (snapshot or {}).get("checkpoint") or {}
         if (
             loaded.get("id") in self.checkpoints
             or loaded.get("name") in self.names
-            or station in self.at_work
+            or station in self.busy_stations
         ):
             return True
         # What the station said of a hidden checkpoint stands there until it is set up for another one.
         another = loaded.get("id") is not None and bool((snapshot or {}).get("validated"))
         return station in self.stations and not another
 
-    def veils_events(self, station: str) -> bool:
+    def redacts_events(self, station: str) -> bool:
         """True if events of the station may be about a hidden checkpoint; also those of earlier trials."""
         return station in self.stations
 
 
-EVERYTHING = Sight()
+FULL_VISIBILITY = Visibility()
 
-_find: Callable[[Any], Sight] | None = None
+_find: Callable[[Any], Visibility] | None = None
 
 
-def declare(find: Callable[[Any], Sight]) -> None:
+def register_visibility_rule(find: Callable[[Any], Visibility]) -> None:
     """`find` says what is hidden from a user."""
     global _find
     _find = find
 
 
-def sight_of(user: Any) -> Sight:
+def visibility_for_user(user: Any) -> Visibility:
     """The user's sight as of now."""
     if _find is None:
         raise ImproperlyConfigured(
@@ -189,11 +189,11 @@ def sight_of(user: Any) -> Sight:
     return _find(user)
 
 
-def sight_for(request: Any) -> Sight:
+def visibility_for_request(request: Any) -> Visibility:
     """The caller's sight, by login or by token; looked up once per request."""
     if not hasattr(request, "_eva_sight"):
-        request._eva_sight = sight_of(getattr(request, "auth", None) or request.user)
-    found: Sight = request._eva_sight
+        request._eva_sight = visibility_for_user(getattr(request, "auth", None) or request.user)
+    found: Visibility = request._eva_sight
     return found
 
 
@@ -203,6 +203,6 @@ def code_of(trial: Any) -> str:
     return str(handout.code) if handout is not None else ""
 
 
-def masked(rows: Iterable[Any]) -> str:
+def plan_titles(rows: Iterable[Any]) -> str:
     """The titles of plans, as a sentence says them."""
     return ", ".join(dict.fromkeys(map(str, rows)))

@@ -15,7 +15,7 @@ SHARE = ContextVar("SHARE", default="nowhere")  # `share_of` the request that is
 _ONE_SUBSCRIBER = 64  # bits of an address of IPv6: whoever has one has all that begin with them
 
 
-def address_of(request: HttpRequest) -> str | None:
+def client_address(request: HttpRequest) -> str | None:
     """The address of the caller, None where there is none, as over a socket of the file system."""
     named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
     found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
@@ -24,13 +24,13 @@ def address_of(request: HttpRequest) -> str | None:
 
 def lockable_of(request: HttpRequest) -> str | None:
     """The address at which names are locked: of IPv6 the first of the network, all of which is one subscriber's."""
-    found = _parsed(address_of(request))
+    found = _parsed(client_address(request))
     if isinstance(found, IPv6Address):
         return str(ip_network((found, _ONE_SUBSCRIBER), strict=False).network_address)
     return None if found is None else str(found)
 
 
-def share_of(scope: dict[str, Any]) -> str:
+def client_key(scope: dict[str, Any]) -> str:
     """From where who asks over ASGI comes, for what each of them has a share of: an address, or a network of IPv6."""
     named = [value.decode("latin-1") for name, value in scope["headers"] if name == b"x-forwarded-for"]
     peer = (scope.get("client") or [None])[0]

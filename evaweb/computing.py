@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from evaweb.errors import EvaError
-from evaweb.lookups import Crowded, Lookups
+from evaweb.lookups import FairLookupPool, LookupQueueFull
 from runtime.core.sentences import Pattern, fixed
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class Questions:
     ) -> None:
         self._run, self._clock, self._patience_s, self._soon_s = run, clock, patience_s, soon_s
         self._lock = threading.Lock()
-        self._turns: Lookups[Any] = Lookups(1, _MOST_ASKED)
+        self._turns: FairLookupPool[Any] = FairLookupPool(1, _MOST_ASKED)
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
         self._asked: dict[
             Hashable, tuple[Hashable, Future[Any]]
@@ -149,7 +149,7 @@ class Questions:
             return coming.result(self._soon_s if soon else self._patience_s)
         except TimeoutError:
             raise UnderWay(_UNDER_WAY) from None
-        except Crowded:
+        except LookupQueueFull:
             raise Busy(_CROWDED) from None
         finally:
             with self._lock:
@@ -157,7 +157,7 @@ class Questions:
 
     def compute(self, share: Hashable, work: Callable[..., Any], *given: Any) -> Any:
         """The same in the turn of `share`, however long it takes: for a thread that is no request's."""
-        found, _ = self._turns.ask(share, partial(self._run, work, *given)).result()
+        found, _ = self._turns.submit(share, partial(self._run, work, *given)).result()
         return found
 
     def _begun(self, person: Hashable, question: tuple[Callable[..., Any], tuple[Any, ...]]) -> Future[Any]:
@@ -167,7 +167,7 @@ class Questions:
         if spent >= AT_ONCE_S:
             wait = ceil((spent - AT_ONCE_S) / REFILLED) + 1
             raise Busy(_SPENT(spent=spent, at_once=AT_ONCE_S, seconds=wait), wait)
-        coming: Future[Any] = self._turns.ask(person, partial(self._answered, person, question))
+        coming: Future[Any] = self._turns.submit(person, partial(self._answered, person, question))
         if not coming.done():  # else there was no room for it
             self._asked[question] = (person, coming)
             coming.add_done_callback(lambda _: self._asked.pop(question, None))

@@ -11,34 +11,34 @@ from django.contrib.sessions.middleware import SessionMiddleware
 from django.http import HttpRequest, HttpResponseBase, parse_cookie
 from django.utils.http import http_date
 
-from evaweb.credentials import OF_ANY_AGE, SESSION, credentials
+from evaweb.credentials import EXPIRED_ALLOWED, SESSION, credentials
 
 _KEPT_S = 365 * 24 * 3600  # by a browser; the session itself ends after SESSION_COOKIE_AGE
 MOST = 8  # of one name that are looked into; a browser has one or two
 
 
-def cookies_of(headers: Iterable[str], name: str) -> list[str]:
+def cookie_values(headers: Iterable[str], name: str) -> list[str]:
     """Values of all cookies of that name, in the order of the headers."""
     parts = (part for header in headers for part in header.split(";") if name in part)
     values = (parse_cookie(part).get(name) for part in parts)
     return list(dict.fromkeys(filter(None, values)))
 
 
-def sessions_of(headers: Iterable[str]) -> list[str]:
+def session_keys(headers: Iterable[str]) -> list[str]:
     """The keys of the sessions that a browser says it has; of very many those that are remembered, and a few more."""
-    keys = cookies_of(headers, settings.SESSION_COOKIE_NAME)
+    keys = cookie_values(headers, settings.SESSION_COOKIE_NAME)
     return keys if len(keys) <= MOST else sorted(keys, key=_is_strange)[:MOST]
 
 
 def _is_strange(key: str) -> bool:
-    return not any(credentials.recall(kind, key) for kind in (SESSION, OF_ANY_AGE[SESSION]))
+    return not any(credentials.recall(kind, key) for kind in (SESSION, EXPIRED_ALLOWED[SESSION]))
 
 
 class AnySessionMiddleware(SessionMiddleware):
     """Django's own, which knows the last of several cookies alone: of these the first that is a session's counts."""
 
     def process_request(self, request: HttpRequest) -> None:
-        keys = sessions_of([request.META.get("HTTP_COOKIE", "")])
+        keys = session_keys([request.META.get("HTTP_COOKIE", "")])
         if len(keys) > 1:
             exists = import_module(settings.SESSION_ENGINE).SessionStore().exists
             request.COOKIES[settings.SESSION_COOKIE_NAME] = next(filter(exists, keys), keys[-1])

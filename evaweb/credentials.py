@@ -27,16 +27,16 @@ from django.contrib.auth.signals import user_logged_out
 from django.contrib.sessions.models import Session
 from django.db import connection
 
-from evaweb.lock_wait import hurried
-from evaweb.lookups import Crowded, Lookups
-from evaweb.rarely import Rarely
+from evaweb.lock_wait import short_lock_wait
+from evaweb.lookups import FairLookupPool, LookupQueueFull
+from evaweb.rarely import LogThrottle
 from evaweb.roles import Role, role_of
 from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
-_faults = Rarely(10.0, 8)
+_faults = LogThrottle(10.0, 8)
 SESSION, TOKEN = "session", "token"
-OF_ANY_AGE = {
+EXPIRED_ALLOWED = {
     kind: f"{kind} of any age" for kind in (SESSION, TOKEN)
 }  # also where its time is over: for an e-stop
 UNVERIFIED = "unverified"  # the name of who presses while the database does not say who they are
@@ -62,7 +62,7 @@ class Unverifiable(Exception):
     """The database did not say whose credential this is."""
 
 
-class Busy(Exception):
+class LookupOverload(Exception):
     """The database answers, and there are so many to ask about from one address that this one had no turn."""
 
 
@@ -81,10 +81,10 @@ class Login:
         return get_user_model()(pk=self.pk, username=self.username)
 
 
-_Said = Login | Unverifiable | Busy | None
+_Said = Login | Unverifiable | LookupOverload | None
 
 
-class Credentials:
+class CredentialCache:
     """Logins that this process has verified; from any thread. `wait` is asyncio's; a test has its own."""
 
     def __init__(
@@ -98,36 +98,36 @@ class Credentials:
         self._nobodys: OrderedDict[_Key, float] = OrderedDict()  # until when that is believed
         self._answered_at = -float("inf")
         self._asked: dict[tuple[_Key, str | None], Future[Login | None]] = {}
-        self._strangers: Lookups[Login | None] = Lookups(_THREADS)
-        self._remembered: Lookups[Login | None] = Lookups(_THREADS_OF_REMEMBERED, most=_MOST)
+        self._strangers: FairLookupPool[Login | None] = FairLookupPool(_THREADS)
+        self._remembered: FairLookupPool[Login | None] = FairLookupPool(_THREADS_OF_REMEMBERED, most=_MOST)
         self._owners: dict[str, Callable[[str], Any]] = {
             SESSION: session_user,
-            OF_ANY_AGE[SESSION]: ended_session_user,
+            EXPIRED_ALLOWED[SESSION]: ended_session_user,
         }
 
-    def learn(self, kind: str, owner: Callable[[str], Any]) -> None:
+    def register_kind(self, kind: str, owner: Callable[[str], Any]) -> None:
         """Register how the user of a credential of that kind is looked up, None where there is none."""
         self._owners[kind] = owner
 
-    def look(self, kind: str, secret: str) -> Any:
+    def look_up(self, kind: str, secret: str) -> Any:
         """The user as the database has them now, None where there is none; in the caller's thread. Raises its Error."""
         with connection.execute_wrapper(self._heard):
             user = self._owners[kind](secret)
         if user is None:
-            if kind in OF_ANY_AGE and self.recall(kind, secret) is not None:
-                self.look(OF_ANY_AGE[kind], secret)  # whose time is over presses as before: at once
+            if kind in EXPIRED_ALLOWED and self.recall(kind, secret) is not None:
+                self.look_up(EXPIRED_ALLOWED[kind], secret)  # whose time is over presses as before: at once
             self._is_nobodys((kind, digest(secret)))
         else:
-            self.note(kind, secret, user)
+            self.remember(kind, secret, user)
         return user
 
-    def heard(self) -> None:
+    def record_answer(self) -> None:
         """The database has just answered something."""
         self._answered_at = self._clock()
 
     def _heard(self, execute: Callable[..., Any], *asked: Any) -> Any:
         answer = execute(*asked)
-        self.heard()
+        self.record_answer()
         return answer
 
     def _is_nobodys(self, key: _Key) -> None:
@@ -138,7 +138,7 @@ class Credentials:
             while len(self._nobodys) > _MOST:
                 self._nobodys.popitem(last=False)
 
-    def note(self, kind: str, secret: str, user: Any) -> None:
+    def remember(self, kind: str, secret: str, user: Any) -> None:
         """The database has just said that it is this user's."""
         login = Login(user.pk, user.get_username(), role_of(user), self._clock())
         key = (kind, digest(secret))
@@ -154,7 +154,7 @@ class Credentials:
         with self._lock:
             return self._known.get((kind, digest(secret)))
 
-    def counted(self, kind: str, secret: str) -> Login | None:
+    def recall_recent(self, kind: str, secret: str) -> Login | None:
         """Login it stands for as the database said within the last minute; without asking."""
         known = self.recall(kind, secret)
         return known if known is not None and self._clock() - known.checked < COUNTS_S else None
@@ -164,7 +164,7 @@ class Credentials:
         with self._lock:
             self._known.pop((kind, digested), None)
 
-    async def presser(self, found: Sequence[Credential], share: str) -> Login | None:
+    async def resolve_presser(self, found: Sequence[Credential], share: str) -> Login | None:
         """The user of an e-stop, by any of these credentials: at once where one is remembered, else by the database.
 
         No press is lost for a date: a credential whose time is over is one here. None: the database says that they
@@ -178,24 +178,25 @@ class Credentials:
                         self._check(remembered, secret)
                     return known
         asking = [
-            asyncio.create_task(self._stranger(_of_any_age(kind), secret, share)) for kind, secret in found
+            asyncio.create_task(self._resolve_unknown(_of_any_age(kind), secret, share))
+            for kind, secret in found
         ]
         try:
-            return await _first(asking)
+            return await _first_known(asking)
         finally:
             for one in asking:
                 one.cancel()
 
-    async def stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
+    async def resolve_stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
         """The user of a stop or halt, and the kind of credential: one that is remembered, else any other.
 
         As the database says, or as it said last where it does not answer. None: unknown. Raises Unverifiable, Busy.
         """
-        fault: Busy | None = None
+        fault: LookupOverload | None = None
         for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
             known = self.recall(kind, secret)
             if known is None:
-                login = await self._stranger(kind, secret, share)
+                login = await self._resolve_unknown(kind, secret, share)
             else:
                 login = known if self._fresh(known) else await self._checked(kind, secret, known)
             if isinstance(login, Login):
@@ -219,7 +220,7 @@ class Credentials:
         answer.add_done_callback(_read)
         return known
 
-    def _stranger(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
+    def _resolve_unknown(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
         """Whose credential it is that is not remembered, or why that is not known; asked about from now on."""
         if self._is_known_as_nobodys((kind, digest(secret))):
             return self._said_of(None)
@@ -233,12 +234,12 @@ class Credentials:
         answer.add_done_callback(_read)
         try:
             while not asked.done():  # which the loop may not have noticed yet
-                await self._wait({answer}, timeout=patience(came, self._answered_at, self._clock()))
-        except (Unverifiable, Busy) as fault:
+                await self._wait({answer}, timeout=remaining_wait(came, self._answered_at, self._clock()))
+        except (Unverifiable, LookupOverload) as fault:
             return fault
         failed = asked.exception()
-        if isinstance(failed, Crowded):
-            return Busy(str(failed))
+        if isinstance(failed, LookupQueueFull):
+            return LookupOverload(str(failed))
         return asked.result() if failed is None else Unverifiable(_AWAY(why=failed))
 
     def _is_known_as_nobodys(self, key: _Key) -> bool:
@@ -257,7 +258,7 @@ class Credentials:
                 return asked
             work = partial(self._ask, kind, secret)
             lookups = self._remembered if share is None else self._strangers
-            asked = self._asked[key] = lookups.ask(share, work)
+            asked = self._asked[key] = lookups.submit(share, work)
         asked.add_done_callback(lambda _: self._done(key))
         return asked
 
@@ -268,12 +269,12 @@ class Credentials:
     def _ask(self, kind: str, secret: str) -> Login | None:
         """A credential of any age is one that is good now, or one whose time is over."""
         try:
-            with hurried():
-                for one in (*(now for now, ever in OF_ANY_AGE.items() if ever == kind), kind):
-                    if self.look(one, secret) is not None:
+            with short_lock_wait():
+                for one in (*(now for now, ever in EXPIRED_ALLOWED.items() if ever == kind), kind):
+                    if self.look_up(one, secret) is not None:
                         return self.recall(one, secret)
         except Exception as fault:  # whatever it is: the database has not said who this is
-            before = _faults.due(kind)
+            before = _faults.suffix_if_due(kind)
             if before is not None:
                 log.warning("a %s was not verified: %s%s", kind, fault, before)
             raise
@@ -282,7 +283,7 @@ class Credentials:
         return None
 
 
-def patience(came: float, answered: float, now: float) -> float:
+def remaining_wait(came: float, answered: float, now: float) -> float:
     """Time that a caller since `came` still waits [s]; the database last answered at `answered` [s].
 
     Raises Unverifiable where it has answered no look-up for half a second, Busy where others were before it longer.
@@ -291,13 +292,13 @@ def patience(came: float, answered: float, now: float) -> float:
     if silent <= 0:
         raise Unverifiable(_LATE(seconds=_PATIENCE_S))
     if came + _TURN_S <= now:
-        raise Busy(_NO_TURN(seconds=_TURN_S))
+        raise LookupOverload(_NO_TURN(seconds=_TURN_S))
     return min(silent, came + _TURN_S - now)
 
 
-async def _first(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
+async def _first_known(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
     """The first known user; raises Unverifiable at once, and Busy where nothing else is known."""
-    busy: Busy | None = None
+    busy: LookupOverload | None = None
     for one in asyncio.as_completed(asking):
         answer = await one
         if isinstance(answer, Login):
@@ -311,7 +312,7 @@ async def _first(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
 
 
 def _of_any_age(kind: str) -> str:
-    return OF_ANY_AGE.get(kind, kind)
+    return EXPIRED_ALLOWED.get(kind, kind)
 
 
 def digest(secret: str) -> str:
@@ -353,9 +354,9 @@ def _read(answer: asyncio.Future[Login | None]) -> None:
 def _logged_out(request: Any = None, **named: Any) -> None:
     session = getattr(request, "session", None)
     if session is not None and session.session_key:
-        for kind in (SESSION, OF_ANY_AGE[SESSION]):
+        for kind in (SESSION, EXPIRED_ALLOWED[SESSION]):
             credentials.forget(kind, digest(session.session_key))
 
 
-credentials = Credentials()
+credentials = CredentialCache()
 user_logged_out.connect(_logged_out, dispatch_uid="evaweb.credentials")

@@ -43,7 +43,7 @@ class Bucket:
         return f"s3://{self.name}/{self.prefix}".rstrip("/")
 
 
-def flag(name: str, default: bool) -> bool:
+def read_flag(name: str, default: bool) -> bool:
     """A yes or no."""
     given = os.environ.get(name)
     if given is None:
@@ -54,7 +54,7 @@ def flag(name: str, default: bool) -> bool:
     return word in _TRUE
 
 
-def words(name: str, default: tuple[str, ...] = ()) -> list[str]:
+def read_list(name: str, default: tuple[str, ...] = ()) -> list[str]:
     """A list separated by commas."""
     given = os.environ.get(name)
     return list(default) if given is None else [word.strip() for word in given.split(",") if word.strip()]
@@ -73,7 +73,7 @@ def _number(name: str, default: float, least: float, most: float, allowed: str) 
     return value
 
 
-def seconds(name: str, default: float) -> float:
+def read_seconds(name: str, default: float) -> float:
     """A time above zero [s]."""
     return _number(name, default, sys.float_info.min, sys.float_info.max, "seconds above zero")
 
@@ -98,10 +98,10 @@ def niceness(name: str, default: int) -> int:
     return int(given)
 
 
-def networks(name: str) -> list[IPv4Network | IPv6Network]:
+def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
     """Addresses and networks, separated by commas; none where it is not given."""
     try:
-        return [ip_network(word) for word in words(name)]
+        return [ip_network(word) for word in read_list(name)]
     except ValueError as error:
         given = os.environ[name]
         raise ImproperlyConfigured(
@@ -220,12 +220,12 @@ def private_file(path: Path) -> Path:
     One that was copied back from somewhere, readable by others, no longer is.
     """
     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
-    for file in beside(path):
+    for file in database_files(path):
         _take_from_others(file)
     return path
 
 
-def beside(database: Path) -> list[Path]:
+def database_files(database: Path) -> list[Path]:
     """A file of SQLite with those of its journal, as far as they are there."""
     names = [database, *(database.with_name(database.name + end) for end in ("-wal", "-shm", "-journal"))]
     return [path for path in names if path.exists()]

@@ -14,7 +14,7 @@ from django.contrib.auth.hashers import PBKDF2PasswordHasher
 
 from evaweb.callers import SHARE
 from evaweb.errors import EvaError
-from evaweb.lookups import Crowded, Lookups
+from evaweb.lookups import FairLookupPool, LookupQueueFull
 from runtime.core.sentences import fixed
 
 _TOO_MANY_PASSWORDS_BEING_CHECKED = fixed(
@@ -26,7 +26,7 @@ _MOST_WAITING = 16
 _NICE = 10
 
 
-class Busy(EvaError):
+class HashingOverload(EvaError):
     """Too many passwords are being checked."""
 
     status = 503
@@ -37,7 +37,7 @@ def _give_way() -> None:
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone
 
 
-_turns: Lookups[str] = Lookups(1, _MOST_WAITING, "passwords", _give_way)
+_turns: FairLookupPool[str] = FairLookupPool(1, _MOST_WAITING, "passwords", _give_way)
 
 
 class QueuedHasher(PBKDF2PasswordHasher):
@@ -46,6 +46,6 @@ class QueuedHasher(PBKDF2PasswordHasher):
     def encode(self, password: str, salt: str, iterations: int | None = None) -> str:
         """The hash; raises Busy."""
         try:
-            return _turns.ask(SHARE.get(), partial(super().encode, password, salt, iterations)).result()
-        except Crowded:
-            raise Busy(_TOO_MANY_PASSWORDS_BEING_CHECKED) from None
+            return _turns.submit(SHARE.get(), partial(super().encode, password, salt, iterations)).result()
+        except LookupQueueFull:
+            raise HashingOverload(_TOO_MANY_PASSWORDS_BEING_CHECKED) from None

@@ -16,13 +16,13 @@ _VIEWER_STYLES = (
     "'sha256-K7kXOYqP8pf16L5/PaLZ4u9Lt5q3nTyjCvyGtO/Af2k='",
 )
 
-NOTHING = "default-src 'none'"  # the policy of what is no page and is answered without Django
+DENY_ALL_POLICY = "default-src 'none'"  # the policy of what is no page and is answered without Django
 PLAIN_PAGE = (
     "default-src 'none'; style-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-BARE = [  # the headers of such an answer
+DEFAULT_HEADERS = [  # the headers of such an answer
     (b"cache-control", b"no-store"),
-    (b"content-security-policy", NOTHING.encode()),
+    (b"content-security-policy", DENY_ALL_POLICY.encode()),
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"same-origin"),
@@ -59,6 +59,6 @@ class HeadersMiddleware(MiddlewareMixin):
     """
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        for name, value in BARE:
+        for name, value in DEFAULT_HEADERS:
             response.headers.setdefault(name.decode().title(), value.decode())
         return response

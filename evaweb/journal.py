@@ -33,7 +33,7 @@ from pydantic import (
 )
 
 from evaweb.errors import EvaError
-from evaweb.roles import known_person
+from evaweb.roles import get_or_create_person
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
@@ -50,13 +50,13 @@ _ITS_IS_OF = Pattern("web.journal.its_is_of", "its {verbose_name} {uuid} is of {
 _NOT_KEPT = Pattern("web.journal.not_kept", "not kept: {strerror} ({path}); {done}")
 
 
-class NotKept(EvaError):
+class NotWritten(EvaError):
     """The disk did not take it, and so the database was not told either."""
 
     status = 507
 
 
-def text(name: str, given: str, longest: int) -> str:
+def clean_text(name: str, given: str, longest: int) -> str:
     """A text as it was typed, without blanks at its ends; EvaError where it cannot be stored."""
     if "\x00" in given:
         raise EvaError(_CONTAINS_CHARACTER_U_0000_WHICH(name=name))
@@ -70,7 +70,7 @@ def text(name: str, given: str, longest: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class From:
+class RowPath:
     """Where a row has what a field of its line says, as queries name it: `rater__username`; "" under its own name."""
 
     path: str
@@ -114,7 +114,7 @@ class Line(BaseModel):
     @classmethod
     def path_of(cls, name: str) -> str:
         """Where the row has it."""
-        found = (each.path for each in cls.model_fields[name].metadata if isinstance(each, From))
+        found = (each.path for each in cls.model_fields[name].metadata if isinstance(each, RowPath))
         return next(found, "") or name
 
     @classmethod
@@ -125,14 +125,17 @@ class Line(BaseModel):
     @classmethod
     def written(cls, row: Any, **given: Any) -> dict[str, Any]:
         """The line of a row that is about to be saved; `given` is what the row does not say."""
-        return {name: given[name] if name in given else plain(cls._value(row, name)) for name in cls.names()}
+        return {
+            name: given[name] if name in given else to_json_value(cls._value(row, name))
+            for name in cls.names()
+        }
 
     @classmethod
     def _value(cls, row: Any, name: str) -> Any:
         field = cls.model_fields[name]
         if name in cls.ELSEWHERE:
             return field.default
-        value = value_at(row, cls.path_of(name))
+        value = resolve_path(row, cls.path_of(name))
         nested = field.annotation
         return (
             nested.written(value)
@@ -140,27 +143,27 @@ class Line(BaseModel):
             else value
         )
 
-    def values(self) -> dict[str, Any]:
+    def to_row_values(self) -> dict[str, Any]:
         """What the row is made of: people as their accounts; what lies in other rows is left out."""
         found = {}
         for name in type(self).names():
             field, _, further = type(self).path_of(name).partition("__")
             value = getattr(self, name)
             if further == "username":
-                found[field] = known_person(value)
+                found[field] = get_or_create_person(value)
             elif not further and name not in self.ELSEWHERE and not isinstance(value, Line):
                 found[field] = value
         return found
 
 
-def value_at(row: Any, path: str) -> Any:
+def resolve_path(row: Any, path: str) -> Any:
     """What a path of a query leads to; None where it ends before."""
     for name in path.split("__"):
         row = getattr(row, name, None) if row is not None else None
     return row
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """A value as JSON has it."""
     if isinstance(value, datetime):
         return value.isoformat()
@@ -172,7 +175,7 @@ def plain(value: Any) -> Any:
 AnyLine = TypeVar("AnyLine", bound=Line)
 
 
-def absent(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list[AnyLine]:
+def missing_rows(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list[AnyLine]:
     """The lines whose rows are not there, of one that was given twice the last; EvaError for one of another owner."""
     ((belongs, whose),) = owner.items()
     last = {line.uuid: line for line in lines}  # type: ignore[attr-defined]
@@ -211,7 +214,7 @@ class Journal(Generic[AnyLine]):
         A line that is not whole, or that is none of theirs, is left out: `say` is told file, line and field.
         """
         path, found, lines = self.path(uuid), [], _reader(_kinds[self.folder])
-        for number, line in numbered(path):
+        for number, line in read_numbered_lines(path):
             try:
                 found.append(lines.validate_json(line))
             except ValidationError as error:
@@ -230,7 +233,7 @@ def folders() -> list[str]:
     return sorted(_kinds)
 
 
-def checked(model: type[AnyLine], content: Mapping[str, Any], what: str) -> AnyLine:
+def parse_model(model: type[AnyLine], content: Mapping[str, Any], what: str) -> AnyLine:
     """`content` as that model; EvaError says after `what` the first thing that is wrong with it."""
     try:
         return model.model_validate_json(json.dumps(content))
@@ -263,10 +266,10 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
             try:
                 _written(file, text.encode() + b"\n")
             except OSError:
-                done = _taken_back(file, before)
+                done = _truncate_back(file, before)
                 raise
     except OSError as error:
-        raise NotKept(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
+        raise NotWritten(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
 
 
 def _written(file: FileIO, payload: bytes) -> None:
@@ -283,7 +286,7 @@ def _written(file: FileIO, payload: bytes) -> None:
         _sync_folder(folder.parent)
 
 
-def _taken_back(file: FileIO, before: int) -> str:
+def _truncate_back(file: FileIO, before: int) -> str:
     """Give the file the length that it had; what became of the line, in words."""
     try:
         file.truncate(before)
@@ -302,7 +305,7 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def numbered(path: Path) -> Iterator[tuple[int, bytes]]:
+def read_numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """The lines of a file with their numbers, from 1; none of an absent one. RecordingError if it is unreadable."""
     try:
         data = path.read_bytes()

@@ -17,7 +17,7 @@ from django.http import HttpRequest, QueryDict, StreamingHttpResponse
 
 from evaweb.downloads import CSV, download
 from evaweb.errors import EvaError
-from evaweb.tabular_export import csv_lines
+from evaweb.tabular_export import iter_csv
 from runtime.core.sentences import Pattern
 
 _SORT_ALLOWED_EACH_ALSO_WITH = Pattern(
@@ -216,7 +216,7 @@ class Listing:
         columns = {column.name: column.cell for column in self.columns if column.cell}
         pages = self._read(rows) if isinstance(rows, QuerySet) else iter([rows])
         cells = (({key: cell(row) for key, cell in columns.items()} for row in page) for page in pages)
-        return download(request, csv_lines(list(columns), cells), f"{name}.csv", CSV)
+        return download(request, iter_csv(list(columns), cells), f"{name}.csv", CSV)
 
     def _read(self, rows: QuerySet[Any]) -> Iterator[list[Any]]:
         keys = list(self.ordered(rows).values_list("pk", flat=True))

@@ -16,7 +16,7 @@ _hurry: ContextVar[float | None] = ContextVar("hurry", default=None)
 
 
 @contextmanager
-def hurried(seconds: float = HURRY_S) -> Iterator[None]:
+def short_lock_wait(seconds: float = HURRY_S) -> Iterator[None]:
     """Connections that are opened within it wait no longer for a lock, nor for a statement of PostgreSQL's."""
     token = _hurry.set(seconds)
     try:
@@ -38,7 +38,7 @@ def lock_wait(seconds: float) -> Iterator[None]:
         _wait_at_most(connection, _usual(connection))
 
 
-def for_pages() -> None:
+def limit_page_waits() -> None:
     """This process serves people: it does not wait long for a PostgreSQL that does not answer.
 
     Other processes keep the time of the settings, and try again.

@@ -14,7 +14,7 @@ from django.http import HttpRequest, HttpResponse
 from django.utils import timezone
 
 from evaweb.callers import lockable_of
-from evaweb.refusals import told
+from evaweb.refusals import error_response
 from runtime.core.sentences import Pattern
 
 _LOCKED = Pattern(
@@ -47,7 +47,7 @@ class ManyNames:
             raise PermissionDenied
 
 
-def answer(request: HttpRequest, *given: Any) -> HttpResponse:
+def lockout_response(request: HttpRequest, *given: Any) -> HttpResponse:
     """429 with how long it lasts."""
     until = _many_names_until(request)
     seconds = _seconds_to(until or _name_until(request))
@@ -57,7 +57,7 @@ def answer(request: HttpRequest, *given: Any) -> HttpResponse:
     else:
         sentence = _LOCKED if minutes > 1 else _LOCKED_FOR_A_MINUTE
         said = sentence(times=settings.AXES_FAILURE_LIMIT, minutes=minutes)
-    response = told(request, said, 429, "registration/locked.html")
+    response = error_response(request, said, 429, "registration/locked.html")
     response["Retry-After"] = str(seconds)
     return response
 

@@ -14,14 +14,14 @@ T = TypeVar("T")
 _MOST = 1024  # that wait, of all shares together
 
 
-class Crowded(Exception):
+class LookupQueueFull(Exception):
     """There is no place to wait for this one."""
 
     def __init__(self) -> None:
         super().__init__("too many logins from this address are looked up at once")
 
 
-class Lookups(Generic[T]):
+class FairLookupPool(Generic[T]):
     """Work in `threads`, the oldest of each share in turn; from any thread, and none of its callers waits.
 
     Each thread does `begin` first.
@@ -42,7 +42,7 @@ class Lookups(Generic[T]):
         self._waiting = 0
         self._threads = ThreadPoolExecutor(threads, name, initializer=begin)
 
-    def ask(self, share: Hashable, work: Callable[[], T]) -> Future[T]:
+    def submit(self, share: Hashable, work: Callable[[], T]) -> Future[T]:
         """Result of `work`, once it had its turn."""
         answer: Future[T] = Future()
         answer.set_running_or_notify_cancel()  # who stops waiting for it ends nobody else's
@@ -52,7 +52,7 @@ class Lookups(Generic[T]):
                 self._shares.setdefault(share, deque()).append((work, answer))
                 self._waiting += 1
         if turned_away is not None:
-            turned_away.set_exception(Crowded())
+            turned_away.set_exception(LookupQueueFull())
         if turned_away is None:  # else a thread is promised to the one that gave way
             try:
                 self._threads.submit(self._next)

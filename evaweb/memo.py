@@ -11,7 +11,7 @@ _MOST = 256  # analyses of 500 trials each: some 100 MB
 T = TypeVar("T")
 
 
-class Kept(Generic[T]):
+class FingerprintCache(Generic[T]):
     """The most recently used of what was made, each with the fingerprint it was made at."""
 
     def __init__(self, most: int = _MOST) -> None:
@@ -46,7 +46,7 @@ class Kept(Generic[T]):
             self._rows.clear()
 
 
-def steady(total: float | None) -> float:
+def rounded_sum(total: float | None) -> float:
     """A sum of numbers as part of a fingerprint.
 
     PostgreSQL adds up on several cores, in another order each time, and the last digits are chance.

@@ -12,7 +12,7 @@ from django.conf import settings
 _PORT = re.compile(r":([0-9]{1,5})$")
 
 
-def is_ours(origin: str, host: str, scheme: str, web_port: int | None = None) -> bool:
+def is_own_origin(origin: str, host: str, scheme: str, web_port: int | None = None) -> bool:
     """True if pages of `origin` are the lab's, for a server that was asked as `host` over `scheme`.
 
     Ours are that scheme, host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For a server
@@ -43,7 +43,7 @@ def scheme_of(scope: Mapping[str, Any]) -> str:
     return "https" if scope.get("scheme") in ("https", "wss") else "http"
 
 
-def at_port(host: str, web_port: int, port: int) -> str:
+def origin_at_port(host: str, web_port: int, port: int) -> str:
     """The origin beside the web's, over plain HTTP; "" where `host` is not the web's own port, but a proxy's."""
     name, asked = _parts(host)
     return f"http://{name}:{port}" if asked == web_port else ""

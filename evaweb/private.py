@@ -8,13 +8,13 @@ from typing import Any
 from django.conf import settings
 from django.core.checks import CheckMessage, Error, Tags, Warning, register
 
-from evaweb.environment import beside, readable_by_others
+from evaweb.environment import database_files, readable_by_others
 
 RESTORING = ".restoring"  # of the data folder: what a restore has copied and not put in its place yet
 
 
 @register(Tags.security)
-def data_is_private(**options: Any) -> list[CheckMessage]:
+def check_private_files(**options: Any) -> list[CheckMessage]:
     """Others cannot read the data folder, the database and the key."""
     return [
         Warning(
@@ -43,7 +43,7 @@ def data_is_whole(**options: Any) -> list[CheckMessage]:
 
 
 @register(Tags.security)
-def proxy_is_declared(**options: Any) -> list[CheckMessage]:
+def check_declared_proxy(**options: Any) -> list[CheckMessage]:
     """Behind an undeclared proxy all logins come from one address."""
     if not settings.SESSION_COOKIE_SECURE or settings.EVA_PROXIES:
         return []
@@ -60,4 +60,4 @@ def _private() -> list[Path]:
     data = Path(settings.DATA_DIR)
     database = settings.DATABASES["default"]
     sqlite = database["ENGINE"].endswith("sqlite3")
-    return [data, data / "secret_key", *(beside(Path(database["NAME"])) if sqlite else [])]
+    return [data, data / "secret_key", *(database_files(Path(database["NAME"])) if sqlite else [])]

@@ -10,7 +10,7 @@ from threading import Lock
 _OTHERS = None  # stands for all names that there is no room for
 
 
-class Rarely:
+class LogThrottle:
     """Of `most` names each is due once in `every_s`, and all others together; from any thread."""
 
     def __init__(self, every_s: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -20,7 +20,7 @@ class Rarely:
             OrderedDict()
         )  # when, and how many came since
 
-    def due(self, name: str, times: int = 1) -> str | None:
+    def suffix_if_due(self, name: str, times: int = 1) -> str | None:
         """Suffix of the line about `name`: how often it was left unsaid, or nothing. None: say no line."""
         now = self._clock()
         with self._lock:

@@ -20,7 +20,7 @@ from django.views import defaults
 
 from evaweb.errors import EvaError, refusal
 from evaweb.races import TAKEN, was_taken
-from evaweb.storage import refusal_of
+from evaweb.storage import storage_error_response
 from runtime.core.sentences import Pattern, fixed
 
 log = logging.getLogger(__name__)
@@ -54,9 +54,9 @@ class RefusalMiddleware(MiddlewareMixin):
         fields = [request.GET] if _of_programs(request) else [request.GET, request.POST]
         texts = (text for one in fields for name, values in one.lists() for text in (name, *values))
         if not is_text(request.path):
-            return told(request, _NUL_IN_ADDRESS, 404, "refused.html")
+            return error_response(request, _NUL_IN_ADDRESS, 404, "refused.html")
         if not all(map(is_text, texts)):
-            return told(request, _NUL_IN_WHAT_WAS_SENT, 400, "refused.html")
+            return error_response(request, _NUL_IN_WHAT_WAS_SENT, 400, "refused.html")
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
@@ -65,7 +65,7 @@ class RefusalMiddleware(MiddlewareMixin):
         spoken = response.headers.get("Content-Type", "").startswith("application/json")
         if status < 400 or spoken or not (_of_programs(request) or status == 405):
             return response
-        said = told(request, _sentence_of(request, response), status, "refused.html")
+        said = error_response(request, _sentence_of(request, response), status, "refused.html")
         if "Allow" in response.headers:
             said["Allow"] = response["Allow"]
         return said
@@ -73,13 +73,13 @@ class RefusalMiddleware(MiddlewareMixin):
     def process_exception(self, request: HttpRequest, exception: Exception) -> HttpResponse | None:
         if _is_no_number(exception):
             log.warning("%a was refused", request.path, exc_info=exception)
-            return told(request, f"{exception!s:.120}", 400, "refused.html")
+            return error_response(request, f"{exception!s:.120}", 400, "refused.html")
         if was_taken(exception):
             log.warning("%a was refused: %s", request.path, exception)
-            return told(request, TAKEN, 409, "refused.html")
+            return error_response(request, TAKEN, 409, "refused.html")
         if not isinstance(exception, EvaError):
             return None
-        return retrying(told(request, str(exception), exception.status, "refused.html"), exception)
+        return retrying(error_response(request, str(exception), exception.status, "refused.html"), exception)
 
 
 def retrying(answer: HttpResponse, fault: EvaError) -> HttpResponse:
@@ -89,14 +89,14 @@ def retrying(answer: HttpResponse, fault: EvaError) -> HttpResponse:
     return answer
 
 
-def nowhere(path: str) -> str:
+def unknown_address_sentence(path: str) -> str:
     """Sentence on an unknown address of REST."""
     return _NOWHERE(path=path)
 
 
 def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
     if response.status_code == 404:
-        return nowhere(request.path)
+        return unknown_address_sentence(request.path)
     if response.status_code == 405:
         allowed = response.headers.get("Allow") or "nothing"
         return _NO_METHOD(method=request.method, allowed=allowed)
@@ -115,7 +115,7 @@ def is_text(given: str) -> bool:
     return _NO_TEXT.search(given) is None
 
 
-def told(request: HttpRequest, sentence: str, status: int, template: str) -> HttpResponse:
+def error_response(request: HttpRequest, sentence: str, status: int, template: str) -> HttpResponse:
     """`template` with the sentence for a browser that navigates, JSON as by `errors.refusal` for everything else."""
     if "text/html" in request.headers.get("Accept", "") and not _of_programs(request):
         return render(request, template, {"sentence": sentence, "status": status}, status=status)
@@ -124,15 +124,15 @@ def told(request: HttpRequest, sentence: str, status: int, template: str) -> Htt
 
 def bad_request(request: HttpRequest, exception: Exception) -> HttpResponse:
     """handler400: such as a host that is not allowed."""
-    return told(request, f"{exception!s:.300}" or "bad request", 400, "unavailable.html")
+    return error_response(request, f"{exception!s:.300}" or "bad request", 400, "unavailable.html")
 
 
 def server_error(request: HttpRequest) -> HttpResponse:
     """handler500: what the disk or the database refused, with a sentence, or a fault of ours."""
     fault = sys.exc_info()[1]
-    refused = refusal_of(fault)
+    refused = storage_error_response(fault)
     if refused is not None:
-        return told(request, *refused, "unavailable.html")
+        return error_response(request, *refused, "unavailable.html")
     if not _of_programs(request):
         return defaults.server_error(request)
     if isinstance(fault, Error):

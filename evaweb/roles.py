@@ -30,7 +30,7 @@ class Role(StrEnum):
         return _RANK[self] >= _RANK[other]
 
     @property
-    def a(self) -> str:
+    def with_article(self) -> str:
         """With its article, as sentences say it."""
         return f"a {self}" if self is Role.VIEWER else f"an {self}"
 
@@ -46,16 +46,18 @@ def role_of(user: Any) -> Role:
     return max((role for role in Role if role.value in held), key=_RANK.__getitem__, default=Role.VIEWER)
 
 
-def require(user: Any, role: Role) -> Role:
+def require_role(user: Any, role: Role) -> Role:
     """The role of the user; NotAllowed unless it is at least `role`."""
     has = role_of(user)
     if not has.includes(role):
-        raise NotAllowed(_NEEDS_ROLE(user=user.get_username(), role=has.a, needed=role.a))
+        raise NotAllowed(
+            _NEEDS_ROLE(user=user.get_username(), role=has.with_article, needed=role.with_article)
+        )
     return has
 
 
 @transaction.atomic
-def grant(*, user: Any, role: Role) -> None:
+def set_role(*, user: Any, role: Role) -> None:
     """Give a user this role and no other; what they were by another way, a superuser say, they are no more."""
     user.is_superuser = False
     user.is_staff = role is Role.ADMIN  # pages of others look at it; ours look at the role
@@ -64,7 +66,7 @@ def grant(*, user: Any, role: Role) -> None:
     user.groups.set([groups.get_or_create(name=role.value)[0]])  # also where somebody has removed the group
 
 
-def known_person(name: str) -> Any:
+def get_or_create_person(name: str) -> Any:
     """The account of that name; one that is gone is made again, deactivated and without a password."""
     from django.contrib.auth import get_user_model  # models cannot be imported before the apps are ready
 

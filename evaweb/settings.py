@@ -18,9 +18,9 @@ BASE_DIR = environment.checkout(Path(__file__).parents[1])
 DATA_DIR = environment.data_dir(BASE_DIR / "data")
 
 SECRET_KEY = environment.secret_key(DATA_DIR)
-DEBUG = environment.flag("EVA_DEBUG", False)
-ALLOWED_HOSTS = environment.words("EVA_ALLOWED_HOSTS", ("127.0.0.1", "localhost", "[::1]"))
-CSRF_TRUSTED_ORIGINS = environment.words("EVA_TRUSTED_ORIGINS")
+DEBUG = environment.read_flag("EVA_DEBUG", False)
+ALLOWED_HOSTS = environment.read_list("EVA_ALLOWED_HOSTS", ("127.0.0.1", "localhost", "[::1]"))
+CSRF_TRUSTED_ORIGINS = environment.read_list("EVA_TRUSTED_ORIGINS")
 
 INSTALLED_APPS = [
     "evaweb.apps.LabAdminConfig",
@@ -173,11 +173,11 @@ MESSAGE_STORAGE = (
     "django.contrib.messages.storage.session.SessionStorage"  # not in a cookie of its usual name
 )
 SESSION_COOKIE_AGE = 14 * 24 * 3600
-_HTTPS = environment.flag("EVA_HTTPS", False)
+_HTTPS = environment.read_flag("EVA_HTTPS", False)
 SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = _HTTPS
 SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https") if _HTTPS else None
 # Browsers remember for so long that this name is reached over HTTPS alone; a month, so that it can be taken back.
-SECURE_HSTS_SECONDS = int(environment.seconds("EVA_HSTS_S", 30 * 24 * 3600)) if _HTTPS else 0
+SECURE_HSTS_SECONDS = int(environment.read_seconds("EVA_HSTS_S", 30 * 24 * 3600)) if _HTTPS else 0
 # Where large files lie that never change: None, they stay in the data folder; another folder, or a bucket.
 EVA_STORE = environment.store()
 CONTENT_SECURITY_POLICY = headers.content_security_policy(getattr(EVA_STORE, "origin", ""))
@@ -202,7 +202,7 @@ AXES_COOLOFF_TIME = timedelta(minutes=15)
 AXES_RESET_ON_SUCCESS = True
 AXES_RESET_COOL_OFF_ON_FAILURE_DURING_LOCKOUT = False
 AXES_CLIENT_IP_CALLABLE = "evaweb.callers.lockable_of"
-AXES_LOCKOUT_CALLABLE = "evaweb.lockout.answer"
+AXES_LOCKOUT_CALLABLE = "evaweb.lockout.lockout_response"
 AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
 AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs who comes and goes
 AXES_ENABLE_ADMIN = False  # evaweb.api.admin has a page of its own
@@ -230,7 +230,7 @@ LOGGING = {
 # --- ours --------------------------------------------------------------------------------------------------
 
 # The proxies in front, whose X-Forwarded-For is believed.
-EVA_PROXIES = environment.networks("EVA_PROXIES")
+EVA_PROXIES = environment.read_networks("EVA_PROXIES")
 # Where stations on other computers connect; None: there are none. The port after it takes their pictures.
 EVA_GATE = environment.address("EVA_GATE")
 # By which name those computers reach this one.
@@ -242,10 +242,10 @@ EVA_CACHE_BYTES = int(1e9 * environment.gigabytes("EVA_CACHE_GB", 10.0))
 # What a page is held that it does not read [MiB]; beyond it is cut off.
 EVA_UNREAD_BYTES = int(2**20 * environment.mebibytes("EVA_UNREAD_MIB", 8.0))
 # How long a request waits for a station's answer [s]; after it the outcome is unknown.
-EVA_COMMAND_TIMEOUT_S = environment.seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
+EVA_COMMAND_TIMEOUT_S = environment.read_seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
 # Without a sign of life for so long a worker's job is taken from it [s].
-EVA_JOB_STALE_S = environment.seconds("EVA_JOB_STALE_S", 60.0)
+EVA_JOB_STALE_S = environment.read_seconds("EVA_JOB_STALE_S", 60.0)
 # How long a worker that is told to end may finish its job [s]; then it puts it back.
-EVA_WORKER_GRACE_S = environment.seconds("EVA_WORKER_GRACE_S", 12.0)
+EVA_WORKER_GRACE_S = environment.read_seconds("EVA_WORKER_GRACE_S", 12.0)
 # How much a worker gives way to whatever else runs on its machine.
 EVA_WORKER_NICE = environment.niceness("EVA_WORKER_NICE", 19)

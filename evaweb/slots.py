@@ -8,9 +8,9 @@ from collections.abc import Awaitable, Callable, Coroutine, Hashable
 from contextlib import AsyncExitStack
 from typing import Any
 
-from evaweb.callers import SHARE, share_of
-from evaweb.headers import BARE
-from evaweb.lock_wait import hurried
+from evaweb.callers import SHARE, client_key
+from evaweb.headers import DEFAULT_HEADERS
+from evaweb.lock_wait import short_lock_wait
 
 _AT_ONCE = 32
 _MOST_WAITING = 256
@@ -22,7 +22,7 @@ _COMMANDING = "/api/v1/stations/"  # what is posted there commands, takes or ren
 _BUSY = b'{"error": "too many requests at once: try again in a few seconds"}'
 
 
-class Slots:
+class RequestLimiter:
     """An ASGI application in front of another one: requests take turns, and those that command do not wait long.
 
     Nobody has more than a share of them, so that one who asks for a lot keeps pages for the others.
@@ -42,7 +42,7 @@ class Slots:
         if scope["path"] == "/healthz":
             await self._application(scope, receive, send)
             return
-        address = share_of(scope)
+        address = client_key(scope)
         who = address, _login_of(scope)
         if (
             len(self._tasks) >= _AT_ONCE + _MOST_WAITING
@@ -69,9 +69,9 @@ class Slots:
             await self._work(scope, client)
 
     async def _work(self, scope: dict[str, Any], client: _Client) -> None:
-        SHARE.set(share_of(scope))  # of this task alone, and of the threads that work for it
+        SHARE.set(client_key(scope))  # of this task alone, and of the threads that work for it
         if scope["method"] == "POST" and scope["path"].startswith(_COMMANDING):
-            with hurried():
+            with short_lock_wait():
                 await self._application(scope, client.receive, client.send)
         else:
             await self._application(scope, client.receive, client.send)
@@ -158,6 +158,6 @@ class _Client:
 
 async def _refuse(send: Any) -> None:
     headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(_BUSY))]
-    headers += [(b"retry-after", b"3"), *BARE]
+    headers += [(b"retry-after", b"3"), *DEFAULT_HEADERS]
     await send({"type": "http.response.start", "status": 503, "headers": headers})
     await send({"type": "http.response.body", "body": _BUSY})

@@ -19,7 +19,7 @@ from typing import Any
 
 from django.core.exceptions import SuspiciousFileOperation
 
-from evaweb.headers import BARE
+from evaweb.headers import DEFAULT_HEADERS
 
 _PREFIX = "/static/"
 _DIGEST = re.compile(r"([0-9a-f]{16})/")
@@ -128,6 +128,6 @@ async def _answer(scope: dict[str, Any], send: Any, file: _File, keeping: bytes)
 
 
 async def _send(send: Any, status: int, headers: list[tuple[bytes, bytes]], content: bytes = b"") -> None:
-    told = dict(BARE) | {b"content-security-policy": _POLICY} | dict(headers)
+    told = dict(DEFAULT_HEADERS) | {b"content-security-policy": _POLICY} | dict(headers)
     await send({"type": "http.response.start", "status": status, "headers": list(told.items())})
     await send({"type": "http.response.body", "body": content})

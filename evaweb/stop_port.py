@@ -9,7 +9,7 @@ from typing import NamedTuple
 from django.conf import settings
 from django.http import HttpRequest
 
-from evaweb.origins import at_port
+from evaweb.origins import origin_at_port
 from runtime.recording.files import write_atomic
 
 
@@ -25,15 +25,15 @@ class StopPort(NamedTuple):
 
     def end(self) -> None:
         """It ends."""
-        forget()
+        remove_stop_port()
 
 
-def forget() -> None:
+def remove_stop_port() -> None:
     """Nothing listens any more, and nothing will."""
     _path().unlink(missing_ok=True)
 
 
-def told() -> StopPort | None:
+def read_stop_port() -> StopPort | None:
     """Ports of the process for stops, as it or its lab last said; None where there is none."""
     try:
         found = json.loads(_path().read_bytes())
@@ -47,10 +47,10 @@ def origin_for(request: HttpRequest) -> str:
 
     A page that came through a proxy has its own alone, and one of EVA_HTTPS: it must not call plain HTTP.
     """
-    found = told()
+    found = read_stop_port()
     if found is None or settings.SESSION_COOKIE_SECURE or request.META["SERVER_PORT"] != str(found.web_port):
         return ""
-    return at_port(request.get_host(), found.web_port, found.port)
+    return origin_at_port(request.get_host(), found.web_port, found.port)
 
 
 def _path() -> Path:

@@ -24,7 +24,7 @@ _DATABASE_AWAY = fixed(
 )
 
 
-def refusal_of(fault: BaseException | None) -> tuple[str, int] | None:
+def storage_error_response(fault: BaseException | None) -> tuple[str, int] | None:
     """507 where there is no room, 503 where database or disk cannot be written or reached; None for any other fault."""
     if not isinstance(fault, Error | OSError):
         return None

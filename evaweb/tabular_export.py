@@ -15,7 +15,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  #
 Pages = Iterable[Iterable[Mapping[str, Any]]]
 
 
-def cell(value: object) -> str:
+def csv_cell(value: object) -> str:
     """A value as it stands in CSV: as `plain` says, and no text is a formula.
 
     A text that a spreadsheet would take for a formula gets an apostrophe in front (OWASP, CSV injection), and so does
@@ -37,11 +37,11 @@ def plain(value: object) -> str:
     return repr(value) if isinstance(value, int | float) else str(value)
 
 
-def csv_lines(columns: Sequence[str], pages: Pages) -> Iterator[str]:
+def iter_csv(columns: Sequence[str], pages: Pages) -> Iterator[str]:
     """A header line, then all rows, a piece per page."""
     yield _lines([columns])
     for page in pages:
-        yield _lines([cell(row[column]) for column in columns] for row in page)
+        yield _lines([csv_cell(row[column]) for column in columns] for row in page)
 
 
 def in_pages(rows: Iterable[Mapping[str, Any]], size: int = 1000) -> Iterator[list[Mapping[str, Any]]]:
@@ -57,7 +57,7 @@ def _lines(rows: Iterable[Sequence[str]]) -> str:
     return buffer.getvalue()
 
 
-def parquet_pieces(columns: Mapping[str, Any], pages: Pages) -> Iterator[bytes]:
+def iter_parquet(columns: Mapping[str, Any], pages: Pages) -> Iterator[bytes]:
     """A Parquet file, written page by page, each a row group; `columns` has the type of each: `int | None`, `str`.
 
     Texts, names of enumerations and what has no type of its own are strings; times are UTC in microseconds.

@@ -7,6 +7,6 @@ from typing import Any
 from runtime.ipc.session_state import SessionState
 
 
-def standing(state: str) -> dict[str, Any]:
+def state_flags(state: str) -> dict[str, Any]:
     """Its word, and what it means."""
     return {"state": state, "state_is": SessionState(state).meaning_dict()}

@@ -16,8 +16,8 @@ from websockets.exceptions import ConnectionClosed
 from benchmarks.attacks.requests import again_and_again, long_to_parse
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import OTHER, PRESSED
-from evaweb.lab.patience import VisitFailed
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.patience import DemoFailed
+from evaweb.lab.visitor import LivePage, RestClient
 from runtime.ipc.bus import Endpoints
 
 _STOPS, _PRESSES = 5000, 1500
@@ -28,7 +28,7 @@ _QUIET_S = 5.0  # after which nothing more is answered
 class _Page(LivePage):
     """A page of which only acknowledgements are counted."""
 
-    def __init__(self, visitor: Visitor, station: str) -> None:
+    def __init__(self, visitor: RestClient, station: str) -> None:
         self.answered = 0
         super().__init__(visitor, station)
 
@@ -48,7 +48,7 @@ class _Page(LivePage):
         except ConnectionClosed as error:
             self._fail(str(error))
 
-    def _told(self, message: Mapping[str, Any]) -> None:
+    def _on_message(self, message: Mapping[str, Any]) -> None:
         self.answered += message.get("type") == "ack"
 
 
@@ -109,7 +109,7 @@ def _waves(target: Target, station: str, message: Mapping[str, Any], times: int)
                         target.begun()
                     _await(target, page, done["sent"])
                 done["answered"] += page.answered
-        except VisitFailed:
+        except DemoFailed:
             done["refused"] += 1
             target.ended.wait(0.5)
     return done

@@ -8,7 +8,7 @@ from uuid import uuid4
 
 from benchmarks.attacks.requests import again_and_again
 from benchmarks.attacks.target import Target
-from benchmarks.estop_presses import Program
+from benchmarks.estop_presses import RestPresser
 from evaweb.roles import Role
 
 _TOKENS, _HALTS = 64, 32
@@ -18,7 +18,7 @@ def made_up_tokens(target: Target) -> Counter[str]:
     """Press the e-stop from 64 clients, each time with a token of its own that nobody has."""
 
     def press(target: Target, number: int) -> str:
-        program = Program(target.stops, {"Authorization": f"Bearer eva_{uuid4().hex}"})
+        program = RestPresser(target.stops, {"Authorization": f"Bearer eva_{uuid4().hex}"})
         return f"answered {program.press('made up').status or 'nothing'}"
 
     return again_and_again(target, target.part(_TOKENS), press)
@@ -31,7 +31,7 @@ def halts(target: Target) -> Counter[str]:
 
     def halt(target: Target, number: int) -> str:
         order = {"kind": "halt", "page": "attack", "epoch": 0, "uuid": str(uuid4())}
-        program = Program(target.stops, headers | {"Origin": target.url})
+        program = RestPresser(target.stops, headers | {"Origin": target.url})
         return f"answered {program.ask('POST', 'commands', json.dumps(order)).get('status', 'an error')}"
 
     return again_and_again(target, target.part(_HALTS), halt)

@@ -15,9 +15,9 @@ from itertools import count
 from urllib.parse import urlsplit
 
 from benchmarks.attacks.target import Target
-from benchmarks.estop_lab import GUESSED, PRESSED
-from evaweb.lab.patience import VisitFailed
-from evaweb.lab.visitor import Visitor
+from benchmarks.estop_lab import GUESSED_ACCOUNT, PRESSED
+from evaweb.lab.patience import DemoFailed
+from evaweb.lab.visitor import RestClient
 from evaweb.roles import Role
 
 _CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4
@@ -70,8 +70,8 @@ def logins(target: Target) -> Counter[str]:
 
 
 def _login(target: Target, number: int) -> str:
-    password = target.passwords[GUESSED] if number % 2 else "not-the-password"
-    Visitor(target.url).login(GUESSED, password)
+    password = target.passwords[GUESSED_ACCOUNT] if number % 2 else "not-the-password"
+    RestClient(target.url).login(GUESSED_ACCOUNT, password)
     return "logged in"
 
 
@@ -99,14 +99,14 @@ def toml(target: Target) -> Counter[str]:
     return again_and_again(target, 1, partial(_import, visitor))
 
 
-def _import(visitor: Visitor, target: Target, number: int) -> str:
+def _import(visitor: RestClient, target: Target, number: int) -> str:
     name = ".".join("a" * target.part(_PARTS))
     text = f"{name} = 1\n" if number % 2 else f"[{name}]\n"
     answer = _posted_file(visitor, target, "/admin/plans/plan/import/", text)
     return f"answered {answer}"
 
 
-def _posted_file(visitor: Visitor, target: Target, path: str, text: str) -> int:
+def _posted_file(visitor: RestClient, target: Target, path: str, text: str) -> int:
     border, token = "end-of-part", visitor.csrf_token
     parts = (
         f'name="csrfmiddlewaretoken"\r\n\r\n{token}',
@@ -172,7 +172,7 @@ def again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], s
         for number in count():
             try:
                 done[ask(target, number)] += 1
-            except (VisitFailed, OSError, http.client.HTTPException) as fault:
+            except (DemoFailed, OSError, http.client.HTTPException) as fault:
                 done[type(fault).__name__] += 1
                 target.ended.wait(0.05)
 

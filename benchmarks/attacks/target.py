@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from evaweb.lab.visitor import Visitor
+from evaweb.lab.visitor import RestClient
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +34,8 @@ class Target:
         """The share of a number, at least 1."""
         return max(1, round(self.share * whole))
 
-    def visitor(self, username: str) -> Visitor:
+    def visitor(self, username: str) -> RestClient:
         """Somebody who has logged in."""
-        found = Visitor(self.url)
+        found = RestClient(self.url)
         found.login(username, self.passwords[username])
         return found

@@ -59,7 +59,7 @@ class Scenario(Bench):
 
     # --- what happens --------------------------------------------------------------------------------------
 
-    def happen(self) -> None:
+    def act(self) -> None:
         """Something, now and then."""
         if self.rng.random() < 0.06:
             kinds = ["follow", "follow", "motion", "hold", "estop", "push", "sim", "yield", "lock"]
@@ -151,16 +151,16 @@ class Scenario(Bench):
         faulty = self._turned(self.kept) if frozen else FAULTS[self.fault](self.rng, sound, self.since - 1)
         return np.where(self.places, faulty, sound)
 
-    def go(self) -> None:
+    def run_tick(self) -> None:
         """One tick: the robot is seen, told, and moves."""
         self._begun = True
         for process in ("coordinator", "guard"):
             self.shared.beat(process, self.clock.now())
-        self.happen()
+        self.act()
         self.observe(qpos=self.read().astype(np.float32))
         before = len(self.sink.sent)
         self.tick(self.step, self.clock.now())
-        self.look(self.sink.sent[before:])
+        self.check(self.sink.sent[before:])
         self.step += 1
         self.clock.advance(PERIOD)
         self._move()
@@ -188,7 +188,7 @@ class Scenario(Bench):
         """Known joints of the robot; moves of an arm by others that are not seen cannot be known."""
         return self.kept if self.fault == "frozen" else self.body
 
-    def look(self, sent: list[Float64]) -> None:
+    def check(self, sent: list[Float64]) -> None:
         """Note the violations in what was sent in this tick."""
         record = self.records()[-1]
         if len(sent) > 1 or (sent and self.behaviour == "yield"):
@@ -253,7 +253,7 @@ class Scenario(Bench):
         self.violations.append(f"{doing}: {what}")
 
 
-class EncoderOff(Bench):
+class EncoderOffsetScenario(Bench):
     """A robot that stands, one joint of which is read elsewhere from a tick on: it must not run away, nor may a run
     begin meanwhile.
     """
@@ -334,6 +334,6 @@ def once(seed: int) -> list[str]:
     """Violations in the scenario of `seed`, in words; [] where there are none."""
     scenario = Scenario(seed)
     for _ in range(_TICKS):
-        scenario.go()
-    found = [*scenario.violations, *EncoderOff(seed).violations()]
+        scenario.run_tick()
+    found = [*scenario.violations, *EncoderOffsetScenario(seed).violations()]
     return [f"seed {seed}: {violation}" for violation in found]

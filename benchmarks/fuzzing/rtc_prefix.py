@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.strategy_station import Obedient, lockstep_deployment, station_of
+from benchmarks.strategy_station import InstantRobot, lockstep_deployment, station_of
 from robots import Robot
 from runtime.config import loader
 from runtime.core.clock import Clock, VirtualClock
@@ -102,12 +102,12 @@ def once(seed: int) -> list[str]:
     made, random = scenario(seed), np.random.default_rng([seed, 1])
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), made)
-        keeper = Keeper(made, spec, random)
+        keeper = PrefixKeepingPolicy(made, spec, random)
         planned = _run(spec, made, keeper, random)
     return [f"seed {seed}: {text}" for text in _violations(made, keeper, planned)]
 
 
-class Late(LockstepRunner):
+class RandomDelayRunner(LockstepRunner):
     """Hands each result over after a number of ticks that is chance."""
 
     def __init__(self, least: int, most: int, random: np.random.Generator) -> None:
@@ -120,7 +120,7 @@ class Late(LockstepRunner):
         return super().submit(call)
 
 
-class Seldom(Obedient):
+class SlowlyObservedRobot(InstantRobot):
     """Stands at `position` in the beginning, and is seen every so many ticks."""
 
     def __init__(self, robot: Robot, clock: Clock, position: Float64, every: int) -> None:
@@ -135,14 +135,14 @@ class Seldom(Obedient):
 
 
 @dataclass(frozen=True, slots=True)
-class Declared:
+class DeclaredPrefix:
     """Content of a request: rows [d, W] that are fixed, the first for control step `step`."""
 
     step: int
     rows: Float64
 
 
-class Keeper(Policy):
+class PrefixKeepingPolicy(Policy):
     """Wanders about where it stands; continues what it is told, where it keeps the contract."""
 
     def __init__(self, made: Scenario, spec: StationSpec, random: np.random.Generator) -> None:
@@ -155,7 +155,7 @@ class Keeper(Policy):
         self._scale = random.uniform(0.3, 3.0, spec.robot.dim)
         self._shift = random.uniform(-1.0, 1.0, spec.robot.dim)
         self._switched = [] if made.space == "eef" else list(spec.robot.binary_dims)
-        self.declared: list[Declared] = []
+        self.declared: list[DeclaredPrefix] = []
 
     def connect(self) -> PolicyInfo:
         """Nothing to reach."""
@@ -167,7 +167,7 @@ class Keeper(Policy):
         if conditioning is not None:
             fixed = conditioning.remaining_rows[: conditioning.predicted_delay].astype(np.float64)
             left = self._joints(conditioning.remaining_rows.astype(np.float64))
-            self.declared.append(Declared(observation.step, self._joints(fixed)))
+            self.declared.append(DeclaredPrefix(observation.step, self._joints(fixed)))
             if self._made.keeps:
                 rows = self._continued(rows, left, len(fixed))
         if self.declared and self._random.random() < self._made.lost:
@@ -294,10 +294,12 @@ class Planned:
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
-def _run(spec: StationSpec, made: Scenario, keeper: Keeper, random: np.random.Generator) -> Planned:
+def _run(
+    spec: StationSpec, made: Scenario, keeper: PrefixKeepingPolicy, random: np.random.Generator
+) -> Planned:
     planned = Planned({}, set(), {}, set(), {}, 0)
-    around, clock = LockstepEnvironment(runner=Late(*made.delay, random)), VirtualClock()
-    robot = Seldom(spec.robot, clock, keeper.stands.copy(), made.seen_every)
+    around, clock = LockstepEnvironment(runner=RandomDelayRunner(*made.delay, random)), VirtualClock()
+    robot = SlowlyObservedRobot(spec.robot, clock, keeper.stands.copy(), made.seen_every)
     with closing(station_of(spec, robot, keeper, clock, around)) as station:
         session = station.coordinator.session
         station.connect()
@@ -345,7 +347,7 @@ def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -
         station.command("tune", strategy=made.strategy if kind == "rtc" else {"kind": kind})
 
 
-def _violations(made: Scenario, keeper: Keeper, planned: Planned) -> list[str]:
+def _violations(made: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -> list[str]:
     """Each fixed row that is not what was planned for its step, by more than its arithmetic."""
     found: list[str] = []
     pace = (made.action_hz or made.control_hz) / made.control_hz

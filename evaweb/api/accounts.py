@@ -13,7 +13,7 @@ from evaweb.roles import Role, role_of
 router = Router(tags=["accounts"])
 
 
-class Me(Schema):
+class AccountOut(Schema):
     """The user that asks."""
 
     username: str
@@ -21,8 +21,8 @@ class Me(Schema):
     role: Role
 
 
-@router.get("/me", response={200: Me, **FAILURES}, summary="The user that asks", url_name="me")
-def me(request: HttpRequest) -> Any:
+@router.get("/me", response={200: AccountOut, **FAILURES}, summary="The user that asks", url_name="me")
+def get_account(request: HttpRequest) -> Any:
     """User of the session or the token, with name and role."""
     user = request.auth
     return {"username": user.get_username(), "name": user.get_full_name(), "role": role_of(user)}

@@ -17,7 +17,7 @@ from django.http import HttpRequest
 from django.utils import timezone
 
 from evaweb.api.models import Token
-from evaweb.roles import Role, grant, role_of
+from evaweb.roles import Role, role_of, set_role
 
 log = logging.getLogger(__name__)
 _MEANINGS = (
@@ -113,7 +113,7 @@ class AccountAdmin(UserAdmin):
         """The account, then its role."""
         super().save_model(request, obj, form, change)
         if "role" in form.cleaned_data:
-            grant(user=obj, role=Role(form.cleaned_data["role"]))
+            set_role(user=obj, role=Role(form.cleaned_data["role"]))
 
     def has_delete_permission(self, request: HttpRequest, obj: User | None = None) -> bool:
         """Never: accounts are switched off, records refer to them."""

@@ -10,12 +10,12 @@ from ninja import Field, Schema
 from pydantic import ConfigDict
 
 Row = TypeVar("Row")
-LARGEST_PAGE = 1000
+MAX_PAGE_SIZE = 1000
 _WRAPPERS = ("given", "filters", "paging")  # parameters of views that stand for the whole question
 _MOST_SAID = 10  # faults of one question
 
 
-class Failure(Schema):
+class ErrorOut(Schema):
     """Why it was not done: a sentence for a person, and for a page in another language its id and arguments.
 
     Sentences that were written by others, such as an operating system, have neither.
@@ -44,10 +44,10 @@ class Page(Schema, Generic[Row]):
 class Paging(Schema):
     """Which of the rows are wanted."""
 
-    limit: Annotated[int, Field(ge=1, le=LARGEST_PAGE)] = 100
+    limit: Annotated[int, Field(ge=1, le=MAX_PAGE_SIZE)] = 100
     offset: Annotated[int, Field(ge=0, le=2**53)] = 0
 
-    def of(self, rows: QuerySet[Any], shape: Any, *seen: Any) -> dict[str, Any]:
+    def page(self, rows: QuerySet[Any], shape: Any, *seen: Any) -> dict[str, Any]:
         """The page of `rows`, each through `shape.of`, which is also given what is `seen` of them."""
         found = rows[self.offset : self.offset + self.limit]
         return {
@@ -58,10 +58,10 @@ class Paging(Schema):
         }
 
 
-FAILURES = {frozenset({400, 401, 403, 404, 409, 422, 503}): Failure}
+FAILURES = {frozenset({400, 401, 403, 404, 409, 422, 503}): ErrorOut}
 
 
-def said_of(faults: Sequence[Mapping[str, Any]]) -> str:
+def describe_errors(faults: Sequence[Mapping[str, Any]]) -> str:
     """Faults of a question, as pydantic found them: each place, what stood there, and what is allowed."""
     said = [_sentence(fault) for fault in faults[:_MOST_SAID]]
     more = len(faults) - len(said)

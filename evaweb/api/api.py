@@ -28,13 +28,13 @@ from evaweb.api import (
     statistics,
     trials,
 )
-from evaweb.api.answers import said_of
+from evaweb.api.answers import describe_errors
 from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
-from evaweb.api.questions import Bounded, only_known
+from evaweb.api.questions import BoundedParser, reject_unknown_parameters
 from evaweb.errors import EvaError, refusal
 from evaweb.races import TAKEN, was_taken
 from evaweb.refusals import retrying
-from evaweb.storage import refusal_of
+from evaweb.storage import storage_error_response
 from runtime.core import bounded_documents as bounded
 
 log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class _Api(NinjaAPI):
 
 
 api = _Api(
-    parser=Bounded(),
+    parser=BoundedParser(),
     title="EVA Web",
     version="1",
     urls_namespace="api",
@@ -66,7 +66,7 @@ api = _Api(
     openapi_url=None,  # served below, to those who are logged in
     docs_url=None,  # its pages fetch scripts from elsewhere
 )
-api.add_decorator(only_known)
+api.add_decorator(reject_unknown_parameters)
 api.add_router("", accounts.router)
 api.add_router("", plans.router)
 api.add_router("/stations", stations.router)
@@ -103,7 +103,7 @@ def _not_logged_in(request: HttpRequest, fault: AuthenticationError) -> HttpResp
 
 @api.exception_handler(ValidationError)
 def _malformed(request: HttpRequest, fault: ValidationError) -> HttpResponse:
-    return _failure(request, said_of(fault.errors), 422)
+    return _failure(request, describe_errors(fault.errors), 422)
 
 
 @api.exception_handler(HttpError)
@@ -124,7 +124,7 @@ def _nowhere(request: HttpRequest, fault: Http404) -> HttpResponse:
 @api.exception_handler(InternalError)
 @api.exception_handler(OSError)
 def _storage(request: HttpRequest, fault: Exception) -> HttpResponse:
-    refused = refusal_of(fault)
+    refused = storage_error_response(fault)
     if refused is None:
         raise fault
     log.error("%s %s was not taken: %s", request.method, request.path, fault)

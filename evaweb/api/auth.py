@@ -9,7 +9,7 @@ from ninja.security import HttpBearer, SessionAuth
 
 from evaweb import audit
 from evaweb.api.tokens import UNKNOWN
-from evaweb.callers import address_of
+from evaweb.callers import client_address
 from evaweb.credentials import SESSION, TOKEN, credentials
 from evaweb.errors import EvaError
 from runtime.core.sentences import Pattern, fixed
@@ -37,9 +37,9 @@ class Bearer(HttpBearer):
 
     def authenticate(self, request: HttpRequest, token: str) -> Any:
         """The token's user; a wrong token is an error, even where a session would do."""
-        user = credentials.look(TOKEN, token)
+        user = credentials.look_up(TOKEN, token)
         if user is None:
-            audit.token_refused(address_of(request), UNKNOWN)
+            audit.log_token_refused(client_address(request), UNKNOWN)
             raise NotLoggedIn(_UNKNOWN_TOKEN(unknown=UNKNOWN))
         return user
 
@@ -56,5 +56,5 @@ class Session(SessionAuth):
             return None
         key = super()._get_key(request)
         if key:
-            credentials.note(SESSION, key, request.user)
+            credentials.remember(SESSION, key, request.user)
         return key

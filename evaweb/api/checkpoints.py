@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema
 
 from evaweb.api.answers import FAILURES, Page, Paging
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.trials import selectors
 from evaweb.trials.models import Checkpoint
 
@@ -50,8 +50,8 @@ def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = Fa
 
     None of a blind plan behind which the caller has not looked.
     """
-    rows = selectors.checkpoint_list(all_of_them=inactive, tag=tag, sight=sight_for(request))
-    return paging.of(rows, CheckpointOut)
+    rows = selectors.checkpoint_list(all_of_them=inactive, tag=tag, sight=visibility_for_request(request))
+    return paging.page(rows, CheckpointOut)
 
 
 @router.get(
@@ -59,4 +59,4 @@ def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = Fa
 )
 def checkpoint(request: HttpRequest, name: str) -> Any:
     """By its name, which may contain slashes, or by its id."""
-    return selectors.checkpoint_get(name=name, sight=sight_for(request))
+    return selectors.checkpoint_get(name=name, sight=visibility_for_request(request))

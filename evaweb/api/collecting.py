@@ -11,10 +11,10 @@ from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Body, Page, Paging
 from evaweb.api.jobs import JobOut
-from evaweb.blinding import Sight, sight_for
+from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
-from evaweb.collect.work import Item, queue_of
+from evaweb.collect.work import QueueItem, session_queue
 from evaweb.stations.selectors import station_get
 
 router = Router(tags=["collecting"])
@@ -97,7 +97,7 @@ class SessionDetail(SessionOut):
         return {
             **SessionOut.of(session),
             "setup": session.setup,
-            "counts": selectors.counts_of(session=session),
+            "counts": selectors.session_counts(session=session),
             "folder": dataset.name,
             "version": dataset.version,
             "events": [
@@ -156,7 +156,7 @@ class QueuedOut(JobOut):
     left_s: float | None
 
     @staticmethod
-    def of(item: Item, sight: Sight) -> dict[str, Any]:
+    def of(item: QueueItem, sight: Visibility) -> dict[str, Any]:
         """The job with what the queue knows of it."""
         return {**JobOut.of(item.job, sight), "episode": item.episode, "left_s": item.left_s}
 
@@ -181,7 +181,7 @@ def sessions(
     open: bool | None = None,
 ) -> Any:
     """The newest first."""
-    return paging.of(selectors.session_list(station=station, dataset=dataset, is_open=open), SessionOut)
+    return paging.page(selectors.session_list(station=station, dataset=dataset, is_open=open), SessionOut)
 
 
 @router.get(
@@ -203,12 +203,12 @@ def session(request: HttpRequest, uuid: UUID) -> Any:
 )
 def queue(request: HttpRequest, uuid: UUID) -> Any:
     """Quality, previews, tables, publication; `POST /jobs/ID/retry` tries one again that has failed."""
-    found = queue_of(session=selectors.session_get(uuid=uuid))
+    found = session_queue(session=selectors.session_get(uuid=uuid))
     return {
         "done": found.done,
         "total": found.total,
         "left_s": found.left_s,
-        "items": [QueuedOut.of(item, sight_for(request)) for item in found.items],
+        "items": [QueuedOut.of(item, visibility_for_request(request)) for item in found.items],
     }
 
 
@@ -218,9 +218,9 @@ def queue(request: HttpRequest, uuid: UUID) -> Any:
     summary="Open a session",
     url_name="session-open",
 )
-def opened(request: HttpRequest, name: str, given: SessionIn) -> Any:
+def open_session(request: HttpRequest, name: str, given: SessionIn) -> Any:
     """With the station's present set-up; operators, while no other user commands it."""
-    made = services.session_begin(user=request.auth, station=station_get(name=name), **given.model_dump())
+    made = services.open_session(user=request.auth, station=station_get(name=name), **given.model_dump())
     return Status(201, SessionOut.of(made))
 
 
@@ -230,9 +230,9 @@ def opened(request: HttpRequest, name: str, given: SessionIn) -> Any:
     summary="Close",
     url_name="session-close",
 )
-def closed(request: HttpRequest, uuid: UUID) -> Any:
+def close_session(request: HttpRequest, uuid: UUID) -> Any:
     """For now: it can be resumed."""
-    return SessionOut.of(services.session_close(user=request.auth, session=selectors.session_get(uuid=uuid)))
+    return SessionOut.of(services.close_session(user=request.auth, session=selectors.session_get(uuid=uuid)))
 
 
 @router.post(
@@ -241,9 +241,9 @@ def closed(request: HttpRequest, uuid: UUID) -> Any:
     summary="Resume",
     url_name="session-resume",
 )
-def resumed(request: HttpRequest, uuid: UUID) -> Any:
+def resume_session(request: HttpRequest, uuid: UUID) -> Any:
     """Refused with every difference where the station's set-up is not as it was."""
-    return SessionOut.of(services.session_resume(user=request.auth, session=selectors.session_get(uuid=uuid)))
+    return SessionOut.of(services.resume_session(user=request.auth, session=selectors.session_get(uuid=uuid)))
 
 
 @router.post(
@@ -252,10 +252,10 @@ def resumed(request: HttpRequest, uuid: UUID) -> Any:
     summary="Target",
     url_name="session-target",
 )
-def target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
+def set_target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
     """Set the number of episodes wanted."""
     found = selectors.session_get(uuid=uuid)
-    return SessionOut.of(services.session_target(user=request.auth, session=found, target=given.target))
+    return SessionOut.of(services.set_session_target(user=request.auth, session=found, target=given.target))
 
 
 @router.post(
@@ -267,5 +267,5 @@ def target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
 def publish(request: HttpRequest, uuid: UUID, given: PublishIn) -> Any:
     """Those that are accepted and in no dataset yet; the jobs that do it."""
     found = selectors.session_get(uuid=uuid)
-    asked = services.session_publish(user=request.auth, session=found, **given.model_dump())
-    return Status(202, [JobOut.of(job, sight_for(request)) for job in asked])
+    asked = services.publish_session(user=request.auth, session=found, **given.model_dump())
+    return Status(202, [JobOut.of(job, visibility_for_request(request)) for job in asked])

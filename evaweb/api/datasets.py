@@ -47,7 +47,7 @@ class DatasetOut(Schema):
     def of(found: Overview) -> dict[str, Any]:
         """With what its newest check found."""
         own = [name for name in DatasetOut.model_fields if name != "check"]
-        checked = None if found.problem else dataset_jobs.checked(found.name)
+        checked = None if found.problem else dataset_jobs.latest_check(found.name)
         check = checked and {name: getattr(checked, name) for name in CheckOut.model_fields}
         return {**{name: getattr(found, name) for name in own}, "check": check}
 
@@ -65,7 +65,7 @@ class DatasetEpisodeOut(Schema):
     verdict: str
 
     @staticmethod
-    def of(row: listing.Row) -> dict[str, Any]:
+    def of(row: listing.DatasetRow) -> dict[str, Any]:
         """As the dataset lists it, with the newest verdict of the lab."""
         plain = ("index", "seconds", "task", "success", "result", "verdict")
         return {**{name: getattr(row, name) for name in plain}, "rows": row.length, "uuid": row.uuid or None}
@@ -96,7 +96,7 @@ def episodes(
     `verdict` pass, fail or unreviewed."""
     only = {"words": words, "success": success, "result": result, "verdict": verdict}
     try:
-        found = listing.rows(orders.full_name(name), **only)
+        found = listing.list_rows(orders.full_name(name), **only)
     except RecordingError as error:
         raise Conflict(str(error)) from None
     return [DatasetEpisodeOut.of(row) for row in found]
@@ -110,4 +110,4 @@ def episodes(
 )
 def ask(request: HttpRequest, given: orders.Order) -> Any:
     """Check, repair, convert, merge, split; delete and push are for administrators. The job says how far it is."""
-    return Status(202, orders.asked(user=request.auth, given=given.model_dump()))
+    return Status(202, orders.submit_order(user=request.auth, given=given.model_dump()))

@@ -24,26 +24,26 @@ from ninja.utils import check_csrf
 from pydantic import ValidationError
 
 from evaweb import audit
-from evaweb.api.answers import said_of
+from evaweb.api.answers import describe_errors
 from evaweb.api.auth import NOT_LOGGED_IN
 from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
 from evaweb.api.tokens import UNKNOWN
-from evaweb.callers import address_of, share_of
-from evaweb.cookies import MOST, cookies_of, sessions_of
+from evaweb.callers import client_address, client_key
+from evaweb.cookies import MOST, cookie_values, session_keys
 from evaweb.credentials import (
     RETRY_AFTER_S,
     SESSION,
     TOKEN,
     UNVERIFIED,
-    Busy,
     Credential,
     Login,
+    LookupOverload,
     Unverifiable,
     credentials,
 )
 from evaweb.errors import EvaError, NotAllowed, refusal
-from evaweb.headers import BARE
-from evaweb.origins import is_ours, scheme_of
+from evaweb.headers import DEFAULT_HEADERS
+from evaweb.origins import is_own_origin, scheme_of
 from evaweb.roles import Role
 from evaweb.stations import commands, stops
 from evaweb.stations import redaction as veil
@@ -95,7 +95,7 @@ class Refused(EvaError):
         self.status = status
 
 
-class StopDoor:
+class StopGateway:
     """An ASGI application in front of another one; `web_port` where it is in a process of its own beside the web's."""
 
     def __init__(self, application: Callable[..., Awaitable[Any]], web_port: int | None = None) -> None:
@@ -121,14 +121,14 @@ class StopDoor:
             answered = await self._answered(scope, asked, body)
         except EvaError as fault:
             answered = (fault.status, refusal(str(fault)))
-        except Busy as fault:
+        except LookupOverload as fault:
             answered = (503, refusal(_STOP_AGAIN(why=fault)))
             told.append(_BUSY)
         except Exception as fault:  # whatever it is: who stops must be told
             log.exception("a stop at %s was not answered", scope["path"][:200])
             answered = (500, refusal(f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"))
         if answered is None:
-            await self._application(scope, _again(body, receive), send)
+            await self._application(scope, _replay_body(body, receive), send)
         else:
             await _send(send, *answered, told)
 
@@ -140,7 +140,7 @@ class StopDoor:
     async def _ready(self, scope: dict[str, Any]) -> Answered:
         """Make the caller known here: their first press is not their first look-up."""
         try:
-            user = (await _presser(scope)).username
+            user = (await _resolve_presser(scope)).username
         except Unverifiable:
             user = UNVERIFIED
         return 200, {"user": user, "alone": self._web_port is not None}
@@ -148,7 +148,7 @@ class StopDoor:
     def _told_browsers(self, scope: dict[str, Any]) -> _Headers:
         """That a page of ours may read the answer, and no other."""
         origin, host = _header(scope, b"origin"), _header(scope, b"host")
-        if not _is_known(host) or not is_ours(origin, host, scheme_of(scope), self._web_port):
+        if not _is_known(host) or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
             return [(b"vary", b"origin")]
         return [
             (b"vary", b"origin"),
@@ -160,31 +160,31 @@ class StopDoor:
         """A request of the web's own pages at its other port as one of this port's: Django knows of one origin."""
         host = _header(scope, b"host")
         origin = _header(scope, b"origin")
-        if self._web_port is None or not is_ours(origin, host, scheme_of(scope), self._web_port):
+        if self._web_port is None or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
             return scope
         others = [(name, value) for name, value in scope["headers"] if name != b"origin"]
         here = f"{scope['scheme']}://{host}".encode("latin-1")
         return {**scope, "headers": [*others, (b"origin", here)]}
 
 
-def stops_alone(web_port: int) -> StopDoor:
+def stop_application(web_port: int) -> StopGateway:
     """The application of the process for stops, for pages of the web at that port."""
     said = refusal(_STOPS_ALONE(port=web_port))
 
     async def nothing_else(scope: dict[str, Any], receive: _Receive, send: Any) -> None:
         await _send(send, 404, said)
 
-    return StopDoor(nothing_else, web_port)
+    return StopGateway(nothing_else, web_port)
 
 
 async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes) -> Answered | None:
     """Status and answer; None for a command that stops nothing."""
     if what == "estop":
-        return await _estop(scope, station, _said(body))
+        return await _estop(scope, station, _parse_body(body))
     press = pressing.parse_json_press(body, "kind")
     if press is not None:
         return await _estop(scope, station, press)
-    said = _said(body) if len(body) <= _LARGEST else {}
+    said = _parse_body(body) if len(body) <= _LARGEST else {}
     return await _stop(scope, station, said, body) if said.get("kind") in commands.STOPPING else None
 
 
@@ -192,25 +192,25 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
     given, at = EStopIn(uuid=said.get("uuid"), why=pressing.json_reason(said)), timezone.now()
     unverified, username, user = "", UNVERIFIED, None
     try:
-        login = await _presser(scope)
-    except (Unverifiable, Busy) as fault:  # no crowd refuses an e-stop
+        login = await _resolve_presser(scope)
+    except (Unverifiable, LookupOverload) as fault:  # no crowd refuses an e-stop
         unverified = str(fault)
         audit.estop_unverified(station, fault)
     else:
         username, user = login.username, login.account
     uuid = given.uuid or uuid4()
-    press = stops.press(station=station, username=username, why=given.why, uuid=uuid)
+    press = stops.press_estop(station=station, username=username, why=given.why, uuid=uuid)
     answer = await asyncio.wrap_future(press)
     place = Station(name=station)
-    commands.estop_noted(
+    commands.record_estop(
         user=user, station=place, why=given.why, uuid=uuid, answer=answer, at=at, unverified=unverified
     )
-    return HTTP_OF[answer.status], _told(str(uuid), answer, answer.data)
+    return HTTP_OF[answer.status], _answer_body(str(uuid), answer, answer.data)
 
 
 async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], body: bytes) -> Answered:
     at = timezone.now()
-    kind, login = await _stopper(scope)
+    kind, login = await _resolve_stopper(scope)
     if kind == SESSION:
         _require_csrf(scope, body)
     if login.role is Role.VIEWER:
@@ -218,44 +218,44 @@ async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], bo
     try:
         given = CommandIn(**said)
     except ValidationError as fault:
-        raise Refused(said_of(fault.errors(include_url=False)), 422) from None
+        raise Refused(describe_errors(fault.errors(include_url=False)), 422) from None
     named = {"kind": given.kind, "page": given.page, "epoch": given.epoch, "uuid": given.uuid}
-    order = stops.order(username=login.username, **named)
-    answer = await asyncio.wrap_future(stops.ask(order, station))
-    commands.stop_noted(user=login.account, station=Station(name=station), answer=answer, at=at, **named)
-    return HTTP_OF[answer.status], _told(str(given.uuid), answer, veil.answer(answer.data))
+    order = stops.stop_command(username=login.username, **named)
+    answer = await asyncio.wrap_future(stops.request_stop(order, station))
+    commands.record_stop(user=login.account, station=Station(name=station), answer=answer, at=at, **named)
+    return HTTP_OF[answer.status], _answer_body(str(given.uuid), answer, veil.redact_answer(answer.data))
 
 
-def _told(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str, Any]:
+def _answer_body(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str, Any]:
     said = {"status": answer.status.value, "reason": answer.reason, **identity(answer.reason)}
     return {"uuid": uuid, **said, "allowed": answer.allowed, "data": data}
 
 
-async def _presser(scope: dict[str, Any]) -> Login:
+async def _resolve_presser(scope: dict[str, Any]) -> Login:
     """The client that presses, by any credential; raises Refused, Unverifiable, Busy."""
     found = _credentials(scope)
-    login = await credentials.presser(found, share_of(scope))
+    login = await credentials.resolve_presser(found, client_key(scope))
     if login is None:
-        raise _nobodys(found, scope)
+        raise _unknown_credentials(found, scope)
     return login
 
 
-async def _stopper(scope: dict[str, Any]) -> tuple[str, Login]:
+async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
     """Kind of credential and login of the client that stops; raises Refused, Busy."""
     found = _credentials(scope)
     try:
-        known = await credentials.stopper(found, share_of(scope))
+        known = await credentials.resolve_stopper(found, client_key(scope))
     except Unverifiable as fault:
         raise Refused(stops.UNKNOWN_STOPPER(why=fault), 503) from None
     if known is None:
-        raise _nobodys(found, scope)
+        raise _unknown_credentials(found, scope)
     return known
 
 
-def _nobodys(found: list[Credential], scope: dict[str, Any]) -> Refused:
+def _unknown_credentials(found: list[Credential], scope: dict[str, Any]) -> Refused:
     if all(kind != TOKEN for kind, _ in found):
         return Refused(NOT_LOGGED_IN, 401)
-    audit.token_refused(address_of(ASGIRequest(scope, BytesIO())), UNKNOWN)
+    audit.log_token_refused(client_address(ASGIRequest(scope, BytesIO())), UNKNOWN)
     return Refused(_UNKNOWN_TOKEN(unknown=UNKNOWN), 401)
 
 
@@ -265,7 +265,7 @@ def _credentials(scope: dict[str, Any]) -> list[Credential]:
     for header in _headers(scope, b"authorization")[:_MOST_TOKENS]:
         scheme, _, secret = header.strip().partition(" ")
         found.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
-    found += [(SESSION, key) for key in sessions_of(_headers(scope, b"cookie"))]
+    found += [(SESSION, key) for key in session_keys(_headers(scope, b"cookie"))]
     if not found:
         raise Refused(NOT_LOGGED_IN, 401)
     return found
@@ -275,7 +275,7 @@ def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
     """Of several cookies any is good."""
     name = settings.CSRF_COOKIE_NAME
     try:
-        for token in cookies_of(_headers(scope, b"cookie"), name)[:MOST] or [""]:
+        for token in cookie_values(_headers(scope, b"cookie"), name)[:MOST] or [""]:
             request = ASGIRequest(scope, BytesIO(body))
             request.COOKIES[name] = token
             if check_csrf(request) is None:
@@ -285,7 +285,7 @@ def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
     raise Refused(_CSRF_CHECK_FAILED, 403)
 
 
-def _said(body: bytes) -> dict[str, Any]:
+def _parse_body(body: bytes) -> dict[str, Any]:
     try:
         said = json.loads(body)
     except (ValueError, RecursionError):
@@ -305,7 +305,7 @@ async def _body(receive: _Receive) -> bytes | None:
     return b"".join(parts)
 
 
-def _again(body: bytes, receive: _Receive) -> _Receive:
+def _replay_body(body: bytes, receive: _Receive) -> _Receive:
     """Receiver that gives the application the body that was read, and then what comes."""
     first = [{"type": "http.request", "body": body, "more_body": False}]
 
@@ -334,6 +334,6 @@ def _headers(scope: dict[str, Any], wanted: bytes) -> list[str]:
 async def _send(send: Any, status: int, answer: Mapping[str, Any], more: _Headers = ()) -> None:
     body = json.dumps(answer).encode()
     headers = [(b"content-type", b"application/json; charset=utf-8"), (b"content-length", b"%d" % len(body))]
-    headers += [*BARE, *more]
+    headers += [*DEFAULT_HEADERS, *more]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})

@@ -12,14 +12,14 @@ from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.jobs import JobOut
-from evaweb.blinding import Sight, sight_for
-from evaweb.collect.selectors import PUBLISHED_RESULTS, accepted
+from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.collect.selectors import PUBLISHED_RESULTS, accepted_demonstrations
 from evaweb.episodes import services
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import Conflict, NotFound
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from evaweb.stations.selectors import station_get
 from evaweb.trials.models import TrialStatus
 from runtime.core.sentences import Pattern
@@ -91,7 +91,7 @@ class EpisodeOut(Schema):
     tags: list[str]
 
     @staticmethod
-    def of(episode: Episode, sight: Sight) -> dict[str, Any]:
+    def of(episode: Episode, sight: Visibility) -> dict[str, Any]:
         """With the names of its station and its trial."""
         own = [name for name in EpisodeOut.model_fields if name not in ("station", "trial", "result", "tags")]
         trial, hidden = getattr(episode, "trial", None), sight.hides_episode(episode)
@@ -103,7 +103,7 @@ class EpisodeOut(Schema):
             "tags": sight.tags_of(episode),
             "checkpoint": sight.policy_of(episode) if hidden else episode.checkpoint,
             "strategy": "" if hidden else episode.strategy,
-            "reason": sight.told(episode.reason) if hidden else episode.reason,
+            "reason": sight.redact_text(episode.reason) if hidden else episode.reason,
         }
 
 
@@ -126,7 +126,7 @@ class EpisodeDetail(EpisodeOut):
     smoothness_detail: dict[str, Any] | None
 
     @staticmethod
-    def of(episode: Episode, sight: Sight) -> dict[str, Any]:
+    def of(episode: Episode, sight: Visibility) -> dict[str, Any]:
         """With all that is known of it."""
         hidden = sight.hides_episode(episode)
         return {
@@ -154,7 +154,7 @@ class Filters(Schema):
 @router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
 def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging]) -> Any:
     """The newest first."""
-    sight = sight_for(request)
+    sight = visibility_for_request(request)
     rows = Episode.objects.select_related(*_WITH).prefetch_related("tags")
     rows = rows.order_by("-started_at", "-created_at", "pk")
     if filters.station:
@@ -168,7 +168,7 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
         "status": filters.status and filters.status.value,
         "dataset": filters.dataset,
     }
-    return paging.of(
+    return paging.page(
         rows.filter(**{name: value for name, value in wanted.items() if value}),
         EpisodeOut,
         sight,
@@ -180,7 +180,7 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
 )
 def episode(request: HttpRequest, uuid: UUID) -> Any:
     """By its uuid."""
-    return EpisodeDetail.of(_found(uuid), sight_for(request))
+    return EpisodeDetail.of(_found(uuid), visibility_for_request(request))
 
 
 _TABLE = {"schema": {"type": "string", "format": "binary"}}
@@ -196,7 +196,7 @@ _TABLE = {"schema": {"type": "string", "format": "binary"}}
 def episode_export(request: HttpRequest, uuid: UUID) -> Any:
     """Raw, smoothed and executed, step by step, with manifest and outcome in its metadata."""
     found = _found(uuid)
-    sight_for(request).require_episode(found)
+    visibility_for_request(request).require_episode(found)
     path = table_file(found.uuid)
     return async_to_sync(file_answer)(request, path, CONTENT_TYPE, path.name)
 
@@ -207,10 +207,12 @@ def episode_export(request: HttpRequest, uuid: UUID) -> Any:
     summary="Have the table made",
     url_name="episode-export-asked",
 )
-def episode_export_asked(request: HttpRequest, uuid: UUID) -> Any:
+def request_export(request: HttpRequest, uuid: UUID) -> Any:
     """For an episode that its station has not exported; the job says how far it is."""
-    require(request.auth, Role.OPERATOR)
-    return Status(202, JobOut.of(services.export_asked(episode=_found(uuid)), sight_for(request)))
+    require_role(request.auth, Role.OPERATOR)
+    return Status(
+        202, JobOut.of(services.request_export(episode=_found(uuid)), visibility_for_request(request))
+    )
 
 
 @router.post(
@@ -224,7 +226,7 @@ def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
 
     A demonstration as its session would: labelled a success or partial, neither discarded nor failed by a review.
     """
-    require(request.auth, Role.OPERATOR)
+    require_role(request.auth, Role.OPERATOR)
     found = _found(uuid)
     if found.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_PUBLISHED(uuid=uuid))
@@ -233,14 +235,14 @@ def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
         raise Conflict(
             _EPISODE_NOT_ACCEPTED_HAS_LABELLED(uuid=uuid, published_results=" or ".join(PUBLISHED_RESULTS))
         )
-    job = services.publish_asked(episode=found)
+    job = services.request_publish(episode=found)
     if job is None:
         raise Conflict(_EPISODE_SIMULATED_ROBOT_NO_DATASET(uuid=uuid))
-    return Status(202, JobOut.of(job, sight_for(request)))
+    return Status(202, JobOut.of(job, visibility_for_request(request)))
 
 
 def _accepted(demonstration: Any) -> bool:
-    fits = accepted(session=demonstration.session, results=PUBLISHED_RESULTS)
+    fits = accepted_demonstrations(session=demonstration.session, results=PUBLISHED_RESULTS)
     return fits.filter(pk=demonstration.pk).exists()
 
 

@@ -8,7 +8,7 @@ from django.http import HttpRequest
 from ninja import Router, Schema
 
 from evaweb.api.answers import FAILURES
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.find import selectors
 
 router = Router(tags=["find"])
@@ -43,4 +43,4 @@ def find(request: HttpRequest, q: str) -> Any:
     All words of `q`, 1 to 200 characters, have to fit. What is hidden from the caller is not found.
     """
     user: Any = request.auth  # type: ignore[attr-defined]
-    return {"groups": selectors.find(query=q, user=user, sight=sight_for(request))}
+    return {"groups": selectors.find(query=q, user=user, sight=visibility_for_request(request))}

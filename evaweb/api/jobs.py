@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Page, Paging
-from evaweb.blinding import HIDDEN, Sight, sight_for
+from evaweb.blinding import HIDDEN, Visibility, visibility_for_request
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_get
@@ -41,7 +41,7 @@ class JobOut(Schema):
     finished_at: datetime | None
 
     @staticmethod
-    def of(job: Job, sight: Sight) -> dict[str, Any]:
+    def of(job: Job, sight: Visibility) -> dict[str, Any]:
         """As it is, or without what may tell."""
         own = {name: getattr(job, name) for name in JobOut.model_fields}
         cover = cover_of(job, sight)
@@ -64,19 +64,21 @@ def jobs(
     """The newest first."""
     rows = Job.objects.order_by("-created_at", "-pk")
     wanted = {"status": status and status.value, "kind": kind, "key": key}
-    return paging.of(
-        rows.filter(**{name: value for name, value in wanted.items() if value}), JobOut, sight_for(request)
+    return paging.page(
+        rows.filter(**{name: value for name, value in wanted.items() if value}),
+        JobOut,
+        visibility_for_request(request),
     )
 
 
 @router.post("/{id}/retry", response={202: JobOut, **FAILURES}, summary="Try again", url_name="job-retry")
 def retry(request: HttpRequest, id: int) -> Any:
     """Ask anew for what a failed job was about; whoever may ask for that."""
-    job = services.try_again(user=request.auth, job=job_get(id=id))
-    return Status(202, JobOut.of(job, sight_for(request)))
+    job = services.retry_job(user=request.auth, job=job_get(id=id))
+    return Status(202, JobOut.of(job, visibility_for_request(request)))
 
 
 @router.post("/{id}/cancel", response={200: JobOut, **FAILURES}, summary="Cancel", url_name="job-cancel")
 def cancel(request: HttpRequest, id: int) -> Any:
     """End a job for good: at once where it waits, else at its next step; operators."""
-    return JobOut.of(services.cancel(user=request.auth, job=job_get(id=id)), sight_for(request))
+    return JobOut.of(services.cancel(user=request.auth, job=job_get(id=id)), visibility_for_request(request))

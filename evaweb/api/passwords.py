@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.db.models.signals import pre_save
 from django.dispatch import receiver
 
-from evaweb.api.tokens import tokens_withdraw
+from evaweb.api.tokens import revoke_tokens
 
 log = logging.getLogger(__name__)
 
@@ -29,10 +29,10 @@ def _ended(
     name = instance.get_username()
     if instance.password != before["password"] and not _hashed_anew(instance, fields):
         log.info("the password of %a is changed", name)
-        tokens_withdraw(user=instance, why="the password is changed")
+        revoke_tokens(user=instance, why="the password is changed")
     if before["is_active"] and not instance.is_active:
         log.info("%a is switched off", name)
-        tokens_withdraw(user=instance, why="the account is switched off")
+        revoke_tokens(user=instance, why="the account is switched off")
 
 
 def _hashed_anew(user: User, fields: set[str]) -> bool:

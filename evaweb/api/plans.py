@@ -11,12 +11,12 @@ from pydantic import StrictBool
 
 from evaweb.api.answers import FAILURES, Body, Page, Paging
 from evaweb.api.trials import TrialDetail
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
+from evaweb.plans import allocation, services
 from evaweb.plans import bench_checks as bench
-from evaweb.plans import services
-from evaweb.plans.allocation import give_back, progress
-from evaweb.plans.blinding_rules import look, sealed_for
-from evaweb.plans.design import told_reason
+from evaweb.plans.allocation import plan_progress
+from evaweb.plans.blinding_rules import is_sealed_for, record_unblinding
+from evaweb.plans.design import visible_close_reason
 from evaweb.plans.models import Achieved, CameraCheck, Plan, PlanState, Reference
 from evaweb.plans.selectors import plan_get, plan_list, reference_get
 from evaweb.stations.selectors import station_get
@@ -56,21 +56,21 @@ class PlanOut(Schema):
     @staticmethod
     def of(plan: Plan, user: Any) -> dict[str, Any]:
         """As this user may see it."""
-        sealed = sealed_for(plan, user)
+        sealed = is_sealed_for(plan, user)
         before = plan.amends if plan.state == PlanState.DRAFT else None  # it says what its draft says
-        done = progress(plan)
+        done = plan_progress(plan)
         plain = ("name", "version", "title", "state", "blind", "commitment")
         times = ("frozen_at", "closed_at", "revealed_at")
         return {
             **{name: getattr(plan, name) for name in (*plain, *times)},
-            "closed_because": told_reason(plan, sealed),
+            "closed_because": visible_close_reason(plan, sealed),
             "sealed": sealed,
             "owner": plan.owner.get_username(),
             "stations": [station.name for station in plan.stations.all()],
             "total": done.total,
             "counted": done.counted,
             "attempts": done.attempts,
-            "question": "" if sealed or (before and sealed_for(before, user)) else plan.question,
+            "question": "" if sealed or (before and is_sealed_for(before, user)) else plan.question,
             "digest": "" if sealed else plan.digest,
             "document": None if sealed else plan.document,
             "key": bytes(plan.key or b"").hex() if plan.state == PlanState.REVEALED else "",
@@ -87,20 +87,20 @@ class HandoutOut(Schema):
     trial: TrialDetail
 
 
-class At(Body):
+class StationIn(Body):
     """Which station."""
 
     station: str
 
 
-class Back(Body):
+class ReleaseSlotsIn(Body):
     """Which station's trials are given to others, and why."""
 
     station: str
     reason: Annotated[str, Field(min_length=1, max_length=2000)]
 
 
-class Freed(Schema):
+class ReleasedOut(Schema):
     """Number of trials that can now be handed to others."""
 
     freed: int
@@ -139,7 +139,7 @@ class RegionOut(Schema):
     words: str
 
 
-class SeenOut(Schema):
+class CameraMatchOut(Schema):
     """Picture of one camera, its reference ("": none), and how well they match, from 1 down."""
 
     camera: str
@@ -148,7 +148,7 @@ class SeenOut(Schema):
     match: float | None
 
 
-class AchievedOut(SeenOut):
+class LayoutOut(CameraMatchOut):
     """The same with each region of the reference."""
 
     regions: list[RegionOut]
@@ -168,7 +168,7 @@ class CamerasOut(Schema):
 
     confirmed: bool
     at: datetime | None
-    cameras: list[SeenOut]
+    cameras: list[CameraMatchOut]
 
     @staticmethod
     def of(check: CameraCheck | None) -> dict[str, Any]:
@@ -214,7 +214,7 @@ class ReferenceOut(Schema):
         }
 
 
-class AchievedIn(Body):
+class LayoutIn(Body):
     """Why a lower match than the plan's least is accepted."""
 
     override: str = ""
@@ -224,7 +224,7 @@ class AchievedIn(Body):
 def plans(request: HttpRequest, paging: Query[Paging], state: PlanState | None = None) -> Any:
     """All versions by name, the newest first; drafts are for their owners and administrators."""
     rows = plan_list(user=request.auth)
-    return paging.of(rows.filter(state=state.value) if state else rows, PlanOut, request.auth)
+    return paging.page(rows.filter(state=state.value) if state else rows, PlanOut, request.auth)
 
 
 @router.get("/plans/{name}", response={200: PlanOut, **FAILURES}, summary="One plan", url_name="plan")
@@ -236,12 +236,12 @@ def plan(request: HttpRequest, name: str, version: int | None = None) -> Any:
 @router.post(
     "/plans/{name}/next", response={201: HandoutOut, **FAILURES}, summary="Next trial", url_name="plan-next"
 )
-def following(request: HttpRequest, name: str, given: At) -> Any:
+def next_trial(request: HttpRequest, name: str, given: StationIn) -> Any:
     """Prepare the next trial of the plan's schedule on a station; operators who have confirmed its cameras."""
     station = station_get(name=given.station)
     found = plan_get(name=name, user=request.auth)
-    handout = bench.next_trial(user=request.auth, station=station, plan=found)
-    seen = sight_for(request)
+    handout = bench.allocate_checked_trial(user=request.auth, station=station, plan=found)
+    seen = visibility_for_request(request)
     return Status(
         201,
         {
@@ -256,14 +256,16 @@ def following(request: HttpRequest, name: str, given: At) -> Any:
 
 @router.post(
     "/plans/{name}/give-back",
-    response={200: Freed, **FAILURES},
+    response={200: ReleasedOut, **FAILURES},
     summary="Give trials to others",
     url_name="plan-give-back",
 )
-def back(request: HttpRequest, name: str, given: Back) -> Any:
+def release_slots(request: HttpRequest, name: str, given: ReleaseSlotsIn) -> Any:
     """Let other stations have the trials that this one has begun a block of and not made; operators."""
     found, station = plan_get(name=name, user=request.auth), station_get(name=given.station)
-    return {"freed": give_back(user=request.auth, plan=found, station=station, reason=given.reason)}
+    return {
+        "freed": allocation.release_slots(user=request.auth, plan=found, station=station, reason=given.reason)
+    }
 
 
 @router.post(
@@ -272,14 +274,14 @@ def back(request: HttpRequest, name: str, given: Back) -> Any:
 def close(request: HttpRequest, name: str, given: Reason) -> Any:
     """Hand out no more trials of it; its owner, or an administrator."""
     found = plan_get(name=name, user=request.auth)
-    return PlanOut.of(services.plan_close(user=request.auth, plan=found, reason=given.reason), request.auth)
+    return PlanOut.of(services.close_plan(user=request.auth, plan=found, reason=given.reason), request.auth)
 
 
 @router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
-def looked(request: HttpRequest, name: str) -> Any:
+def unblind(request: HttpRequest, name: str) -> Any:
     """Look behind the blind before the reveal: recorded, and the user runs none of its trials."""
     found = plan_get(name=name, user=request.auth)
-    look(found, request.auth)
+    record_unblinding(found, request.auth)
     return PlanOut.of(found, request.auth)
 
 
@@ -289,7 +291,7 @@ def looked(request: HttpRequest, name: str) -> Any:
 def reveal(request: HttpRequest, name: str) -> Any:
     """Say which checkpoint was which, once and for all; its owner, or an administrator."""
     found = plan_get(name=name, user=request.auth)
-    return PlanOut.of(services.plan_reveal(user=request.auth, plan=found), request.auth)
+    return PlanOut.of(services.reveal_plan(user=request.auth, plan=found), request.auth)
 
 
 @router.get(
@@ -300,7 +302,7 @@ def reveal(request: HttpRequest, name: str) -> Any:
 )
 def cameras(request: HttpRequest, name: str) -> Any:
     """The caller's confirmation of the cameras; valid until the station starts anew, half a day at most."""
-    return CamerasOut.of(bench.cameras_confirmed(user=request.auth, station=station_get(name=name)))
+    return CamerasOut.of(bench.current_camera_check(user=request.auth, station=station_get(name=name)))
 
 
 @router.post(
@@ -311,7 +313,7 @@ def cameras(request: HttpRequest, name: str) -> Any:
 )
 def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
     """Each camera shows what its reference shows; kept with what it shows now. Operators."""
-    check = bench.cameras_confirm(user=request.auth, station=station_get(name=name), first=given.first)
+    check = bench.confirm_cameras(user=request.auth, station=station_get(name=name), first=given.first)
     return Status(201, CamerasOut.of(check))
 
 
@@ -327,7 +329,7 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)
         position = trials.position_get(scene=scene, number=given.position or 0)
-    taken = bench.references_take(user=request.auth, station=station_get(name=name), position=position)
+    taken = bench.take_references(user=request.auth, station=station_get(name=name), position=position)
     return Status(201, [ReferenceOut.of(row) for row in taken])
 
 
@@ -340,7 +342,7 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
 def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
     """Another reference with the same picture and these regions, in which the bench is compared; operators."""
     drawn = [region.dict() for region in given.regions]
-    row = bench.regions_draw(user=request.auth, reference=reference_get(id=id), drawn=drawn)
+    row = bench.save_regions(user=request.auth, reference=reference_get(id=id), drawn=drawn)
     return Status(201, ReferenceOut.of(row))
 
 
@@ -350,9 +352,9 @@ def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
     summary="How the bench lies now",
     url_name="bench",
 )
-def lies(request: HttpRequest, id: int) -> Any:
+def bench_match(request: HttpRequest, id: int) -> Any:
     """Of each camera that has a reference of the trial's position, how well it matches now; nothing is kept."""
-    seen = bench.bench_now(trial=trials.trial_get(id=id))
+    seen = bench.current_matches(trial=trials.trial_get(id=id))
     return [
         {
             "camera": one.camera,
@@ -367,13 +369,13 @@ def lies(request: HttpRequest, id: int) -> Any:
 
 @router.post(
     "/trials/{int:id}/achieved",
-    response={201: list[AchievedOut], **FAILURES},
+    response={201: list[LayoutOut], **FAILURES},
     summary="Keep how the bench is laid out",
     url_name="achieved",
 )
-def achieved(request: HttpRequest, id: int, given: AchievedIn) -> Any:
+def record_layout(request: HttpRequest, id: int, given: LayoutIn) -> Any:
     """Before the run: what the cameras show, and how well it matches the position's references; operators."""
-    taken = bench.achieve(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
+    taken = bench.record_layout(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
     return Status(201, [_seen(row) for row in taken])
 
 

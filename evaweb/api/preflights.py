@@ -10,9 +10,9 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Body, Page, Paging
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.preflights import selectors, services
-from evaweb.preflights.blinding_rules import shown
+from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight, PreflightStatus
 from evaweb.stations.selectors import station_get
 from evaweb.trials.selectors import checkpoint_get
@@ -42,7 +42,7 @@ class PreflightOut(Schema):
     @staticmethod
     def of(row: Preflight, user: Any) -> dict[str, Any]:
         """As this user may see it."""
-        seen = shown(row, user)
+        seen = visible_preflight(row, user)
         plain = ("by", "status", "verdict", "asked_at", "ended_at")
         return {
             **{name: getattr(row, name) for name in plain},
@@ -63,28 +63,30 @@ class PreflightIn(Body):
     station: Annotated[str, Field(max_length=63)] = ""
 
 
-class Which(Schema):
+class PreflightFilters(Schema):
     """Of which checkpoint, by name or id; without one of all."""
 
     checkpoint: str = ""
 
 
 @router.get("", response={200: Page[PreflightOut], **FAILURES}, summary="Preflights", url_name="preflights")
-def preflights(request: HttpRequest, filters: Query[Which], paging: Query[Paging]) -> Any:
+def preflights(request: HttpRequest, filters: Query[PreflightFilters], paging: Query[Paging]) -> Any:
     """The newest first."""
-    seen = sight_for(request)
+    seen = visibility_for_request(request)
     checkpoint = checkpoint_get(name=filters.checkpoint, sight=seen) if filters.checkpoint else None
-    return paging.of(selectors.preflight_list(checkpoint=checkpoint, sight=seen), PreflightOut, request.auth)
+    return paging.page(
+        selectors.preflight_list(checkpoint=checkpoint, sight=seen), PreflightOut, request.auth
+    )
 
 
 @router.post(
     "", response={202: PreflightOut, **FAILURES}, summary="Ask for a preflight", url_name="preflight-ask"
 )
-def ask(request: HttpRequest, given: PreflightIn) -> Any:
+def start_preflight(request: HttpRequest, given: PreflightIn) -> Any:
     """Begin one; it is under way then, and read at its id."""
-    row = services.preflight_ask(
+    row = services.start_preflight(
         user=request.auth,
-        checkpoint=checkpoint_get(name=given.checkpoint, sight=sight_for(request)),
+        checkpoint=checkpoint_get(name=given.checkpoint, sight=visibility_for_request(request)),
         station=station_get(name=given.station) if given.station else None,
     )
     return Status(202, PreflightOut.of(row, request.auth))
@@ -95,5 +97,7 @@ def ask(request: HttpRequest, given: PreflightIn) -> Any:
 )
 def preflight(request: HttpRequest, id: UUID) -> Any:
     """A preflight: its progress, or its result."""
-    row = services.preflight_settled(row=selectors.preflight_get(id=id, sight=sight_for(request)))
+    row = services.refresh_preflight(
+        row=selectors.preflight_get(id=id, sight=visibility_for_request(request))
+    )
     return PreflightOut.of(row, request.auth)

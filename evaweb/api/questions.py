@@ -14,9 +14,9 @@ from django.http import HttpRequest
 from ninja.parser import Parser
 
 from evaweb.errors import EvaError
-from evaweb.posts import post_at
+from evaweb.posts import body_limit_for
 from evaweb.refusals import is_text
-from evaweb.roles import require
+from evaweb.roles import require_role
 from evaweb.stations.commands import STOPPING
 from runtime.core import bounded_documents as bounded
 from runtime.core.sentences import Pattern
@@ -44,7 +44,7 @@ class UnknownParameter(EvaError):
     status = 422
 
 
-def only_known(view: View) -> View:
+def reject_unknown_parameters(view: View) -> View:
     """Wrap the view of an operation: every parameter of a query has to be known."""
 
     @wraps(view)
@@ -74,14 +74,14 @@ class TooLong(EvaError):
     status = 413
 
 
-class Bounded(Parser):
+class BoundedParser(Parser):
     """Reads a body when its sender is known; that of a press of the e-stop may be anything."""
 
     def parse_body(self, request: Any) -> Any:
         """Value of the JSON body, whose text can be kept; NotAllowed, TooLong, Unreadable, EvaError."""
         pressed = request.path.endswith("/estop")
         if not (request.path.endswith("/commands") and pressing.parse_json_press(request.body, "kind")):
-            require(request.auth, post_at(request.path).role)
+            require_role(request.auth, body_limit_for(request.path).role)
         try:
             given = _read(request)
             return _without_unknown(given) if request.path.endswith("/commands") else given
@@ -106,25 +106,25 @@ def _stops(given: Any) -> bool:
 
 
 def _read(request: HttpRequest) -> Any:
-    post = post_at(request.path)
+    post = body_limit_for(request.path)
     if len(request.body) > post.largest:
         raise TooLong(_BODY_TOO_LONG(count=len(request.body), largest=post.largest))
     given = bounded.parse_json(request.body, "the body", most=post.values)
     if b"\\u" in request.body and not _stops(given):
-        for place, text in _texts(given):
+        for place, text in _iter_strings(given):
             if not is_text(text):
                 raise EvaError(_NO_TEXT(place=place or "body", text=text))
     return given
 
 
-def _texts(given: Any, place: str = "") -> Iterator[tuple[str, str]]:
+def _iter_strings(given: Any, place: str = "") -> Iterator[tuple[str, str]]:
     """Every string with where it stands, names of fields as well."""
     if isinstance(given, str):
         yield place, given
     elif isinstance(given, list):
         for value in given:
-            yield from _texts(value, place)
+            yield from _iter_strings(value, place)
     elif isinstance(given, dict):
         for name, value in given.items():
             yield place, name
-            yield from _texts(value, f"{place}.{name}".strip("."))
+            yield from _iter_strings(value, f"{place}.{name}".strip("."))

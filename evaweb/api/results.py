@@ -13,13 +13,13 @@ from ninja import Field, Query, Router, Schema
 from pydantic import create_model
 
 from evaweb.api.answers import FAILURES, Page, Paging
-from evaweb.api.tables import Format, table_answer
+from evaweb.api.tables import Format, table_response
 from evaweb.errors import NotFound
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
+from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
 from evaweb.results.analysis.analysis import Analysis
-from evaweb.results.analysis.filters import Chosen, chosen
+from evaweb.results.analysis.filters import TrialFilter, parse_filter
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.analysis.simulated import set_beside, simulated_plans
 from evaweb.results.models import Judgement, Preference, Rating
@@ -27,7 +27,7 @@ from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.citing import citation
 from evaweb.results.presentation.headline import headline_document, with_planned_letters
 from evaweb.results.presentation.integrity import integrity_document
-from evaweb.results.ratings.unblinding import require_seen, why_sealed
+from evaweb.results.ratings.unblinding import require_visible_results, sealed_reason
 from evaweb.results.reports.document import (
     analysis_document,
     arm_document,
@@ -56,7 +56,7 @@ _USUAL = Question()
 _PLAN = "/plans/{name}/{int:version}"
 
 
-class Only(Schema):
+class TrialFilters(Schema):
     """Which trials are meant, all of them together; "" where it does not matter."""
 
     scene: str = ""
@@ -178,7 +178,7 @@ class ScoreRow(Schema):
         }
 
 
-class Planned(Schema):
+class PlannerIn(Schema):
     """A question to the planner; see its page."""
 
     rate: Annotated[float, Field(ge=0, le=1)] = _USUAL.rate
@@ -198,7 +198,7 @@ class Planned(Schema):
     summary="Every statistic",
     url_name="plan-results",
 )
-def results(request: HttpRequest, name: str, version: int, only: Query[Only]) -> Any:
+def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilters]) -> Any:
     """Of each checkpoint, of each pair, of raters, automatic judges and preferences; intervals are at 95 %.
 
     What the plan's design decided stands in `headline` and `planned`; all else describes. A comparison whose design has
@@ -206,7 +206,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
     the reveal; `corrected` has rates with those of now, where they differ.
     """
     plan, which = _seen(request, name, version, only)
-    analysis = with_planned_letters(plan, caching.analysis_of(plan, which))
+    analysis = with_planned_letters(plan, caching.cached_analysis(plan, which))
     return {
         "plan": plan.name,
         "version": plan.version,
@@ -220,9 +220,9 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
             name: proportion_document(found) for name, found in caching.corrected_of(plan, which).items()
         },
         "notes": list(analysis.notes),
-        "agreement": agreement_of(plan),
-        "judges": judges_of(plan),
-        "preferences": preferences_of(plan),
+        "agreement": rater_agreement(plan),
+        "judges": judge_agreement(plan),
+        "preferences": preference_ranking(plan),
     }
 
 
@@ -234,7 +234,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[Only]) ->
 )
 def integrity(request: HttpRequest, name: str, version: int) -> Any:
     """Looks, voids, corrections, amendments, deviations, delays, and what the headline would be under each doubt."""
-    plan, _ = _seen(request, name, version, Only())
+    plan, _ = _seen(request, name, version, TrialFilters())
     return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **integrity_document(plan)}
 
 
@@ -247,9 +247,9 @@ def integrity(request: HttpRequest, name: str, version: int) -> Any:
 def simulated(request: HttpRequest, name: str, version: int) -> Any:
     """Of each plan of the same checkpoints on simulated benches: rates, rank correlation, mean maximum rank violation,
     and differences with what simulation adds (null of fewer than eight matched trials)."""
-    plan, _ = _seen(request, name, version, Only())
+    plan, _ = _seen(request, name, version, TrialFilters())
     user: Any = request.auth  # type: ignore[attr-defined]
-    found = (set_beside(plan, row) for row in simulated_plans(plan) if not why_sealed(row, user))
+    found = (set_beside(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
     return [
         {
             "plan": one["plan"].name,
@@ -283,7 +283,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
 def frozen(request: HttpRequest, digest: str) -> Any:
     """One sentence, one table and one figure with the design; no later correction changes them."""
     plan = plan_at_reveal(digest)
-    require_seen(plan, request.auth)
+    require_visible_results(plan, request.auth)
     later = reverse("api:plan-integrity", args=[plan.name, plan.version])
     return {**citation(plan).document, "later": later}
 
@@ -294,10 +294,12 @@ def frozen(request: HttpRequest, digest: str) -> Any:
     summary="One checkpoint",
     url_name="plan-checkpoint",
 )
-def checkpoint(request: HttpRequest, name: str, version: int, checkpoint: str, only: Query[Only]) -> Any:
+def checkpoint(
+    request: HttpRequest, name: str, version: int, checkpoint: str, only: Query[TrialFilters]
+) -> Any:
     """Its rates, scores, milestones and times."""
     plan, which = _seen(request, name, version, only)
-    analysis = caching.analysis_of(plan, which)
+    analysis = caching.cached_analysis(plan, which)
     found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
     if found is None:
         raise NotFound(_NO_TRIAL_COUNTS_THERE_TRIALS(checkpoint=checkpoint, names=_names(analysis)))
@@ -311,12 +313,12 @@ def checkpoint(request: HttpRequest, name: str, version: int, checkpoint: str, o
     url_name="plan-comparison",
 )
 def comparison(
-    request: HttpRequest, name: str, version: int, first: str, second: str, only: Query[Only]
+    request: HttpRequest, name: str, version: int, first: str, second: str, only: Query[TrialFilters]
 ) -> Any:
     """Difference, tests and evidence; the first minus the second, whichever way round the page has them."""
     plan, which = _seen(request, name, version, only)
-    analysis = caching.analysis_of(plan, which)
-    found = analysis.compared(first, second)
+    analysis = caching.cached_analysis(plan, which)
+    found = analysis.comparison_of(first, second)
     if found is None:
         raise NotFound(_NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=_names(analysis)))
     return comparison_document(found)
@@ -332,7 +334,7 @@ def outcomes(
     request: HttpRequest,
     name: str,
     version: int,
-    only: Query[Only],
+    only: Query[TrialFilters],
     paging: Query[Paging],
     format: Format = "json",
 ) -> Any:
@@ -340,7 +342,7 @@ def outcomes(
     plan, which = _seen(request, name, version, only)
     if format != "json":
         name = f"{plan.name}-v{plan.version}-trials"
-        return table_answer(request, name, COLUMNS, outcome_pages(plan, which), format)
+        return table_response(request, name, COLUMNS, outcome_pages(plan, which), format)
     return outcome_page(plan, which, paging.offset, paging.limit)
 
 
@@ -354,7 +356,7 @@ def scores(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Those that were corrected included."""
-    plan, _ = _seen(request, name, version, Only())
+    plan, _ = _seen(request, name, version, TrialFilters())
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "scores", rows, ScoreRow, paging, format)
 
@@ -369,7 +371,7 @@ def ratings(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Given by users other than the trial's operator; they never change its score."""
-    plan, _ = _seen(request, name, version, Only())
+    plan, _ = _seen(request, name, version, TrialFilters())
     rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "ratings", rows, RatingOut, paging, format)
 
@@ -384,7 +386,7 @@ def judgements(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Each trial once by each version of a judge; they never change its score and are no ratings."""
-    plan, _ = _seen(request, name, version, Only())
+    plan, _ = _seen(request, name, version, TrialFilters())
     rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
     return _rows(request, plan, "judgements", rows, JudgementOut, paging, format)
 
@@ -399,7 +401,7 @@ def preferences(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Raters' preferences between two trials at the same initial condition."""
-    plan, _ = _seen(request, name, version, Only())
+    plan, _ = _seen(request, name, version, TrialFilters())
     rows = plan.preferences.select_related("rater", "first__checkpoint", "second__checkpoint").order_by("pk")
     return _rows(request, plan, "preferences", rows, PreferenceOut, paging, format)
 
@@ -407,29 +409,31 @@ def preferences(
 @router.get(
     "/planner", response={200: dict[str, Any], **FAILURES}, summary="How many trials", url_name="planner"
 )
-def planner(request: HttpRequest, asked: Query[Planned]) -> Any:
+def planner(request: HttpRequest, asked: Query[PlannerIn]) -> Any:
     """Trials and robot hours for a wanted difference, and what the trials there is time for would miss."""
     question = question_of({name: str(value) for name, value in asked.model_dump().items()})
     user: Any = request.auth  # type: ignore[attr-defined]
     return {"question": asked.model_dump(), **table_of(question, user.pk)}
 
 
-def _seen(request: Any, name: str, version: int, only: Only) -> tuple[Plan, Chosen]:
+def _seen(request: Any, name: str, version: int, only: TrialFilters) -> tuple[Plan, TrialFilter]:
     """The plan, of which the user sees results, and which of its trials are meant."""
     plan = plan_get(name=name, version=version)
-    require_seen(plan, request.auth)
+    require_visible_results(plan, request.auth)
     given = only.model_dump()
-    return plan, chosen(given, caching.runs_of(plan).outcomes) if any(given.values()) else Chosen()
+    return plan, parse_filter(given, caching.cached_runs(plan).outcomes) if any(
+        given.values()
+    ) else TrialFilter()
 
 
 def _rows(
     request: HttpRequest, plan: Plan, what: str, rows: Any, shape: Any, paging: Paging, format: Format
 ) -> Any:
     if format == "json":
-        return paging.of(rows, shape)
+        return paging.page(rows, shape)
     columns = {name: field.annotation for name, field in shape.model_fields.items()}
     pages = in_pages(map(shape.of, rows.iterator(chunk_size=1000)))
-    return table_answer(request, f"{plan.name}-v{plan.version}-{what}", columns, pages, format)
+    return table_response(request, f"{plan.name}-v{plan.version}-{what}", columns, pages, format)
 
 
 def _names(analysis: Analysis) -> str:

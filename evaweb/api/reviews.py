@@ -11,11 +11,11 @@ from ninja import Field, Router, Schema, Status
 
 from evaweb.api.answers import FAILURES, Body
 from evaweb.api.jobs import JobOut
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.episodes.selectors import episode_get, tag_counts
 from evaweb.reviews import selectors, services
 from evaweb.reviews.models import Review, Segment, SegmentLabel
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 
 router = Router(tags=["reviews"])
 
@@ -102,7 +102,7 @@ class LabelOut(Schema):
     key: str
 
 
-class SaidOut(Schema):
+class EpisodeReviewsOut(Schema):
     """All that is said of an episode: reviews newest first, segments in order, the report where there is one.
 
     `covered`: how much of that others say, kept from whoever may still have to judge its trial.
@@ -166,7 +166,7 @@ class NextOut(Schema):
 @router.get(
     "/reviews/next", response={200: NextOut, **FAILURES}, summary="Next unreviewed", url_name="review-next"
 )
-def following(request: HttpRequest, after: UUID | None = None) -> Any:
+def next_unreviewed(request: HttpRequest, after: UUID | None = None) -> Any:
     """The one after the episode `after` in the list, newest first; from the top where there is none below."""
     found, waiting = selectors.unreviewed_next(after=after)
     return {"episode": found.uuid if found else None, "waiting": waiting}
@@ -185,55 +185,55 @@ def labels(request: HttpRequest) -> Any:
 
 @router.get(
     "/episodes/{uuid:uuid}/reviews",
-    response={200: SaidOut, **FAILURES},
+    response={200: EpisodeReviewsOut, **FAILURES},
     summary="What is said of it",
     url_name="episode-reviews",
 )
-def said(request: HttpRequest, uuid: UUID) -> Any:
+def get_reviews(request: HttpRequest, uuid: UUID) -> Any:
     """Verdicts, annotations, and what the checks found."""
     return _said(request, uuid)
 
 
 @router.post(
     "/episodes/{uuid:uuid}/reviews",
-    response={200: SaidOut, **FAILURES},
+    response={200: EpisodeReviewsOut, **FAILURES},
     summary="Pass, fail or note",
     url_name="episode-review",
 )
 def review(request: HttpRequest, uuid: UUID, given: ReviewIn) -> Any:
     """Add to what is said; operators. Nothing that was said is changed."""
-    services.review_add(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
+    services.add_review(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
     return _said(request, uuid)
 
 
 @router.post(
     "/episodes/{uuid:uuid}/segments",
-    response={200: SaidOut, **FAILURES},
+    response={200: EpisodeReviewsOut, **FAILURES},
     summary="Annotate a part",
     url_name="episode-segment",
 )
 def segment(request: HttpRequest, uuid: UUID, given: SegmentIn) -> Any:
     """Mark a part, or change one of one's own; operators."""
-    services.segment_put(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
+    services.save_segment(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
     return _said(request, uuid)
 
 
 @router.post(
     "/episodes/{uuid:uuid}/segments/{uuid:segment}/remove",
-    response={200: SaidOut, **FAILURES},
+    response={200: EpisodeReviewsOut, **FAILURES},
     summary="Take a part away",
     url_name="episode-segment-remove",
 )
-def segment_removed(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
+def remove_segment(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
     """One of one's own; administrators any."""
-    services.segment_remove(user=request.auth, episode=episode_get(uuid=uuid), segment=segment)
+    services.remove_segment(user=request.auth, episode=episode_get(uuid=uuid), segment=segment)
     return _said(request, uuid)
 
 
 @router.get("/reviews/tags", response={200: list[TagOut], **FAILURES}, summary="Tags", url_name="tags")
 def tags(request: HttpRequest) -> Any:
     """All that episodes have, in the order of the alphabet."""
-    found = tag_counts(sight=sight_for(request))
+    found = tag_counts(sight=visibility_for_request(request))
     return [{"words": words, "episodes": episodes} for words, episodes in found.items()]
 
 
@@ -246,7 +246,7 @@ def tags(request: HttpRequest) -> Any:
 def tags_changed(request: HttpRequest, uuid: UUID, given: TagsIn) -> Any:
     """Put tags on it and take others off; operators. Once it is closed."""
     changed = services.tags_change(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
-    left = sight_for(request).tags_of(episode_get(uuid=uuid))
+    left = visibility_for_request(request).tags_of(episode_get(uuid=uuid))
     return {"tags": left, "added": changed.added, "removed": changed.removed}
 
 
@@ -267,18 +267,18 @@ def quality(request: HttpRequest, uuid: UUID) -> Any:
     summary="Have it checked",
     url_name="episode-quality-asked",
 )
-def quality_asked(request: HttpRequest, uuid: UUID) -> Any:
+def request_quality(request: HttpRequest, uuid: UUID) -> Any:
     """Again where it was; operators. The job says how far it is."""
-    require(request.auth, Role.OPERATOR)
-    asked = services.quality_asked(episode=episode_get(uuid=uuid))
-    return Status(202, JobOut.of(asked, sight_for(request)))
+    require_role(request.auth, Role.OPERATOR)
+    asked = services.request_quality_check(episode=episode_get(uuid=uuid))
+    return Status(202, JobOut.of(asked, visibility_for_request(request)))
 
 
 def _said(request: Any, uuid: UUID) -> dict[str, Any]:
     episode = episode_get(uuid=uuid)
-    standing = selectors.standing_of(episode=episode)
+    standing = selectors.get_standing(episode=episode)
     reviews, segments, covered = selectors.opinions_of(
-        user=request.auth, episode=episode, sight=sight_for(request)
+        user=request.auth, episode=episode, sight=visibility_for_request(request)
     )
     return {
         "verdict": ReviewOut.of(standing.review) if standing.review in reviews else None,

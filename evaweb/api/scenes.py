@@ -61,7 +61,7 @@ class SceneOut(Schema):
 @router.get("", response={200: Page[SceneOut], **FAILURES}, summary="Scenes", url_name="scenes")
 def scenes(request: HttpRequest, paging: Query[Paging], inactive: bool = False) -> Any:
     """Those offered to operators; with `inactive` also the ones that are switched off."""
-    return paging.of(selectors.scene_list(all_of_them=inactive), SceneOut)
+    return paging.page(selectors.scene_list(all_of_them=inactive), SceneOut)
 
 
 @router.get("/{name}", response={200: SceneOut, **FAILURES}, summary="One scene", url_name="scene")

@@ -12,18 +12,18 @@ from django.utils import timezone
 from ninja import Field, Router, Schema, Status
 from pydantic import AfterValidator, ValidationError, field_validator
 
-from evaweb.api.answers import FAILURES, Body, Failure
+from evaweb.api.answers import FAILURES, Body, ErrorOut
 from evaweb.api.trials import TrialDetail
-from evaweb.blinding import Sight, sight_for
+from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.collect.selectors import session_get
 from evaweb.collect.station_commands import session_command
 from evaweb.datasets.on_robot import replay_command
 from evaweb.errors import EvaError, StationGone, reasoned
 from evaweb.stations import commands, leases, selectors, stops
 from evaweb.stations import redaction as veil
-from evaweb.stations.holders import who
+from evaweb.stations.holders import holder_display_name
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from evaweb.trials import selectors as trial_selectors
 from evaweb.trials import services
 from evaweb.trials.station_commands import checkpoint_command, trial_command
@@ -86,7 +86,7 @@ class LeaseOut(Schema):
         lease = selectors.lease_open(station=station)
         return {
             "holder": lease.holder if lease else "",
-            "user": who(lease.holder) if lease else "",
+            "user": holder_display_name(lease.holder) if lease else "",
             "epoch": lease.epoch if lease else 0,
             "granted_at": lease.granted_at if lease else None,
             "requests": [RequestOut.of(asked) for asked in selectors.request_list(station=station)],
@@ -201,7 +201,7 @@ class EStopIn(Schema):
     @field_validator("why", mode="before")
     @classmethod
     def _any_words(cls, given: Any) -> str:
-        return stops.spoken(given) if isinstance(given, str) and given else "pressed"
+        return stops.clean_reason(given) if isinstance(given, str) and given else "pressed"
 
 
 class TrialIn(Body):
@@ -213,7 +213,7 @@ class TrialIn(Body):
     seed: int | None = None
 
 
-ANSWERS = {200: CommandOut, 504: CommandOut, frozenset({400, 401, 403, 404, 422, 503}): Failure}
+ANSWERS = {200: CommandOut, 504: CommandOut, frozenset({400, 401, 403, 404, 422, 503}): ErrorOut}
 
 
 @router.get("", response={200: list[StationOut], **FAILURES}, summary="Stations", url_name="stations")
@@ -228,12 +228,12 @@ def station(request: HttpRequest, name: str) -> Any:
     found = selectors.station_get(name=name)
     snapshot, gone = None, ""
     try:
-        snapshot = wire_to(name).status()
+        snapshot = connection_to(name).status()
     except StationGone as fault:
         gone = str(fault)
-    seen, unfinished = sight_for(request), trial_selectors.trial_open(found)
-    if snapshot is not None and seen.veils(name, snapshot):
-        snapshot = veil.state(snapshot, seen)
+    seen, unfinished = visibility_for_request(request), trial_selectors.trial_open(found)
+    if snapshot is not None and seen.redacts_snapshot(name, snapshot):
+        snapshot = veil.redact_state(snapshot, seen)
     trial = TrialDetail.of(trial_selectors.trial_get(id=unfinished.pk), seen) if unfinished else None
     return {**StationOut.of(found), "snapshot": snapshot, "gone": gone, "trial": trial}
 
@@ -247,30 +247,30 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
     if given.action == "claim":
         leases.claim(user=user, station=found, page=page)
     elif given.action == "give_up":
-        leases.give_up(user=user, station=found, page=page)
+        leases.release(user=user, station=found, page=page)
     elif given.action == "request":
-        leases.request(user=user, station=found, page=page)
+        leases.request_handover(user=user, station=found, page=page)
     elif given.action == "withdraw":
-        leases.withdraw(user=user, station=found)
+        leases.withdraw_request(user=user, station=found)
     elif given.action == "move":
         leases.move(user=user, station=found, page=page)
     elif given.action == "take":
-        leases.take(user=user, station=found, page=page, reason=given.reason)
+        leases.take_over(user=user, station=found, page=page, reason=given.reason)
     else:
-        answer = leases.hand_over if given.action == "hand_over" else leases.decline
+        answer = leases.hand_over if given.action == "hand_over" else leases.decline_request
         answer(user=user, station=found, page=page, request=_request_of(given))
     return LeaseOut.of(found)
 
 
 @router.post(
     "/{name}/commands",
-    response={**ANSWERS, 409: CommandOut | Failure},
+    response={**ANSWERS, 409: CommandOut | ErrorOut},
     summary="Give a command",
     url_name="commands",
 )
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     """Set-up, run, stop, modes, strategy, motions, grippers; the same uuid again gets the first answer."""
-    found, seen = selectors.station_get(name=name), sight_for(request)
+    found, seen = selectors.station_get(name=name), visibility_for_request(request)
     order = given.model_dump(exclude=set(_NAMED))
     named = [name for name in _NAMED if getattr(given, name) is not None]
     if len(named) > 1:
@@ -288,7 +288,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     elif given.replay is not None:
         row = replay_command(user=request.auth, station=found, **given.replay.model_dump(), **order)
     elif given.trial is None:
-        row = commands.issue(user=request.auth, station=found, **order)
+        row = commands.issue_command(user=request.auth, station=found, **order)
     else:
         trial = trial_selectors.trial_get(id=given.trial)
         if trial.station_id != found.pk:
@@ -298,16 +298,18 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
 
 
 @router.post(
-    "/{name}/estop", response={**ANSWERS, 409: CommandOut | Failure}, summary="E-stop", url_name="estop"
+    "/{name}/estop", response={**ANSWERS, 409: CommandOut | ErrorOut}, summary="E-stop", url_name="estop"
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     """Stop the robot now; any logged-in user. To the wire first, without a wait for the row."""
     # A served lab answers at evaweb.api.door, also where the database does not say who is logged in.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth
-    answer = stops.press(station=name, username=user.get_username(), why=given.why, uuid=identity).result()
+    answer = stops.press_estop(
+        station=name, username=user.get_username(), why=given.why, uuid=identity
+    ).result()
     place = Station(name=name)
-    commands.estop_noted(user=user, station=place, why=given.why, uuid=identity, answer=answer, at=at)
+    commands.record_estop(user=user, station=place, why=given.why, uuid=identity, answer=answer, at=at)
     said = {name: getattr(answer, name) for name in ("status", "allowed", "data")}
     return Status(HTTP_OF[answer.status], {"uuid": identity, **said, **reasoned(answer.reason)})
 
@@ -318,15 +320,17 @@ def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
 def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
     """The next trial of this checkpoint at this position, or the repetition of one that does not count."""
     scene = trial_selectors.scene_get(name=given.scene)
-    made = services.trial_prepare(
+    made = services.prepare_trial(
         user=request.auth,
         station=selectors.station_get(name=name),
         scene=scene,
         position=trial_selectors.position_get(scene=scene, number=given.position),
-        checkpoint=trial_selectors.checkpoint_get(name=given.checkpoint, sight=sight_for(request)),
+        checkpoint=trial_selectors.checkpoint_get(
+            name=given.checkpoint, sight=visibility_for_request(request)
+        ),
         seed=given.seed,
     )
-    return Status(201, TrialDetail.of(trial_selectors.trial_get(id=made.pk), sight_for(request)))
+    return Status(201, TrialDetail.of(trial_selectors.trial_get(id=made.pk), visibility_for_request(request)))
 
 
 def _request_of(given: LeaseIn) -> int:
@@ -335,9 +339,9 @@ def _request_of(given: LeaseIn) -> int:
     return given.request
 
 
-def _command_out(row: Command, sight: Sight) -> dict[str, Any]:
+def _command_out(row: Command, sight: Visibility) -> dict[str, Any]:
     reason, data = row.reason, row.data
-    if sight.veils_events(row.station.name) or sight.veils(row.station.name, row.args):
-        reason, data = sight.told(row.reason), veil.answer(row.data)
+    if sight.redacts_events(row.station.name) or sight.redacts_snapshot(row.station.name, row.args):
+        reason, data = sight.redact_text(row.reason), veil.redact_answer(row.data)
     known = {"uuid": row.pk, "status": row.status, "allowed": row.allowed}
     return {**known, **reasoned(reason), "data": data}

@@ -8,9 +8,9 @@ from django.http import HttpRequest, HttpResponse
 from ninja import Query, Router, Schema
 
 from evaweb.api.answers import FAILURES
-from evaweb.api.tables import Format, table_answer
+from evaweb.api.tables import Format, table_response
 from evaweb.api.trials import Filters
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.trials import selectors
 from evaweb.trials.selectors import StatisticsRow
 
@@ -88,9 +88,12 @@ METHOD = (
 )
 def statistics(request: HttpRequest, filters: Query[Filters], format: Format = "json") -> Any:
     """Counts, success rate with its Wilson 95 % interval, mean score, median duration, smoothness; CSV, Parquet."""
-    rows = [StatisticsOut.of(row) for row in selectors.statistics(filters.chosen(), sight_for(request))]
+    rows = [
+        StatisticsOut.of(row)
+        for row in selectors.statistics(filters.chosen(), visibility_for_request(request))
+    ]
     if format != "json":
         columns = {name: field.annotation for name, field in StatisticsOut.model_fields.items()}
-        answer: HttpResponse = table_answer(request, "statistics", columns, [rows], format)
+        answer: HttpResponse = table_response(request, "statistics", columns, [rows], format)
         return answer
     return {"method": METHOD, "items": rows}

@@ -8,25 +8,25 @@ from typing import Any, Literal
 from django.http import HttpRequest, StreamingHttpResponse
 
 from evaweb.downloads import CSV, download
-from evaweb.tabular_export import Pages, cell, csv_lines, parquet_pieces
+from evaweb.tabular_export import Pages, csv_cell, iter_csv, iter_parquet
 
-__all__ = ["Format", "Pages", "cell", "csv_answer", "table_answer"]
+__all__ = ["Format", "Pages", "csv_cell", "csv_response", "table_response"]
 
 Format = Literal["json", "csv", "parquet"]
 PARQUET = "application/vnd.apache.parquet"
 
 
-def table_answer(
+def table_response(
     request: HttpRequest, name: str, columns: Mapping[str, Any], pages: Pages, format: Format
 ) -> StreamingHttpResponse:
     """A download in `format`, csv or parquet; `columns` are the fields with their types."""
     if format == "parquet":
-        return download(request, parquet_pieces(columns, pages), f"{name}.parquet", PARQUET)
-    return csv_answer(request, name, list(columns), pages)
+        return download(request, iter_parquet(columns, pages), f"{name}.parquet", PARQUET)
+    return csv_response(request, name, list(columns), pages)
 
 
-def csv_answer(
+def csv_response(
     request: HttpRequest, name: str, columns: Sequence[str], pages: Pages
 ) -> StreamingHttpResponse:
     """A download `name`.csv with a header line, written page by page as they come."""
-    return download(request, csv_lines(columns, pages), f"{name}.csv", CSV)
+    return download(request, iter_csv(columns, pages), f"{name}.csv", CSV)

@@ -14,7 +14,7 @@ from django.dispatch import receiver
 from django.utils import timezone
 
 from evaweb.api.models import Token
-from evaweb.credentials import OF_ANY_AGE, TOKEN, credentials, digest
+from evaweb.credentials import EXPIRED_ALLOWED, TOKEN, credentials, digest
 from evaweb.errors import Conflict, EvaError
 from evaweb.lock_wait import lock_wait
 from runtime.core.sentences import Pattern
@@ -36,7 +36,7 @@ _LENGTH = len(PREFIX) + 43
 _USED_EVERY = timedelta(minutes=1)  # how exactly `used_at` is kept: not every request is a write
 
 
-def token_create(*, user: User, name: str, days: int = DAYS) -> str:
+def create_token(*, user: User, name: str, days: int = DAYS) -> str:
     """A new token of 256 random bits that ends after `days`; the only time that it can be seen."""
     name = name.strip()
     if not 0 < len(name) <= 80 or not name.isprintable():
@@ -53,14 +53,14 @@ def token_create(*, user: User, name: str, days: int = DAYS) -> str:
     return secret
 
 
-def tokens_withdraw(*, user: User, why: str) -> None:
+def revoke_tokens(*, user: User, why: str) -> None:
     """End every token of a user for good."""
     for token in Token.objects.filter(user=user):
         token.delete()
         log.info("token %a of %a is withdrawn: %s", token.name, user.get_username(), why)
 
 
-def token_user(*, secret: str, ended: bool = False) -> User | None:
+def user_of_token(*, secret: str, ended: bool = False) -> User | None:
     """The token's user, None where it is unknown, or its user may not log in.
 
     One whose time is over is unknown, unless `ended`: a stop of a robot is not asked for the date.
@@ -89,9 +89,9 @@ def _note_use(token: Token) -> None:
 
 @receiver(post_delete, sender=Token)
 def _withdrawn(instance: Token, **named: Any) -> None:
-    for kind in (TOKEN, OF_ANY_AGE[TOKEN]):
+    for kind in (TOKEN, EXPIRED_ALLOWED[TOKEN]):
         credentials.forget(kind, instance.digest)
 
 
-credentials.learn(TOKEN, lambda secret: token_user(secret=secret))
-credentials.learn(OF_ANY_AGE[TOKEN], lambda secret: token_user(secret=secret, ended=True))
+credentials.register_kind(TOKEN, lambda secret: user_of_token(secret=secret))
+credentials.register_kind(EXPIRED_ALLOWED[TOKEN], lambda secret: user_of_token(secret=secret, ended=True))

@@ -12,12 +12,12 @@ from ninja import Field, Query, Router, Schema
 from pydantic import StrictBool, create_model
 
 from evaweb.api.answers import FAILURES, Body, Page, Paging
-from evaweb.api.tables import Format, table_answer
-from evaweb.blinding import Sight, sight_for
+from evaweb.api.tables import Format, table_response
+from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.trials import corrections, selectors, services, voids
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest
-from evaweb.trials.record import api_columns, shown
+from evaweb.trials.record import api_columns, visible_columns
 from evaweb.trials.selectors import TrialFilters
 
 router = Router(tags=["trials"])
@@ -52,9 +52,9 @@ class TrialOut(_Columns):
     """
 
     @staticmethod
-    def of(trial: Trial, sight: Sight) -> dict[str, Any]:
+    def of(trial: Trial, sight: Visibility) -> dict[str, Any]:
         """Flat, the same for JSON and CSV."""
-        return shown(trial, sight, _LIST)
+        return visible_columns(trial, sight, _LIST)
 
 
 class OutcomeOut(Schema):
@@ -130,11 +130,11 @@ class TrialDetail(_Detail):
     """A trial with all its scores, the newest first, and what a simulated bench says of its end."""
 
     @staticmethod
-    def of(trial: Trial, sight: Sight) -> dict[str, Any]:
+    def of(trial: Trial, sight: Visibility) -> dict[str, Any]:
         """With all that is known of it."""
         scores = [ScoreOut.of(score) for score in trial.scores.all()]
         asked = [VoidRequestOut.of(row) for row in trial.void_requests.all()]
-        return {**shown(trial, sight, (*_LIST, *_DETAIL)), "scores": scores, "void_requests": asked}
+        return {**visible_columns(trial, sight, (*_LIST, *_DETAIL)), "scores": scores, "void_requests": asked}
 
 
 class ScoreIn(Body):
@@ -196,25 +196,25 @@ def trials(
     request: HttpRequest, filters: Query[Filters], paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """The newest first, in pages; with `format=csv` or `parquet` all that fit, the oldest first."""
-    seen = sight_for(request)
+    seen = visibility_for_request(request)
     if format != "json":
         pages = selectors.trials_in_pages(filters.chosen(), sight=seen)
-        return table_answer(request, "trials", COLUMNS, _csv_pages(pages, seen), format)
-    return paging.of(selectors.trial_list(filters.chosen(), seen), TrialOut, seen)
+        return table_response(request, "trials", COLUMNS, _csv_pages(pages, seen), format)
+    return paging.page(selectors.trial_list(filters.chosen(), seen), TrialOut, seen)
 
 
 @router.get("/{int:id}", response={200: TrialDetail, **FAILURES}, summary="One trial", url_name="trial")
 def trial(request: HttpRequest, id: int) -> Any:
     """With every score it was ever given."""
-    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+    return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
 @router.post("/{int:id}/score", response={200: TrialDetail, **FAILURES}, summary="Score it", url_name="score")
 def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
     """Add a score, or a correction; operators."""
     found = selectors.trial_get(id=id)
-    services.trial_score(user=request.auth, trial=found, **given.model_dump())
-    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+    services.score_trial(user=request.auth, trial=found, **given.model_dump())
+    return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
 @router.post(
@@ -227,7 +227,7 @@ def failure(request: HttpRequest, id: int, given: FailureIn) -> Any:
     """Correct phase and cause and nothing else of its score, which stays in the record; operators."""
     found = selectors.trial_get(id=id)
     corrections.trial_failure(user=request.auth, trial=found, **given.model_dump())
-    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+    return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
 @router.post("/{int:id}/void", response={200: TrialDetail, **FAILURES}, summary="Void it", url_name="void")
@@ -237,8 +237,8 @@ def void(request: HttpRequest, id: int, given: Reason) -> Any:
     A scored trial of a blind plan is void_asked then, until a second blind operator has answered; without an answer
     within 14 days, or at the reveal, it counts.
     """
-    voids.trial_void(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
-    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+    voids.void_trial(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
+    return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
 @router.post(
@@ -250,8 +250,8 @@ def void(request: HttpRequest, id: int, given: Reason) -> Any:
 def void_answer(request: HttpRequest, id: int, given: VoidAnswer) -> Any:
     """Agree to a void that another operator asked for, or refuse it with a reason; blind operators."""
     trial = selectors.trial_get(id=id)
-    voids.void_answer(user=request.auth, trial=trial, agree=given.agree, reason=given.reason)
-    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+    voids.answer_void(user=request.auth, trial=trial, agree=given.agree, reason=given.reason)
+    return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
 @router.post(
@@ -259,16 +259,16 @@ def void_answer(request: HttpRequest, id: int, given: VoidAnswer) -> Any:
 )
 def abandon(request: HttpRequest, id: int, given: Reason) -> Any:
     """Give up a trial that never ran; operators."""
-    services.trial_abandon(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
-    return TrialDetail.of(selectors.trial_get(id=id), sight_for(request))
+    services.abandon_trial(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
+    return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
-def _csv_pages(pages: Iterator[list[Trial]], sight: Sight) -> Iterator[list[dict[str, Any]]]:
+def _csv_pages(pages: Iterator[list[Trial]], sight: Visibility) -> Iterator[list[dict[str, Any]]]:
     for page in pages:
         yield [_csv_row(trial, sight) for trial in page]
 
 
-def _csv_row(trial: Trial, sight: Sight) -> dict[str, Any]:
+def _csv_row(trial: Trial, sight: Visibility) -> dict[str, Any]:
     outcomes = list(trial.verdict.outcomes.all()) if trial.verdict else []
     return {
         **TrialOut.of(trial, sight),

@@ -14,7 +14,7 @@ from evaweb.api.api import api
 @csrf_exempt  # it changes nothing, and its answer is the truer one
 def nowhere(request: HttpRequest, rest: str) -> JsonResponse:
     """Answer at an unknown address of the interface, in the form of all its answers."""
-    return JsonResponse({"error": refusals.nowhere(request.path)}, status=404)
+    return JsonResponse({"error": refusals.unknown_address_sentence(request.path)}, status=404)
 
 
 patterns, app_name, namespace = api.urls

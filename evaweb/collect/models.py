@@ -31,7 +31,8 @@ class CollectSession(models.Model):
     closed_at = models.DateTimeField(null=True, blank=True)
 
     append_only = AppendOnly(
-        "a session keeps its task, dataset and set-up: open another one", but=("target", "closed_at")
+        "a session keeps its task, dataset and set-up: open another one",
+        except_columns=("target", "closed_at"),
     )
 
     class Meta:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from evaweb.collect import selectors
-from evaweb.collect.work import queue_of
+from evaweb.collect.work import session_queue
 from evaweb.stations.models import Station
 
 SHOWN = 8  # jobs that are listed; the others are counted
@@ -16,12 +16,12 @@ def session_panel(*, station: Station) -> dict[str, Any]:
     session = selectors.session_open(station=station)
     shown: dict[str, Any] = {"station": station, "session": session}
     if session is not None:
-        return {**shown, "counts": selectors.counts_of(session=session)}
-    earlier = list(selectors.sessions_earlier(station=station))
+        return {**shown, "counts": selectors.session_counts(session=session)}
+    earlier = list(selectors.resumable_sessions(station=station))
     return {
         **shown,
         "earlier": earlier,
-        "tasks": selectors.tasks_earlier(station=station),
+        "tasks": selectors.earlier_tasks(station=station),
         "dataset": earlier[0].dataset if earlier else "",
     }
 
@@ -32,15 +32,15 @@ def progress_panel(*, station: Station) -> dict[str, Any]:
     shown: dict[str, Any] = {"station": station, "session": session}
     if session is None:
         return shown
-    queue = queue_of(session=session)
+    queue = session_queue(session=session)
     return {
         **shown,
-        "counts": selectors.counts_of(session=session),
+        "counts": selectors.session_counts(session=session),
         "last": selectors.demonstrations_of(session=session).first(),
         "queue": queue,
         "listed": queue.items[:SHOWN],
         "more": max(0, len(queue.items) - SHOWN),
         "dataset": selectors.dataset_of(session=session),
-        "accepted": selectors.to_publish(session=session).count(),
-        "failures": selectors.to_publish(session=session, results=("fail",)).count(),
+        "accepted": selectors.unpublished_demonstrations(session=session).count(),
+        "failures": selectors.unpublished_demonstrations(session=session, results=("fail",)).count(),
     }

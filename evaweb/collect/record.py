@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from evaweb.collect.models import SessionEvent
-from evaweb.journal import From, Journal, Line, Moment, Person
+from evaweb.journal import Journal, Line, Moment, Person, RowPath
 from evaweb.stations.models import STATION_NAME
 
 _OPENED = ("station", "dataset", "task", "setup")  # what never changes
@@ -19,14 +19,14 @@ class EventLine(Line):
     ELSEWHERE: ClassVar = frozenset[str]()
 
     kind: Literal["opened", "closed", "resumed", "target", "published"]
-    by: Annotated[Person, From("by__username")]
+    by: Annotated[Person, RowPath("by__username")]
     at: Moment
     text: str = ""
-    target: Annotated[Annotated[int, Field(ge=1, lt=2**31)] | None, From("session__target")] = None
-    station: Annotated[str, Field(pattern=STATION_NAME), From("session__station__name")] = ""
-    dataset: Annotated[str, From("session__dataset")] = ""
-    task: Annotated[str, From("session__task")] = ""
-    setup: Annotated[dict[str, Any], From("session__setup")] = Field(default_factory=dict)
+    target: Annotated[Annotated[int, Field(ge=1, lt=2**31)] | None, RowPath("session__target")] = None
+    station: Annotated[str, Field(pattern=STATION_NAME), RowPath("session__station__name")] = ""
+    dataset: Annotated[str, RowPath("session__dataset")] = ""
+    task: Annotated[str, RowPath("session__task")] = ""
+    setup: Annotated[dict[str, Any], RowPath("session__setup")] = Field(default_factory=dict)
 
     @classmethod
     def written(cls, row: SessionEvent, **given: Any) -> dict[str, Any]:

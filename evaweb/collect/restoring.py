@@ -11,15 +11,15 @@ from django.utils import timezone
 
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.collect.record import SESSIONS, EventLine
-from evaweb.collect.setups import setup_in
-from evaweb.collect.station_events import demonstration_bound, label_read
+from evaweb.collect.setups import setup_from_manifest
+from evaweb.collect.station_events import bind_demonstration, sync_label
 from evaweb.episodes.folders import journal_folder
-from evaweb.episodes.manifest import recorded_in
+from evaweb.episodes.manifest import read_recorded_episode
 from evaweb.episodes.models import Episode
-from evaweb.episodes.reconcile import Kept, restores
-from evaweb.episodes.services import station_known
+from evaweb.episodes.reconcile import RestorableRun, register_restorer
+from evaweb.episodes.services import get_or_create_station
 from evaweb.errors import EvaError
-from evaweb.roles import known_person
+from evaweb.roles import get_or_create_person
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
 from runtime.recording.files import read_json
@@ -31,13 +31,13 @@ _MANIFEST_DOES_NOT_SAY_HOW = Pattern(
 )
 
 
-@restores
-def restore(kept: Kept) -> int:
+@register_restorer
+def restore(kept: RestorableRun) -> int:
     """Make the rows of an episode's session and of itself as its demonstration that are not there; how many."""
     episode = Episode.objects.filter(uuid=kept.uuid).first() if kept.recorded else None
     if episode is None:
         return 0
-    named = recorded_in(journal_folder(kept.uuid)).session.get("uuid")
+    named = read_recorded_episode(journal_folder(kept.uuid)).session.get("uuid")
     if not named:
         return 0
     try:
@@ -49,19 +49,19 @@ def restore(kept: Kept) -> int:
         if session is None:
             session, made = _session(uuid, episode, kept), 1
         fresh = not Demonstration.objects.filter(pk=episode.pk).exists()
-        demonstration = demonstration_bound(episode=episode, session=session)
+        demonstration = bind_demonstration(episode=episode, session=session)
         assert demonstration is not None
-        label_read(demonstration=demonstration)
+        sync_label(demonstration=demonstration)
     return made + fresh
 
 
-def _session(uuid: UUID, episode: Episode, kept: Kept) -> CollectSession:
+def _session(uuid: UUID, episode: Episode, kept: RestorableRun) -> CollectSession:
     """From its own file, else from the manifest of the first episode that is met: without target and history then."""
-    events = SESSIONS.read(uuid, kept.say)
+    events = SESSIONS.read(uuid, kept.report_problem)
     first = next((event for event in events if event.kind == "opened"), None)
     if first is None:
         return _from_manifest(uuid, episode)
-    station = station_known(
+    station = get_or_create_station(
         name=first.station, robot=str(first.setup.get("robot", "")), simulated=False, source=f"session {uuid}"
     )
     targets = [event.target for event in events if event.kind in ("opened", "target")]
@@ -70,14 +70,14 @@ def _session(uuid: UUID, episode: Episode, kept: Kept) -> CollectSession:
         station,
         dataset=first.dataset,
         task=first.task,
-        operator=known_person(first.by),
+        operator=get_or_create_person(first.by),
         target=targets[-1],
         setup=first.setup,
         opened_at=first.at,
         closed_at=_closed_at(events),
     )
     for event in events:
-        SessionEvent.objects.create(session=session, **event.values())
+        SessionEvent.objects.create(session=session, **event.to_row_values())
     return session
 
 
@@ -89,7 +89,7 @@ def _closed_at(events: list[EventLine]) -> Any:
 def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
     manifest: Mapping[str, Any] = read_json(journal_folder(episode.pk) / "manifest.json")
     try:
-        setup, dataset = setup_in(manifest), str(manifest["session"]["dataset"])
+        setup, dataset = setup_from_manifest(manifest), str(manifest["session"]["dataset"])
     except (KeyError, TypeError, AttributeError) as error:
         raise EvaError(_MANIFEST_DOES_NOT_SAY_HOW(error=error)) from None
     opened = episode.started_at or timezone.now()
@@ -98,7 +98,7 @@ def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
         episode.station,
         dataset=dataset,
         task=episode.task,
-        operator=known_person(episode.operator),
+        operator=get_or_create_person(episode.operator),
         target=None,
         setup=setup,
         opened_at=opened,

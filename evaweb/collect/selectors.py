@@ -81,7 +81,7 @@ def session_open(*, station: Station) -> CollectSession | None:
     return session_list(is_open=True).filter(station=station).first()
 
 
-def sessions_earlier(*, station: Station) -> QuerySet[CollectSession]:
+def resumable_sessions(*, station: Station) -> QuerySet[CollectSession]:
     """Those that may be resumed there, the last used first."""
     closed = session_list(is_open=False).filter(station=station)
     return closed.annotate(saved=Count("demonstrations", _saved("demonstrations__"))).order_by("-closed_at")[
@@ -89,13 +89,13 @@ def sessions_earlier(*, station: Station) -> QuerySet[CollectSession]:
     ]
 
 
-def tasks_earlier(*, station: Station) -> list[str]:
+def earlier_tasks(*, station: Station) -> list[str]:
     """Tasks demonstrated at the station, the newest first, each once."""
     newest = session_list().filter(station=station).values_list("task", flat=True)
     return list(dict.fromkeys(newest[:200]))[:EARLIER]
 
 
-def counts_of(*, session: CollectSession) -> Counts:
+def session_counts(*, session: CollectSession) -> Counts:
     """Number of its episodes, in all and by outcome."""
     cut = Q(discarded=False, episode__status__in=(EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED))
     wanted = {
@@ -124,7 +124,7 @@ def demonstrations_of(*, session: CollectSession) -> QuerySet[Demonstration]:
     return session.demonstrations.select_related("episode__standing__review").order_by(*newest)
 
 
-def accepted(*, session: CollectSession, results: tuple[str, ...]) -> QuerySet[Demonstration]:
+def accepted_demonstrations(*, session: CollectSession, results: tuple[str, ...]) -> QuerySet[Demonstration]:
     """Those that may be published: whole, not discarded, of these results, failed by no review."""
     return (
         demonstrations_of(session=session)
@@ -133,11 +133,11 @@ def accepted(*, session: CollectSession, results: tuple[str, ...]) -> QuerySet[D
     )
 
 
-def to_publish(
+def unpublished_demonstrations(
     *, session: CollectSession, results: tuple[str, ...] = PUBLISHED_RESULTS
 ) -> QuerySet[Demonstration]:
     """Those of them that are in no dataset yet, in the order in which they were recorded."""
-    waiting = accepted(session=session, results=results).filter(episode__dataset_index=None)
+    waiting = accepted_demonstrations(session=session, results=results).filter(episode__dataset_index=None)
     return waiting.order_by("episode__started_at", "episode__created_at")
 
 

@@ -11,16 +11,16 @@ from django.utils import timezone
 from evaweb.collect import selectors
 from evaweb.collect.models import CollectSession, Result, SessionEvent, SessionEventKind
 from evaweb.collect.record import SESSIONS, EventLine
-from evaweb.collect.setups import require_same, setup_of
+from evaweb.collect.setups import require_same_setup, setup_from_snapshot
 from evaweb.episodes.publishing import DATASET_NAME
-from evaweb.episodes.services import publish_asked
+from evaweb.episodes.services import request_publish
 from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
-from evaweb.journal import text
-from evaweb.roles import Role, require
-from evaweb.stations.holders import who
+from evaweb.journal import clean_text
+from evaweb.roles import Role, require_role
+from evaweb.stations.holders import holder_display_name
 from evaweb.stations.models import Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.core.sentences import Pattern, fixed
 
 _TASK_EMPTY_SAY_WHAT_DEMONSTRATED = fixed(
@@ -82,7 +82,7 @@ HIGHEST_TARGET = 100_000
 _ROLLOUTS = "rollouts"  # begins the names of datasets of policies' runs
 
 
-def session_begin(
+def open_session(
     *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
 ) -> CollectSession:
     """Open a session with the station's present set-up; operators, while no other user commands it.
@@ -90,19 +90,19 @@ def session_begin(
     `dataset` "" takes the deployment's own. Conflict where one is open there, or the dataset was collected with
     another set-up: every difference is listed.
     """
-    require(user, Role.OPERATOR)
-    task = text("task", task, LONGEST_TASK)
+    require_role(user, Role.OPERATOR)
+    task = clean_text("task", task, LONGEST_TASK)
     if not task:
         raise EvaError(_TASK_EMPTY_SAY_WHAT_DEMONSTRATED)
     _check_target(target)
     if not station.active:
         raise Conflict(_STATION_SWITCHED_OFF_CHOOSE_ANOTHER(name=station.name))
-    snapshot = _commanded(user, station)
-    setup = setup_of(snapshot, station.name)
+    snapshot = _commanded_snapshot(user, station)
+    setup = setup_from_snapshot(snapshot, station.name)
     dataset = _dataset(dataset or snapshot["collect"]["dataset"])
     before = selectors.session_list(dataset=dataset).filter(station__simulated=station.simulated).first()
     if before is not None:
-        require_same(setup, before.setup, f"the dataset {dataset}")
+        require_same_setup(setup, before.setup, f"the dataset {dataset}")
     _require_none_open(station)
     session = CollectSession(
         station=station, dataset=dataset, task=task, operator=user, target=target, setup=setup
@@ -110,59 +110,63 @@ def session_begin(
     try:
         with transaction.atomic():
             session.save(force_insert=True)
-            _note(session, user, SessionEventKind.OPENED)
+            _record_event(session, user, SessionEventKind.OPENED)
     except IntegrityError:
         raise Conflict(_SOMEONE_ELSE_OPENED_SESSION_AT(name=station.name)) from None
     return session
 
 
-def session_close(*, user: Any, session: CollectSession) -> CollectSession:
+def close_session(*, user: Any, session: CollectSession) -> CollectSession:
     """End it for now; it can be resumed."""
-    require(user, Role.OPERATOR)
-    snapshot = _commanded(user, session.station, needed=False)
+    require_role(user, Role.OPERATOR)
+    snapshot = _commanded_snapshot(user, session.station, needed=False)
     running = (snapshot.get("collect") or {}).get("episode")
     if running and session.demonstrations.filter(pk=running).exists():
         raise Conflict(_EPISODE_BEING_RECORDED_STOP_FIRST)
     with transaction.atomic():
-        held = _held(session)
+        held = _lock_session(session)
         if held.closed_at is not None:
             raise Conflict(_SESSION_CLOSED_ALREADY(session=held.pk))
         held.closed_at = timezone.now()
-        _note(held, user, SessionEventKind.CLOSED)
+        _record_event(held, user, SessionEventKind.CLOSED)
         held.save(update_fields=["closed_at"])
     return held
 
 
-def session_resume(*, user: Any, session: CollectSession) -> CollectSession:
+def resume_session(*, user: Any, session: CollectSession) -> CollectSession:
     """Go on with it, however long ago it was closed; SetupChanged where the station is not as it was then."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     station = session.station
-    require_same(setup_of(_commanded(user, station), station.name), session.setup, f"session {session}")
+    require_same_setup(
+        setup_from_snapshot(_commanded_snapshot(user, station), station.name),
+        session.setup,
+        f"session {session}",
+    )
     _require_none_open(station)
     try:
         with transaction.atomic():
-            held = _held(session)
+            held = _lock_session(session)
             held.closed_at = None
             held.save(update_fields=["closed_at"])
-            _note(held, user, SessionEventKind.RESUMED)
+            _record_event(held, user, SessionEventKind.RESUMED)
     except IntegrityError:
         raise Conflict(_SOMEONE_ELSE_OPENED_SESSION_AT(name=station.name)) from None
     return held
 
 
 @transaction.atomic
-def session_target(*, user: Any, session: CollectSession, target: int | None) -> CollectSession:
+def set_session_target(*, user: Any, session: CollectSession, target: int | None) -> CollectSession:
     """Set the number of episodes wanted, None for no target."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _check_target(target)
-    held = _held(session)
+    held = _lock_session(session)
     held.target = target
-    _note(held, user, SessionEventKind.TARGET, f"{target or 'none'}")
+    _record_event(held, user, SessionEventKind.TARGET, f"{target or 'none'}")
     held.save(update_fields=["target"])
     return held
 
 
-def session_publish(
+def publish_session(
     *,
     user: Any,
     session: CollectSession,
@@ -174,7 +178,7 @@ def session_publish(
     `version` is that of a new dataset, "" for the usual one or that which it has. Conflict where there is none to
     publish, or the dataset is of another version.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     allowed = [result.value for result in Result if result.value]
     if not results or set(results) - set(allowed):
         raise EvaError(
@@ -186,26 +190,29 @@ def session_publish(
     if version and version not in dataset.versions:
         why = f": {dataset.name} is of that version already, convert it" if dataset.version else ""
         raise Conflict(_VERSION_ALLOWED(version=version, versions=", ".join(dataset.versions), why=why))
-    waiting = list(selectors.to_publish(session=session, results=tuple(results)))
+    waiting = list(selectors.unpublished_demonstrations(session=session, results=tuple(results)))
     if not waiting:
         raise Conflict(_NOTHING_PUBLISH_EPISODES_WHOLE_NOT(results=" or ".join(results)))
     chosen = version or dataset.versions[0]
     with transaction.atomic():
-        _note(
-            _held(session), user, SessionEventKind.PUBLISHED, f"{len(waiting)} episodes into {dataset.name}"
+        _record_event(
+            _lock_session(session),
+            user,
+            SessionEventKind.PUBLISHED,
+            f"{len(waiting)} episodes into {dataset.name}",
         )
-        asked = [publish_asked(episode=one.episode, version=chosen) for one in waiting]
+        asked = [request_publish(episode=one.episode, version=chosen) for one in waiting]
     return [job for job in asked if job is not None]
 
 
-def _note(session: CollectSession, user: Any, kind: SessionEventKind, words: str = "") -> None:
+def _record_event(session: CollectSession, user: Any, kind: SessionEventKind, words: str = "") -> None:
     """The caller holds the session's row."""
     event = SessionEvent(session=session, kind=kind, text=words, by=user, at=timezone.now())
     SESSIONS.append(session.pk, EventLine.written(event))
     event.save(force_insert=True)
 
 
-def _held(session: CollectSession) -> CollectSession:
+def _lock_session(session: CollectSession) -> CollectSession:
     rows = CollectSession.objects.select_for_update(of=("self",)).select_related("station", "operator")
     return rows.get(pk=session.pk)
 
@@ -216,15 +223,15 @@ def _require_none_open(station: Station) -> None:
         raise Conflict(_SESSION_OPEN_AT_CLOSE_FIRST(name=station.name, other=other))
 
 
-def _commanded(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
+def _commanded_snapshot(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
     """The station's snapshot; Conflict while another user commands it. Not `needed`: {} of a station that is away."""
     try:
-        snapshot = wire_to(station.name).status()
+        snapshot = connection_to(station.name).status()
     except EvaError:
         if needed:
             raise
         return {}
-    holder = who((snapshot.get("lease") or {}).get("holder") or "")
+    holder = holder_display_name((snapshot.get("lease") or {}).get("holder") or "")
     if holder and holder != user.get_username():
         raise Conflict(_COMMANDS_ASK_FOR_FIRST(holder=holder, name=station.name))
     return dict(snapshot)

@@ -29,7 +29,7 @@ class SetupChanged(Conflict):
     """The station is not as the session had it."""
 
 
-def setup_of(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:
+def setup_from_snapshot(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:
     """The set-up that a station's snapshot shows; Conflict where it collects nothing or a camera is not seen yet."""
     collect = snapshot.get("collect")
     if collect is None:
@@ -39,7 +39,7 @@ def setup_of(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:
     return dict(collect["setup"])
 
 
-def setup_in(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def setup_from_manifest(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """The set-up that an episode's manifest shows."""
     robot = manifest["robot"]
     return {
@@ -52,7 +52,7 @@ def setup_in(manifest: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def differences(given: Setup, allowed: Setup) -> list[str]:
+def setup_differences(given: Setup, allowed: Setup) -> list[str]:
     """A sentence for everything in which `given` is not as `allowed`; none where they are alike."""
     return [
         *_plain(given, allowed),
@@ -61,9 +61,9 @@ def differences(given: Setup, allowed: Setup) -> list[str]:
     ]
 
 
-def require_same(given: Setup, allowed: Setup, whose: str) -> None:
+def require_same_setup(given: Setup, allowed: Setup, whose: str) -> None:
     """SetupChanged with every difference; `whose` is what `allowed` belongs to."""
-    found = differences(given, allowed)
+    found = setup_differences(given, allowed)
     if found:
         raise SetupChanged(_SET_UP_DIFFERS_FROM(whose=whose, found="; ".join(found)))
 

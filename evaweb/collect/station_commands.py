@@ -10,14 +10,14 @@ from django.db import transaction
 
 from evaweb.collect.models import CollectSession
 from evaweb.collect.selectors import session_get
-from evaweb.collect.setups import require_same, setup_of
-from evaweb.collect.station_events import demonstration_bound
-from evaweb.episodes.services import episode_opened
+from evaweb.collect.setups import require_same_setup, setup_from_snapshot
+from evaweb.collect.station_events import bind_demonstration
+from evaweb.episodes.services import record_opened
 from evaweb.errors import Conflict, EvaError
-from evaweb.roles import Role, require
-from evaweb.stations.commands import identity_of, issue
+from evaweb.roles import Role, require_role
+from evaweb.stations.commands import issue_command, parse_command_uuid
 from evaweb.stations.models import CARRIED_OUT, Command
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.core.sentences import Pattern
 
 _ARGS_SAY_BESIDE_SESSION_WHICH = Pattern(
@@ -48,8 +48,8 @@ def session_command(
     Before each run the station is looked at: SetupChanged where it is not as the session had it. Never within a
     transaction. An accepted run has begun: its episode has a row.
     """
-    require(user, Role.OPERATOR)
-    identity = identity_of(uuid)
+    require_role(user, Role.OPERATOR)
+    identity = parse_command_uuid(uuid)
     own = _own(session, kind, user)
     beside = dict(args or {})
     doubled = sorted(own.keys() & beside.keys())
@@ -57,7 +57,9 @@ def session_command(
         raise EvaError(_ARGS_SAY_BESIDE_SESSION_WHICH(doubled=", ".join(doubled)))
     if not Command.objects.filter(pk=identity).exists():  # else it is asked again what became of it
         _require_fit(session, kind)
-    row = issue(user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given)
+    row = issue_command(
+        user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given
+    )
     if kind == "run" and row.status in CARRIED_OUT and row.data.get("episode"):
         _begun(session, row, user.get_username())
     return row
@@ -68,7 +70,7 @@ def _begun(session: CollectSession, row: Command, operator: str) -> None:
     """Its episode has a row, unless the station has said meanwhile that it could not be opened."""
     if Command.objects.select_for_update().get(pk=row.pk).unopened:
         return
-    episode = episode_opened(
+    episode = record_opened(
         station=session.station,
         uuid=row.data["episode"],
         kind="demonstration",
@@ -76,7 +78,7 @@ def _begun(session: CollectSession, row: Command, operator: str) -> None:
         task=session.task,
         operator=operator,
     )
-    demonstration_bound(episode=episode, session=session)
+    bind_demonstration(episode=episode, session=session)
 
 
 def _own(session: CollectSession, kind: str, user: Any) -> dict[str, Any]:
@@ -98,4 +100,6 @@ def _require_fit(session: CollectSession, kind: str) -> None:
         raise Conflict(_SESSION_CLOSED_RESUME_FIRST(session=session))
     if kind == "run":
         station = session.station.name
-        require_same(setup_of(wire_to(station).status(), station), session.setup, f"session {session}")
+        require_same_setup(
+            setup_from_snapshot(connection_to(station).status(), station), session.setup, f"session {session}"
+        )

@@ -12,9 +12,9 @@ from django.db import transaction
 
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.episodes.folders import data_dir, journal_folder
-from evaweb.episodes.manifest import recorded_in
+from evaweb.episodes.manifest import read_recorded_episode
 from evaweb.episodes.models import Episode
-from evaweb.episodes.services import publish_asked
+from evaweb.episodes.services import request_publish
 from runtime.recording.files import RecordingError
 from runtime.recording.labels import latest_label
 
@@ -23,26 +23,26 @@ TOLD = ("episode_closed", "labelled")
 """The kinds of events that say something of a demonstration."""
 
 
-def demonstration_told(*, event: Mapping[str, Any]) -> Demonstration | None:
+def apply_station_event(*, event: Mapping[str, Any]) -> Demonstration | None:
     """Take one row of a station's event log; the demonstration it is about, None where that is of no session."""
     data = event.get("data") or {}
     try:
         uuid = UUID(str(data.get("episode") or data.get("uuid")))
     except ValueError:
         return None
-    found = demonstration_of(episode=Episode.objects.filter(pk=uuid).first())
-    return None if found is None else label_read(demonstration=found)
+    found = get_or_create_demonstration(episode=Episode.objects.filter(pk=uuid).first())
+    return None if found is None else sync_label(demonstration=found)
 
 
-def demonstration_of(*, episode: Episode | None) -> Demonstration | None:
+def get_or_create_demonstration(*, episode: Episode | None) -> Demonstration | None:
     """That of an episode, made where its manifest names a session that is known."""
     if episode is None:
         return None
     found = Demonstration.objects.filter(pk=episode.pk).first()
-    return found or demonstration_bound(episode=episode, session=_session_of(episode))
+    return found or bind_demonstration(episode=episode, session=_session_of(episode))
 
 
-def demonstration_bound(*, episode: Episode, session: CollectSession | None) -> Demonstration | None:
+def bind_demonstration(*, episode: Episode, session: CollectSession | None) -> Demonstration | None:
     """Say that the episode is one of the session; None for none."""
     if session is None:
         return None
@@ -51,7 +51,7 @@ def demonstration_bound(*, episode: Episode, session: CollectSession | None) -> 
 
 def _session_of(episode: Episode) -> CollectSession | None:
     try:
-        named = recorded_in(journal_folder(episode.pk)).session.get("uuid")
+        named = read_recorded_episode(journal_folder(episode.pk)).session.get("uuid")
         return CollectSession.objects.filter(pk=UUID(str(named))).first() if named else None
     except (RecordingError, ValueError) as error:
         log.warning("nobody knows whether episode %s is one of a session: %s", episode.pk, error)
@@ -59,7 +59,7 @@ def _session_of(episode: Episode) -> CollectSession | None:
 
 
 @transaction.atomic
-def label_read(*, demonstration: Demonstration) -> Demonstration:
+def sync_label(*, demonstration: Demonstration) -> Demonstration:
     """Bring the row up to the newest label on the disk; a published episode goes to its dataset anew with it."""
     held = (
         Demonstration.objects.select_for_update(of=("self",))
@@ -74,5 +74,5 @@ def label_read(*, demonstration: Demonstration) -> Demonstration:
     held.labelled_by, held.labelled_at = label.by[:150], datetime.fromtimestamp(label.time, UTC)
     held.save()
     if before != held.result and held.episode.dataset_index is not None and not held.discarded:
-        publish_asked(episode=held.episode)
+        request_publish(episode=held.episode)
     return held

@@ -20,7 +20,7 @@ _AT_ONCE = 500  # keys in one question
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class QueueItem:
     """A job that is not done: `number` counts the session's episodes, `left_s` is how long it still takes if known."""
 
     job: Job
@@ -42,7 +42,7 @@ class Item:
 class Queue:
     """Failed, running and waiting jobs, in this order; `left_s` of all that runs and waits, in succession."""
 
-    items: tuple[Item, ...]
+    items: tuple[QueueItem, ...]
     done: int
     left_s: float | None
 
@@ -62,7 +62,7 @@ class Queue:
         return sum(item.job.status == JobStatus.FAILED for item in self.items)
 
 
-def queue_of(*, session: CollectSession) -> Queue:
+def session_queue(*, session: CollectSession) -> Queue:
     """The newest job of each kind about each of its episodes."""
     in_order = session.demonstrations.order_by("episode__started_at", "episode__created_at")
     frames = {
@@ -73,7 +73,7 @@ def queue_of(*, session: CollectSession) -> Queue:
     open_jobs = [job for job in newest if job.status != JobStatus.DONE]
     speeds = {kind: _seconds_per_frame(kind) for kind in {job.kind for job in open_jobs}}
     having = served()
-    items = sorted((_item(job, frames, speeds, having) for job in open_jobs), key=_turn)
+    items = sorted((_item(job, frames, speeds, having) for job in open_jobs), key=_queue_order)
     waiting = [item.left_s for item in items if item.job.status != JobStatus.FAILED]
     known = [left for left in waiting if left is not None]
     return Queue(tuple(items), len(newest) - len(items), sum(known) if len(known) == len(waiting) else None)
@@ -95,19 +95,19 @@ def _parts(keys: Sequence[str]) -> Iterator[list[str]]:
 
 def _item(
     job: Job, frames: Mapping[UUID, tuple[int, int]], speeds: Mapping[str, float | None], having: Served
-) -> Item:
+) -> QueueItem:
     uuid = UUID(job.key.partition(":")[2])
     number, count = frames[uuid]
     speed = speeds[job.kind]
     expected = left = None if speed is None else speed * max(count, 1)
     if left is not None and job.status == JobStatus.RUNNING and job.claimed_at is not None:
         left = max(0.0, left - (timezone.now() - job.claimed_at).total_seconds())
-    return Item(
+    return QueueItem(
         job, uuid, number, None if job.status == JobStatus.FAILED else left, expected, having.lacks(job)
     )
 
 
-def _turn(item: Item) -> tuple[int, object]:
+def _queue_order(item: QueueItem) -> tuple[int, object]:
     order = (JobStatus.FAILED, JobStatus.RUNNING, JobStatus.QUEUED)
     return (order.index(JobStatus(item.job.status)), item.job.created_at)
 

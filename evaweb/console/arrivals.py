@@ -22,7 +22,7 @@ from twisted.protocols.policies import ProtocolWrapper, WrappingFactory
 
 from evaweb.console.bodies import BoundedRequest, stop_bound_of
 from evaweb.console.channel import Channel, is_stop
-from evaweb.console.turns import Turns
+from evaweb.console.turns import TurnScheduler
 
 events: Any = reactor
 WHOLE_REQUEST_S = 15.0  # in which a connection sends its first request
@@ -36,7 +36,7 @@ class _Waiting:
     close: Callable[[], object]
 
 
-class Arrivals:
+class ConnectionLimiter:
     """At most `most` that wait, and `most_of_one` of one address; belongs to the event loop."""
 
     def __init__(self, most: int, most_of_one: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -47,9 +47,9 @@ class Arrivals:
     def __len__(self) -> int:
         return len(self._all)
 
-    def came(self, key: int, peer: str, seconds: float, close: Callable[[], object]) -> None:
+    def add(self, key: int, peer: str, seconds: float, close: Callable[[], object]) -> None:
         """It has so long; `close` ends it."""
-        self.gone(key)
+        self.remove(key)
         self._all[key] = _Waiting(peer, self._clock() + seconds, close)
         of_one = self._of.setdefault(peer, OrderedDict())
         of_one[key] = None
@@ -58,7 +58,7 @@ class Arrivals:
         elif len(self._all) > self._most:
             self._end(next(iter(self._all)))
 
-    def gone(self, key: int) -> None:
+    def remove(self, key: int) -> None:
         """It has sent a request, or was closed."""
         found = self._all.pop(key, None)
         if found is None:
@@ -68,7 +68,7 @@ class Arrivals:
         if not of_one:
             del self._of[found.peer]
 
-    def sweep(self) -> None:
+    def close_expired(self) -> None:
         """End those whose time is over."""
         now = self._clock()
         for key in [key for key, waiting in self._all.items() if waiting.until <= now]:
@@ -76,7 +76,7 @@ class Arrivals:
 
     def _end(self, key: int) -> None:
         close = self._all[key].close
-        self.gone(key)
+        self.remove(key)
         close()
 
 
@@ -92,7 +92,7 @@ class Request(BoundedRequest):
         if is_stop(self.path):
             super().process()
         else:
-            self.channel.transport.factory.turns.take(self._in_turn)
+            self.channel.transport.factory.turns.submit(self._in_turn)
 
     def _in_turn(self) -> None:
         if not self._disconnected:
@@ -120,32 +120,32 @@ class _Connection(ProtocolWrapper):
         super().connectionMade()
 
     def connectionLost(self, reason: object) -> None:
-        self.factory.arrivals.gone(id(self))
+        self.factory.arrivals.remove(id(self))
         super().connectionLost(reason)
 
     def sent(self) -> None:
         """A whole request is here, or one whose sender is known."""
-        self.factory.arrivals.gone(id(self))
+        self.factory.arrivals.remove(id(self))
 
     def answered(self) -> None:
         """The next one may come over it."""
         self._wait(NEXT_REQUEST_S, self.transport.loseConnection)
 
     def _wait(self, seconds: float, close: Callable[[], object]) -> None:
-        self.factory.arrivals.came(id(self), str(getattr(self.getPeer(), "host", "")), seconds, close)
+        self.factory.arrivals.add(id(self), str(getattr(self.getPeer(), "host", "")), seconds, close)
 
 
-class Entrance(WrappingFactory):
+class LimitedFactory(WrappingFactory):
     """Daphne's connections, looked after by `arrivals`."""
 
     protocol = _Connection
     noisy = False
 
-    def __init__(self, factory: Any, arrivals: Arrivals, request: type[Request] = Request) -> None:
+    def __init__(self, factory: Any, arrivals: ConnectionLimiter, request: type[Request] = Request) -> None:
         super().__init__(factory)
         factory.protocol = Channel
         self.arrivals, self._request = arrivals, request
-        self.turns = Turns(partial(events.callLater, 0))
+        self.turns = TurnScheduler(partial(events.callLater, 0))
 
     def buildProtocol(self, addr: IAddress) -> ProtocolWrapper:
         made = super().buildProtocol(addr)

@@ -9,12 +9,12 @@ from typing import Any
 from channels.db import database_sync_to_async
 from django.db import Error
 
-from evaweb.blinding import Sight, sight_of
+from evaweb.blinding import Visibility, visibility_for_user
 
 log = logging.getLogger(__name__)
 
 
-async def look(users: Mapping[int, Any]) -> dict[int, Sight]:
+async def current_visibilities(users: Mapping[int, Any]) -> dict[int, Visibility]:
     """By the user's id; empty where the database does not answer: it takes no trial either that would hide more."""
     try:
         return await database_sync_to_async(_found, thread_sensitive=False)(users)
@@ -23,5 +23,5 @@ async def look(users: Mapping[int, Any]) -> dict[int, Sight]:
         return {}
 
 
-def _found(users: Mapping[int, Any]) -> dict[int, Sight]:
-    return {key: sight_of(user) for key, user in users.items()}
+def _found(users: Mapping[int, Any]) -> dict[int, Visibility]:
+    return {key: visibility_for_user(user) for key, user in users.items()}

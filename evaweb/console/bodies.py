@@ -21,25 +21,25 @@ from django.db import connections
 from twisted.internet import reactor
 from twisted.internet.threads import deferToThread
 
-from evaweb.console.channel import is_stop, refusal, whole
-from evaweb.console.logins import role_now
-from evaweb.cookies import sessions_of
+from evaweb.console.channel import is_stop, raw_refusal, refusal
+from evaweb.console.logins import current_role
+from evaweb.cookies import session_keys
 from evaweb.plans.references import LARGEST
-from evaweb.posts import post_at
+from evaweb.posts import body_limit_for
 from evaweb.roles import Role
 from runtime.ipc import estop_requests as pressing
 
 log = logging.getLogger(__name__)
-STRANGER = 64 * 1024  # a login, or a press of the e-stop
-MEMBER = 2 * 1024 * 1024  # a form; what REST takes is in evaweb.posts
-_UPLOADS = {b"/admin/plans/plan/import/": LARGEST + STRANGER}  # files, from administrators
+ANONYMOUS_LIMIT = 64 * 1024  # a login, or a press of the e-stop
+USER_LIMIT = 2 * 1024 * 1024  # a form; what REST takes is in evaweb.posts
+_UPLOADS = {b"/admin/plans/plan/import/": LARGEST + ANONYMOUS_LIMIT}  # files, from administrators
 _ESTOP = re.compile(rb"/api/v1/stations/[^/]+/estop")
 _REST = b"/api/"
 _LINGER_S = 5.0  # for which a client that goes on sending is heard, so that it reads the answer
 
 
 @dataclass(frozen=True, slots=True)
-class Bound:
+class BodyBound:
     """Largest body [bytes], and the answer to a longer one; status 0: it is left out, the request goes on.
 
     What is longer than `sure` is let in only where the first session of `keys` is an administrator's. Where it
@@ -55,25 +55,27 @@ class Bound:
     may_press: bool = False
 
 
-def bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:
+def body_bound(path: bytes, cookies: Iterable[bytes], authorized: bool) -> BodyBound:
     """For a request with these headers, of known length; whether its session or token is good is not known yet."""
     if _ESTOP.fullmatch(path):
-        return Bound(STRANGER, 0, "", STRANGER)
-    keys = tuple(sessions_of(cookie.decode("latin-1") for cookie in cookies))
+        return BodyBound(ANONYMOUS_LIMIT, 0, "", ANONYMOUS_LIMIT)
+    keys = tuple(session_keys(cookie.decode("latin-1") for cookie in cookies))
     if keys or authorized:
-        sure = post_at(path.decode("latin-1")).largest if path.startswith(_REST) else MEMBER
+        sure = body_limit_for(path.decode("latin-1")).largest if path.startswith(_REST) else USER_LIMIT
         largest = _UPLOADS.get(path, sure) if keys else sure
         sentence = f"the body is too long; allowed here: {largest} bytes"
-        return Bound(largest, 413, sentence, sure, keys, is_stop(path))
-    allowed = f"the body is too long; allowed without a login: {STRANGER} bytes"
-    return Bound(STRANGER, 401 if path.startswith(_REST) else 413, allowed, STRANGER)
+        return BodyBound(largest, 413, sentence, sure, keys, is_stop(path))
+    allowed = f"the body is too long; allowed without a login: {ANONYMOUS_LIMIT} bytes"
+    return BodyBound(ANONYMOUS_LIMIT, 401 if path.startswith(_REST) else 413, allowed, ANONYMOUS_LIMIT)
 
 
-def stop_bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bound:
+def stop_bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> BodyBound:
     """The same in the process for stops, which has no long ones."""
     if is_stop(path):
-        return bound_of(path, (), True)
-    return Bound(STRANGER, 413, f"the body is too long; allowed here: {STRANGER} bytes", STRANGER)
+        return body_bound(path, (), True)
+    return BodyBound(
+        ANONYMOUS_LIMIT, 413, f"the body is too long; allowed here: {ANONYMOUS_LIMIT} bytes", ANONYMOUS_LIMIT
+    )
 
 
 class BoundedRequest(WebRequest):
@@ -82,8 +84,8 @@ class BoundedRequest(WebRequest):
     An e-stop whose sender dies before the end of it is pressed: where and by whom was said whole.
     """
 
-    bound_of = staticmethod(bound_of)
-    _bound: Bound
+    bound_of = staticmethod(body_bound)
+    _bound: BodyBound
     _whole = False
     _got = 0
     _over = False
@@ -104,7 +106,7 @@ class BoundedRequest(WebRequest):
         if over and not bound.may_press:
             self._leave_out()
         elif length is not None and length > bound.sure and not bound.may_press:
-            self._ask_who(bound.keys)
+            self._look_up_sender(bound.keys)
 
     def handleContentChunk(self, data: bytes) -> None:
         """Some of the body."""
@@ -157,13 +159,17 @@ class BoundedRequest(WebRequest):
             self.requestHeaders.removeHeader(b"expect")
             self._refuse(self.channel.transport)
 
-    def _ask_who(self, keys: tuple[str, ...]) -> None:
+    def _look_up_sender(self, keys: tuple[str, ...]) -> None:
         """Read nothing more until the database has said whose session it is."""
         self.channel.transport.pauseProducing()
         deferToThread(_role, keys).addCallback(self._known).addErrback(self._unknown)
 
     def _known(self, role: Role | None) -> None:
-        said = "log in first" if role is None else f"you are {role.a}; this needs {Role.ADMIN.a}"
+        said = (
+            "log in first"
+            if role is None
+            else f"you are {role.with_article}; this needs {Role.ADMIN.with_article}"
+        )
         self._go_on(0 if role is Role.ADMIN else 403, said)
 
     def _unknown(self, failure: Any) -> None:
@@ -181,7 +187,7 @@ class BoundedRequest(WebRequest):
         self.channel.transport.resumeProducing()
 
     def _refuse(self, transport: Any) -> None:
-        transport.write(whole(self._bound.status, self._bound.sentence, self._path))
+        transport.write(raw_refusal(self._bound.status, self._bound.sentence, self._path))
         transport.loseWriteConnection()
         events: Any = reactor
         events.callLater(_LINGER_S, transport.abortConnection)
@@ -189,6 +195,6 @@ class BoundedRequest(WebRequest):
 
 def _role(keys: tuple[str, ...]) -> Role | None:
     try:
-        return next(filter(None, map(role_now, keys)), None)
+        return next(filter(None, map(current_role, keys)), None)
     finally:
         connections.close_all()

@@ -20,24 +20,24 @@ from evaweb.stations.models import Lease, LeaseRequest
 from evaweb.trials.models import Score, Trial
 
 log = logging.getLogger(__name__)
-Marks = dict[str, Any]
+ChangeMarks = dict[str, Any]
 
 
-async def look(station: str) -> Marks | None:
+async def read_marks(station: str) -> ChangeMarks | None:
     """The marks of the station now; None where the database does not answer: nothing live depends on it."""
     try:
-        return await database_sync_to_async(marks, thread_sensitive=False)(station)
+        return await database_sync_to_async(change_marks, thread_sensitive=False)(station)
     except Error as error:
         log.warning("the database does not say what has changed: %s", error)
         return None
 
 
-def difference(before: Marks, now: Marks) -> list[str]:
+def changed_names(before: ChangeMarks, now: ChangeMarks) -> list[str]:
     """The names of what has another mark."""
     return sorted(name for name in now if now[name] != before.get(name))
 
 
-def marks(station: str) -> Marks:
+def change_marks(station: str) -> ChangeMarks:
     """Marks that differ after every change, by what it is about."""
     here = Q(station__name=station)
     return {

@@ -14,7 +14,7 @@ import daphne.server  # noqa: F401  first: it decides which reactor there is
 from django.template.loader import render_to_string
 from twisted.web.http import HTTPChannel
 
-from evaweb.headers import BARE, PLAIN_PAGE
+from evaweb.headers import DEFAULT_HEADERS, PLAIN_PAGE
 
 _REST = b"/api/"
 _STOPS = re.compile(rb"/api/v1/stations/[^/]+/(estop|commands)")
@@ -35,11 +35,16 @@ def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
         kind, policy = "text/html; charset=utf-8", {b"content-security-policy": PLAIN_PAGE.encode()}
         body = render_to_string("unavailable.html", {"sentence": sentence, "status": status})
     said = body.encode()
-    described = {b"content-type": kind.encode(), b"content-length": b"%d" % len(said), **dict(BARE), **policy}
+    described = {
+        b"content-type": kind.encode(),
+        b"content-length": b"%d" % len(said),
+        **dict(DEFAULT_HEADERS),
+        **policy,
+    }
     return list(described.items()), said
 
 
-def whole(status: int, sentence: str, path: bytes) -> bytes:
+def raw_refusal(status: int, sentence: str, path: bytes) -> bytes:
     """The same as it goes over a connection that ends with it."""
     headers, said = refusal(status, sentence, path)
     lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode()]
@@ -79,5 +84,5 @@ class Channel(HTTPChannel):  # type: ignore[misc]
             self._refuse(400, "this is no request of HTTP", path)
 
     def _refuse(self, status: int, sentence: str, path: Any) -> None:
-        self.transport.write(whole(status, sentence, bytes(path)))
+        self.transport.write(raw_refusal(status, sentence, bytes(path)))
         self.loseConnection()

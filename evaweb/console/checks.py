@@ -11,7 +11,7 @@ _WANTED = {"uplot/uPlot.esm.js": "curves", "meshcat/main.min.js": "the 3D scene"
 
 
 @register()
-def third_party_scripts(**options: Any) -> list[CheckMessage]:
+def check_third_party_scripts(**options: Any) -> list[CheckMessage]:
     """The scripts of others are where they are served from."""
     return [
         Warning(

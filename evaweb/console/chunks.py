@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaweb.console import parts
-from evaweb.console.parts import Part
-from evaweb.stations.robot_geometry import Looks
+from evaweb.console.parts import EncodedPart
+from evaweb.stations.robot_geometry import DrawnRobot
 
 GHOSTS = 12  # whole robots at most; the page moves the ghost on between them
 _WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap", "ik")
 
 
-def chunk_part(content: Mapping[str, Any], looks: Looks | None, now: float) -> Part:
+def encode_chunk(content: Mapping[str, Any], looks: DrawnRobot | None, now: float) -> EncodedPart:
     """Stream `chunk` of the runtime for pages; {"chunk": 0} where there is none any more.
 
     Beside the runtime's own words: `targets` [H], the step each row is for (-1: it is not executed), and
@@ -29,13 +29,13 @@ def chunk_part(content: Mapping[str, Any], looks: Looks | None, now: float) -> P
     if "targets" in content:
         words["targets"] = np.asarray(content["targets"]).tolist()
     if looks is None or rows.ndim != 2 or not len(rows) or rows.shape[1] != looks.robot.dim:
-        return parts.facts("chunk", words, now)
+        return parts.encode_facts("chunk", words, now)
     if not np.isfinite(rows).all():
-        return parts.facts("chunk", words, now)
+        return parts.encode_facts("chunk", words, now)
     links = looks.poses(rows)
-    arrays: dict[str, NDArray[Any]] = {"tips": looks.tips(links)}
+    arrays: dict[str, NDArray[Any]] = {"tips": looks.fingertip_positions(links)}
     if content.get("state") == "proposed":
         shown = np.unique(np.linspace(0, len(rows) - 1, min(GHOSTS, len(rows))).round().astype(int))
         words["ghost_rows"] = shown.tolist()
         arrays["ghost"] = links[shown]
-    return parts.numbers("chunk", words, arrays, now)
+    return parts.encode_numbers("chunk", words, arrays, now)

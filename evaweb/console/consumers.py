@@ -20,24 +20,24 @@ from channels.db import database_sync_to_async
 from channels.generic.websocket import AsyncWebsocketConsumer
 from django.db import Error
 
-from evaweb.blinding import EVERYTHING, Sight, sight_of
-from evaweb.callers import share_of
+from evaweb.blinding import FULL_VISIBILITY, Visibility, visibility_for_user
+from evaweb.callers import client_key
 from evaweb.console import requests
-from evaweb.console.hub import Room, hub
-from evaweb.console.logins import role_now
+from evaweb.console.hub import StationRoom, hub
+from evaweb.console.logins import current_role
 from evaweb.console.mailbox import Mailbox
-from evaweb.console.pose_queries import Aims
-from evaweb.console.quota import PER_SECOND, Quota
+from evaweb.console.pose_queries import AimQueries
+from evaweb.console.quota import PER_SECOND, MessageQuota
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
-from evaweb.console.stopping import Stopping
-from evaweb.cookies import sessions_of
+from evaweb.console.stopping import PageStops
+from evaweb.cookies import session_keys
 from evaweb.credentials import COUNTS_S, SESSION, Login, credentials
 from evaweb.errors import NotFound, StationGone, reasoned
 from evaweb.roles import Role, role_of
 from evaweb.stations import leases
-from evaweb.stations.flights import Flights, TooMany
+from evaweb.stations.flights import RequestCoalescer, TooManyRequests
 from evaweb.stations.models import Station
-from evaweb.stations.robot_geometry import facts_of
+from evaweb.stations.robot_geometry import describe_robot
 from evaweb.stations.selectors import station_get
 from runtime.core.sentences import Pattern, identity
 from runtime.ipc.messages import Ack
@@ -49,7 +49,7 @@ _MOST_ERRORS = 20
 _MOST_EARLY = 50  # messages that wait until the database has said who is there
 _LOGIN_S = 5.0  # how often the login is looked at
 _AGAIN_S = 1.0  # after which a database that did not answer is asked again
-_renewals: Flights[Ack] = Flights("renew", most=32)  # of one station, which may hang
+_renewals: RequestCoalescer[Ack] = RequestCoalescer("renew", most=32)  # of one station, which may hang
 _LOGIN_UNKNOWN = Pattern(
     "console.login_unknown",
     "the database has not said for {seconds:.0f} s whose login this is; stopping works",
@@ -68,16 +68,16 @@ class StationConsumer(AsyncWebsocketConsumer):
         super().__init__()
         self._outbox: asyncio.Queue[str | bytes] = asyncio.Queue()
         self._tasks: list[asyncio.Task[None]] = []
-        self._room: Room | None = None
+        self._room: StationRoom | None = None
         self._mailbox: Mailbox | None = None
-        self._aims: Aims | None = None
+        self._aims: AimQueries | None = None
         self._renewing = self._admitted = False
         self._errors = 0
         self._sessions: list[str] = []  # of which one may be the login's
         self._session = ""  # the key of the login; empty where the page has no business here
         self._cameras: Collection[str] = ()
         self._early: list[str] = []
-        self._quota, self._over = Quota(), False
+        self._quota, self._over = MessageQuota(), False
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Serve the page until it is gone, however that comes about."""
@@ -100,7 +100,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         """Accept, and close again with a code where the page has no business here: a browser sees no other."""
         await self.accept()
         said = (value.decode("latin-1") for name, value in self.scope["headers"] if name == b"cookie")
-        self._sessions = sessions_of(said)
+        self._sessions = session_keys(said)
         self._page = parse_qs(self.scope["query_string"].decode()).get("page", [""])[-1]
         self._station = self.scope["url_route"]["kwargs"]["name"]
         if not self._sessions:
@@ -111,8 +111,8 @@ class StationConsumer(AsyncWebsocketConsumer):
             known = (key for key in self._sessions if credentials.recall(SESSION, key))
             self._session = next(known, self._sessions[0])
             found = [(SESSION, key) for key in self._sessions]
-            self._stopping = Stopping(
-                self._station, self._page, found, share_of(self.scope), self._say, _go_on
+            self._stopping = PageStops(
+                self._station, self._page, found, client_key(self.scope), self._send_text, _go_on
             )
             self._keep(self._write())
             self._keep(self._admit())
@@ -135,9 +135,9 @@ class StationConsumer(AsyncWebsocketConsumer):
             return
         self._stopping.login, self._cameras = credentials.recall(SESSION, self._session), facts["cameras"]
         hello = {"station": station.name, "user": user.get_username(), "role": role, "page": self._page}
-        self._say({"type": "hello", **hello, "facts": facts})
+        self._send_text({"type": "hello", **hello, "facts": facts})
         room = self._room = hub().room(station.name, station.robot)
-        self._aims = Aims(station, user.get_username(), role, self._say, lambda: room.looks)
+        self._aims = AimQueries(station, user.get_username(), role, self._send_text, lambda: room.looks)
         self._mailbox = room.join(self._outbox.put_nowait, user, sight)
         self._keep(self._follow_login(role))
         self._admitted = True
@@ -166,28 +166,28 @@ class StationConsumer(AsyncWebsocketConsumer):
         while now is role:
             await asyncio.sleep(_LOGIN_S)
             try:
-                now = await _in_database(role_now, self._session)
+                now = await _in_database(current_role, self._session)
             except Error as error:
                 log.warning("the database does not say who is logged in: %s", error)
         self._leave()
         if now is None:
             await self.close(NO_LOGIN, "log in again")
         else:
-            await self.close(NEW_ROLE, f"you are {now.a} now")
+            await self.close(NEW_ROLE, f"you are {now.with_article} now")
 
     async def receive(self, text_data: str | None = None, bytes_data: bytes | None = None) -> None:
         """One message of the page."""
-        text = text_data or _as_said(bytes_data or b"")
-        if not self._session or (self._over and not requests.may_stop(text)):
+        text = text_data or _decode_binary(bytes_data or b"")
+        if not self._session or (self._over and not requests.looks_like_stop(text)):
             return
         within, request = self._quota.take(), self._parsed(text)
         if isinstance(request, EStop | Stop):
-            self._stopping.heard(request)
+            self._stopping.handle(request)
         elif not within:
-            await self._too_much()
+            await self._close_flooded()
         elif self._mailbox is not None:
-            self._mailbox.heard()
-            await self._do(request)
+            self._mailbox.mark_read()
+            await self._handle(request)
         elif isinstance(request, Renew) and not self._admitted and self._counted is not None:
             self._keep_lease(request)  # the page was loaded anew while the database is away
         elif len(self._early) < _MOST_EARLY:
@@ -195,7 +195,7 @@ class StationConsumer(AsyncWebsocketConsumer):
 
     @property
     def _counted(self) -> Login | None:
-        return credentials.counted(SESSION, self._session)
+        return credentials.recall_recent(SESSION, self._session)
 
     def _parsed(self, text: str) -> Request | BadRequest:
         try:
@@ -203,7 +203,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         except BadRequest as error:
             return error
 
-    async def _too_much(self) -> None:
+    async def _close_flooded(self) -> None:
         """Say so once, and close; what stops is obeyed to the last."""
         if not self._over:
             self._over = True
@@ -212,25 +212,25 @@ class StationConsumer(AsyncWebsocketConsumer):
             await self.send(text_data=_as_text({"type": "error", "reason": reason}))
             await self.close(TOO_MUCH, reason)
 
-    async def _do(self, request: Request | BadRequest) -> None:
+    async def _handle(self, request: Request | BadRequest) -> None:
         assert self._room is not None
         assert self._mailbox is not None
         assert self._aims is not None
         if isinstance(request, BadRequest):
-            await self._complain(str(request))
+            await self._send_error(str(request))
         elif isinstance(request, Renew):
             self._keep_lease(request)
         elif isinstance(request, Watch):
             self._room.watch(self._mailbox, request.streams)
         elif isinstance(request, Credit):
             self._mailbox.credit()
-            self._room.ring()
+            self._room.schedule_flush()
         elif isinstance(request, Events):
             self._mailbox.want_events(request.after, request.boot)
-            self._room.ring()
+            self._room.schedule_flush()
         elif isinstance(request, Aim) and self._counted is None:
             said = {"ok": False, "reason": _NOT_SAID, "sentence": identity(_NOT_SAID)}
-            self._say({"type": "aimed", "id": request.id, **said})
+            self._send_text({"type": "aimed", "id": request.id, **said})
         elif isinstance(request, Aim) and self._aims.ask(request):
             _go_on(self._aims.answer())
 
@@ -238,7 +238,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         """Renew the lease if the database has named the user within the last minute; it may be away since."""
         login = self._counted
         if login is None:
-            self._say({"type": "renewed", "ok": False, "lost": False, **reasoned(_NOT_SAID)})
+            self._send_text({"type": "renewed", "ok": False, "lost": False, **reasoned(_NOT_SAID)})
         elif not self._renewing:  # else the one before has no answer yet
             self._renewing = True
             _go_on(self._renew(request, login.username))
@@ -255,9 +255,11 @@ class StationConsumer(AsyncWebsocketConsumer):
         )
         try:
             key, identity = (username, self._page), (request.epoch, request.hidden)
-            ack = await asyncio.wrap_future(_renewals.ask(self._station, renew, key=key, identity=identity))
+            ack = await asyncio.wrap_future(
+                _renewals.submit(self._station, renew, key=key, identity=identity)
+            )
             refused = ack.status == "refused"
-            self._say(
+            self._send_text(
                 {
                     "type": "renewed",
                     "ok": not refused,
@@ -266,19 +268,19 @@ class StationConsumer(AsyncWebsocketConsumer):
                     "epoch": request.epoch,
                 }
             )
-        except (StationGone, TooMany) as gone:
-            self._say({"type": "renewed", "ok": False, "lost": False, **reasoned(str(gone))})
+        except (StationGone, TooManyRequests) as gone:
+            self._send_text({"type": "renewed", "ok": False, "lost": False, **reasoned(str(gone))})
         finally:
             self._renewing = False
 
-    async def _complain(self, reason: str) -> None:
+    async def _send_error(self, reason: str) -> None:
         self._errors += 1
         if self._errors > _MOST_ERRORS:
             await self.close(BAD_REQUEST, "too many requests that mean nothing")
         else:
-            self._say({"type": "error", "reason": reason})
+            self._send_text({"type": "error", "reason": reason})
 
-    def _say(self, message: dict[str, Any]) -> None:
+    def _send_text(self, message: dict[str, Any]) -> None:
         self._outbox.put_nowait(_as_text(message))
 
     async def _write(self) -> None:
@@ -291,7 +293,7 @@ class StationConsumer(AsyncWebsocketConsumer):
                 await self.send(bytes_data=message)
 
 
-class NowhereConsumer(AsyncWebsocketConsumer):
+class UnknownAddressConsumer(AsyncWebsocketConsumer):
     """Consumer at unknown addresses of the live sockets."""
 
     channel_layer_alias = ""
@@ -307,20 +309,27 @@ def _short(reason: str) -> str:
     return reason.encode("utf-8", "replace")[:123].decode("utf-8", "ignore")
 
 
-_Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Sight]
+_Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Visibility]
 
 
 def _admitted(name: str, sessions: list[str]) -> _Admitted:
     """The session, its user and their sight of the station; an unknown user is shown nothing. NotFound."""
     for session in sessions:
-        user = credentials.look(SESSION, session)
+        user = credentials.look_up(SESSION, session)
         if user is not None:
             station = station_get(name=name)
-            return session, user, station, role_of(user), facts_of(station.robot), sight_of(user)
-    return "", None, None, Role.VIEWER, {}, EVERYTHING
+            return (
+                session,
+                user,
+                station,
+                role_of(user),
+                describe_robot(station.robot),
+                visibility_for_user(user),
+            )
+    return "", None, None, Role.VIEWER, {}, FULL_VISIBILITY
 
 
-def _as_said(message: bytes) -> str:
+def _decode_binary(message: bytes) -> str:
     """Text of a binary message, which is no page's way and may be a press."""
     return message.decode(json.detect_encoding(message), "replace")
 

@@ -19,7 +19,7 @@ from django.db.models import Q
 from evaweb.collect import station_events as collect
 from evaweb.console.feed import Feeds, History, feeds
 from evaweb.episodes import services as episodes
-from evaweb.preflights.services import preflights_settled
+from evaweb.preflights.services import refresh_preflights
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
@@ -31,12 +31,12 @@ _TURN_S = 1.0
 _SWEEP_S = 5.0  # how often what was lost on the way is looked for
 
 
-class Scribe:
+class StationEventIngester:
     """One station's thread."""
 
     def __init__(self, station: str, heard: Feeds) -> None:
         self._station = station
-        self._feed = heard.of(station)
+        self._feed = heard.get(station)
         self._ended = threading.Event()
         self._news = threading.Event()
         self._written = ("", 0)  # boot and number of the last event
@@ -48,16 +48,16 @@ class Scribe:
 
     def start(self) -> None:
         """Begin to listen."""
-        self._feed.join(self._hear, pictures=False)
+        self._feed.subscribe(self._on_stream, pictures=False)
         self._thread.start()
 
     def end(self) -> None:
         """Listen no more; the thread ends after what it is writing."""
-        self._feed.leave(self._hear)
+        self._feed.unsubscribe(self._on_stream)
         self._ended.set()
         self._news.set()
 
-    def _hear(self, stream: str, content: Any) -> None:
+    def _on_stream(self, stream: str, content: Any) -> None:
         if stream == "events" or (stream == "state" and self._lease_of(content) != self._lease):
             self._news.set()
 
@@ -70,14 +70,14 @@ class Scribe:
                 self._write()
                 self._failing = False
             except Error as error:
-                self._again(error)
+                self._log_retry(error)
             except Exception:  # a station of another version must not silence the thread for good
                 log.exception("what happens at %s cannot be written down", self._station)
                 self._ended.wait(_TURN_S)
             finally:
                 close_old_connections()
 
-    def _again(self, error: Exception) -> None:
+    def _log_retry(self, error: Exception) -> None:
         if not self._failing:
             log.warning("what happens at %s is written down later: %s", self._station, error)
         self._failing = True
@@ -100,16 +100,14 @@ class Scribe:
             Station.objects.filter(pk=station.pk).update(collects=collects)
             self._collects = collects
         if lease:
-            leases.notice(station=station, boot=state["boot"], held=state["lease"])
+            leases.record_snapshot_lease(station=station, boot=state["boot"], held=state["lease"])
             self._lease = lease
         if behind:
-            self._written = events_written(
-                station=station, history=history, state=str(state.get("state", ""))
-            )
+            self._written = ingest_events(station=station, history=history, state=str(state.get("state", "")))
         if sweep and self._feed.link.ok:
-            for row in commands.unsettled(station=station):
-                commands.settle(row=row)
-            preflights_settled(station=station)
+            for row in commands.unresolved_commands(station=station):
+                commands.resolve_unknown_outcome(row=row)
+            refresh_preflights(station=station)
             self._swept = time.monotonic()
 
     @staticmethod
@@ -117,7 +115,7 @@ class Scribe:
         return (state["boot"], state["lease"]["holder"], state["lease"]["epoch"]) if state else ()
 
 
-def events_written(*, station: Station, history: History, state: str = "") -> tuple[str, int]:
+def ingest_events(*, station: Station, history: History, state: str = "") -> tuple[str, int]:
     """Hand all events to the services that are not in the database yet; boot and number of the last one.
 
     A boot that is new begins with an event of ours that says in which state the station is: it may have
@@ -168,26 +166,26 @@ def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
     unbegun = event["data"].get("unbegun") or {}
     try:
         if event["kind"] == "episode_closed":
-            episodes.episode_closed(station=station, data=event["data"])
+            episodes.record_closed(station=station, data=event["data"])
         if unbegun.get("unopened"):
-            commands.run_unopened(station=station, uuid=unbegun["command"], reason=event["text"])
-        trials.run_changed(station=station, event=event, boot=boot)
+            commands.record_run_not_opened(station=station, uuid=unbegun["command"], reason=event["text"])
+        trials.apply_station_event(station=station, event=event, boot=boot)
         if unbegun.get("unopened"):
-            episodes.episode_unopened(station=station, uuid=unbegun["episode"])
+            episodes.forget_unopened(station=station, uuid=unbegun["episode"])
         if event["kind"] in collect.TOLD:
-            collect.demonstration_told(event=event)
+            collect.apply_station_event(event=event)
     except Error:
         raise
     except Exception:
         log.exception("event %s of %s (%s) is not in the database", event["number"], station, event["text"])
 
 
-class Chronicle:
+class EventIngest:
     """The scribes of all stations, those that are added later included."""
 
     def __init__(self, heard: Feeds = feeds) -> None:
         self._feeds = heard
-        self._scribes: dict[str, Scribe] = {}
+        self._scribes: dict[str, StationEventIngester] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="chronicle", daemon=True)
 
@@ -204,9 +202,9 @@ class Chronicle:
     def _run(self) -> None:
         failing = False
         while not self._ended.is_set():
-            commands.unwritten.look()
+            commands.unwritten.start_writing()
             try:
-                self._look()
+                self._update_stations()
                 failing = False
             except Error as error:
                 if not failing:
@@ -214,7 +212,7 @@ class Chronicle:
                 failing = True
             self._ended.wait(2 * _TURN_S)
 
-    def _look(self) -> None:
+    def _update_stations(self) -> None:
         close_old_connections()
         try:
             names = list(Station.objects.values_list("name", flat=True))
@@ -222,5 +220,5 @@ class Chronicle:
             close_old_connections()
         for name in names:
             if name not in self._scribes and not self._ended.is_set():
-                self._scribes[name] = Scribe(name, self._feeds)
+                self._scribes[name] = StationEventIngester(name, self._feeds)
                 self._scribes[name].start()

@@ -16,9 +16,9 @@ from typing import Any
 
 import zmq
 
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 from evaweb.errors import StationGone
-from evaweb.stations.runtime_client import StationWire, wire_to
+from evaweb.stations.runtime_client import StationConnection, connection_to
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
 from runtime.ipc.session_state import complete_state_meaning
@@ -36,7 +36,7 @@ Listener = Callable[[str, Any], None]  # told of a stream ("link", "events" amon
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class LinkState:
     """State of the link to a station's runtime; `reason` says what is known where it is not `ok`."""
 
     ok: bool
@@ -70,7 +70,7 @@ class History:
 class _Reader(ABC):
     """A thread that follows one socket of a station, from runtime to runtime."""
 
-    def __init__(self, wire: StationWire, process: str, key: str, streams: tuple[str, ...]) -> None:
+    def __init__(self, wire: StationConnection, process: str, key: str, streams: tuple[str, ...]) -> None:
         self._wire, self._process, self._key, self._streams = wire, process, key, streams
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"{wire.name} {key}", daemon=True)
@@ -83,10 +83,10 @@ class _Reader(ABC):
         self._ended.set()
 
     @abstractmethod
-    def heard(self, found: Mapping[str, Any]) -> None:
+    def on_messages(self, found: Mapping[str, Any]) -> None:
         """The newest of each stream that had something."""
 
-    def lost(self, reason: str) -> None:  # noqa: B027  # who reads pictures leaves it to who reads the state
+    def on_silence(self, reason: str) -> None:  # noqa: B027  # who reads pictures leaves it to who reads the state
         """Nothing has come for a while."""
 
     def _run(self) -> None:
@@ -94,12 +94,14 @@ class _Reader(ABC):
             try:
                 self._follow(self._wire.address(self._process, self._key))
             except StationGone as gone:
-                self.lost(str(gone))
+                self.on_silence(str(gone))
             except zmq.ZMQError as error:  # the file names no address
-                self.lost(f"the address of {self._wire.name} cannot be used: {error.strerror}")
+                self.on_silence(f"the address of {self._wire.name} cannot be used: {error.strerror}")
             except Exception:  # whatever a runtime of another version publishes: the next one may be better
                 log.exception("%s published what this web cannot use", self._wire.name)
-                self.lost(f"{self._wire.name} publishes what this web cannot use: see the log of the web")
+                self.on_silence(
+                    f"{self._wire.name} publishes what this web cannot use: see the log of the web"
+                )
             self._ended.wait(_TURN_S)
 
     def _follow(self, endpoint: str) -> None:
@@ -111,9 +113,9 @@ class _Reader(ABC):
                 now = time.monotonic()
                 if found:
                     heard = now
-                    self.heard(found)
+                    self.on_messages(found)
                 elif now - heard > _SILENCE_S:
-                    self.lost(
+                    self.on_silence(
                         f"no sign of life from {self._wire.name}: was its runtime ended, or does it hang?"
                     )
                 if now - looked >= _TURN_S:
@@ -129,26 +131,26 @@ class _Reader(ABC):
             return {}
 
 
-class _Numbers(_Reader):
+class _StateReader(_Reader):
     """State and events, from the coordinator."""
 
-    def __init__(self, feed: Feed, wire: StationWire) -> None:
+    def __init__(self, feed: StationFeed, wire: StationConnection) -> None:
         super().__init__(wire, "coordinator", "state", ("state", "event"))
         self._feed = feed
 
-    def heard(self, found: Mapping[str, Any]) -> None:
+    def on_messages(self, found: Mapping[str, Any]) -> None:
         feed = self._feed
-        if feed.link != Link(True):
-            feed.tell("link", Link(True))
+        if feed.link != LinkState(True):
+            feed.dispatch("link", LinkState(True))
         if "state" in found:
-            feed.tell("state", _whole(found["state"]))
+            feed.dispatch("state", _check_snapshot(found["state"]))
         if "event" in found or self._behind():
             self._catch_up()
 
-    def lost(self, reason: str) -> None:
-        if self._feed.link != Link(False, reason):
+    def on_silence(self, reason: str) -> None:
+        if self._feed.link != LinkState(False, reason):
             log.warning("%s", reason)
-            self._feed.tell("link", Link(False, reason))
+            self._feed.dispatch("link", LinkState(False, reason))
 
     def _behind(self) -> bool:
         state, history = self._feed.state, self._feed.history
@@ -165,40 +167,42 @@ class _Numbers(_Reader):
             log.warning("events of %s are late: %s", self._wire.name, gone)
             return
         if rows or boot != history.boot:
-            self._feed.tell("events", history.extended(boot, rows))
+            self._feed.dispatch("events", history.extended(boot, rows))
 
 
-def _whole(state: Any) -> dict[str, Any]:
+def _check_snapshot(state: Any) -> dict[str, Any]:
     """A snapshot as JSON may carry it; ValueError where it lacks what this web depends on."""
     missing = [key for key in _NEEDED if not isinstance(state, Mapping) or key not in state]
     if missing:
         raise ValueError(f"a snapshot without {', '.join(missing)}: {state!r:.200}")
-    return complete_state_meaning(plain(state))
+    return complete_state_meaning(to_json_value(state))
 
 
 class _Shown(_Reader):
     """What is for pages alone, and passed on as it comes."""
 
-    def __init__(self, feed: Feed, wire: StationWire, process: str, key: str, *streams: str) -> None:
+    def __init__(
+        self, feed: StationFeed, wire: StationConnection, process: str, key: str, *streams: str
+    ) -> None:
         super().__init__(wire, process, key, streams)
         self._feed = feed
 
-    def heard(self, found: Mapping[str, Any]) -> None:
+    def on_messages(self, found: Mapping[str, Any]) -> None:
         for stream, content in found.items():
-            self._feed.tell(stream, content)
+            self._feed.dispatch(stream, content)
 
 
-def _motion(feed: Feed, wire: StationWire) -> _Reader:
+def _motion(feed: StationFeed, wire: StationConnection) -> _Reader:
     """Joints and chunks, from the coordinator."""
     return _Shown(feed, wire, "coordinator", "state", "joints", "chunk")
 
 
-def _pictures(feed: Feed, wire: StationWire) -> _Reader:
+def _pictures(feed: StationFeed, wire: StationConnection) -> _Reader:
     """Previews of the cameras, from media."""
     return _Shown(feed, wire, "media", "cameras", "camera/")
 
 
-class Feed:
+class StationFeed:
     """One station; `link`, `state` and `history` are the newest that was heard, for any thread to read."""
 
     def __init__(self, station: str) -> None:
@@ -206,14 +210,14 @@ class Feed:
         self.link = self._unheard()
         self.state: dict[str, Any] = {}
         self.history = History()
-        self._wire = wire_to(station)
+        self._wire = connection_to(station)
         self._listeners: dict[Listener, bool] = {}  # and whether it wants pictures and motion
         self._lock = threading.Lock()
         self._numbers: _Reader | None = None
         self._motion: _Reader | None = None
         self._pictures: _Reader | None = None
 
-    def join(self, listener: Listener, *, pictures: bool) -> None:
+    def subscribe(self, listener: Listener, *, pictures: bool) -> None:
         """Tell `listener` what is known, then all that comes; the first one starts the threads.
 
         Pictures, joints and chunks come while anybody wants `pictures`.
@@ -226,7 +230,7 @@ class Feed:
             listener("events", self.history)
         self._adjust()
 
-    def leave(self, listener: Listener) -> None:
+    def unsubscribe(self, listener: Listener) -> None:
         """The last one ends the threads."""
         with self._lock:
             self._listeners.pop(listener, None)
@@ -234,10 +238,10 @@ class Feed:
                 self.link, self.state = self._unheard(), {}
         self._adjust()
 
-    def _unheard(self) -> Link:
-        return Link(False, _UNHEARD(station=self.station))
+    def _unheard(self) -> LinkState:
+        return LinkState(False, _UNHEARD(station=self.station))
 
-    def tell(self, stream: str, content: Any) -> None:
+    def dispatch(self, stream: str, content: Any) -> None:
         """Pass on what a reader has heard."""
         with self._lock:
             if stream == "link":
@@ -252,12 +256,12 @@ class Feed:
     def _adjust(self) -> None:
         with self._lock:
             wanted, pictures = bool(self._listeners), any(self._listeners.values())
-            self._numbers = self._switched(self._numbers, wanted, _Numbers)
+            self._numbers = self._switched(self._numbers, wanted, _StateReader)
             self._motion = self._switched(self._motion, pictures, _motion)
             self._pictures = self._switched(self._pictures, pictures, _pictures)
 
     def _switched(
-        self, reader: _Reader | None, wanted: bool, kind: Callable[[Feed, StationWire], _Reader]
+        self, reader: _Reader | None, wanted: bool, kind: Callable[[StationFeed, StationConnection], _Reader]
     ) -> _Reader | None:
         if wanted and reader is None:
             reader = kind(self, self._wire)
@@ -272,13 +276,13 @@ class Feeds:
     """The feeds of a process, one per station, shared by its pages and its chronicle."""
 
     def __init__(self) -> None:
-        self._feeds: dict[str, Feed] = {}
+        self._feeds: dict[str, StationFeed] = {}
         self._lock = threading.Lock()
 
-    def of(self, station: str) -> Feed:
+    def get(self, station: str) -> StationFeed:
         """The station's feed."""
         with self._lock:
-            return self._feeds.setdefault(station, Feed(station))
+            return self._feeds.setdefault(station, StationFeed(station))
 
 
 feeds = Feeds()

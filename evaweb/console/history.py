@@ -11,7 +11,7 @@ from typing import Any
 
 from django.utils import timezone
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.results.presentation.drawings.svg import (
@@ -78,7 +78,7 @@ _MEASURES: tuple[tuple[str, str, Callable[[Day], float | None]], ...] = (
 )
 
 
-def histories(sight: Sight) -> Iterator[History]:
+def histories(sight: Visibility) -> Iterator[History]:
     """Of every station that is in use, one question for all of them."""
     today = timezone.localdate()
     first = today - timedelta(days=DAYS - 1)

@@ -14,7 +14,7 @@ from django.db.models import Q
 from django.urls import reverse
 from django.utils import timezone
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.console.feed import feeds
 from evaweb.console.views_jobs import Row, row_of
 from evaweb.episodes.verifying import unverified
@@ -23,14 +23,14 @@ from evaweb.jobs.selectors import jobs_failed
 from evaweb.jobs.workers import served
 from evaweb.plans.models import PlanState
 from evaweb.results import selectors as results
-from evaweb.results.ratings.unblinding import why_sealed
+from evaweb.results.ratings.unblinding import sealed_reason
 from evaweb.results.selectors import PlanRow
-from evaweb.reviews.selectors import unreviewed
+from evaweb.reviews.selectors import unreviewed_episodes
 from evaweb.roles import Role, role_of
 from evaweb.stations.models import LeaseRequest, Station
 from evaweb.trials.models import Trial, TrialStatus, VoidRequest
 from evaweb.trials.selectors import UNFINISHED
-from evaweb.trials.voids import may_answer
+from evaweb.trials.voids import can_answer_void
 
 MOST = 5  # of each kind
 FULL = 0.10  # share of the disk that is free, below which it is said
@@ -68,7 +68,7 @@ class Now:
     jobs: list[Row]
 
 
-def now(*, user: Any, sight: Sight) -> Now:
+def now(*, user: Any, sight: Visibility) -> Now:
     """As of now, in a number of questions that does not grow with the lab."""
     under_way = Job.objects.filter(status__in=(JobStatus.RUNNING, JobStatus.QUEUED)).select_related(
         "cancelled_by"
@@ -84,8 +84,8 @@ def now(*, user: Any, sight: Sight) -> Now:
     )
 
 
-def _plan(row: PlanRow, user: Any, sight: Sight) -> PlanNow:
-    sealed = why_sealed(row.plan, user, sight)
+def _plan(row: PlanRow, user: Any, sight: Visibility) -> PlanNow:
+    sealed = sealed_reason(row.plan, user, sight)
     address = reverse("result-evidence", args=[row.plan.name, row.plan.version])
     return PlanNow(row, "" if sealed or not row.counted else address, sealed)
 
@@ -103,13 +103,13 @@ def _work(user: Any) -> Iterator[Item]:
         else:
             yield Item(what, reverse("station-eval", args=[trial.station.name]), f"At {trial.station}")
     asked = VoidRequest.objects.filter(answer="").select_related("trial", "by").order_by("at")[:_VOIDS]
-    for one in [one for one in asked if may_answer(one.trial, user)][:MOST]:
+    for one in [one for one in asked if can_answer_void(one.trial, user)][:MOST]:
         words = f"{one.by.get_username()} asks for the void of trial {one.trial_id}: {one.reason:.80}"
         yield Item(words, reverse("result-trial", args=[one.trial_id]), "Answer")
     for one in _requests(user):
         words = f"{one.user.get_username()} asks for {one.station}, which you command"
         yield Item(words, reverse("station-eval", args=[one.station.name]), "Answer")
-    count = unreviewed().order_by().count()
+    count = unreviewed_episodes().order_by().count()
     if count:
         words = f"{count} episode{'s are' if count > 1 else ' is'} waiting for a review"
         yield Item(words, f"{reverse('replay-list')}?{urlencode({'review': 'unreviewed'})}", "Review")
@@ -128,7 +128,7 @@ def _requests(user: Any) -> list[LeaseRequest]:
 def alarms() -> Iterator[Item]:
     """What somebody has to see to, of the whole lab."""
     for station in Station.objects.filter(active=True).order_by("name"):
-        feed = feeds.of(station.name)
+        feed = feeds.get(station.name)
         stands = feed.state.get("state_is", {}) if feed.link.ok else {}
         if not feed.link.ok:
             yield Item(

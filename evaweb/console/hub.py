@@ -8,22 +8,22 @@ from collections.abc import Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.console import blinding as sights
 from evaweb.console import changes, parts
-from evaweb.console.encoder import Encoder
-from evaweb.console.feed import Feeds, History, Link, feeds
+from evaweb.console.encoder import StreamEncoder
+from evaweb.console.feed import Feeds, History, LinkState, feeds
 from evaweb.console.mailbox import Deliver, Mailbox
-from evaweb.console.parts import Part
+from evaweb.console.parts import EncodedPart
 from evaweb.stations import redaction as veil
-from evaweb.stations.robot_geometry import Looks
+from evaweb.stations.robot_geometry import DrawnRobot
 
 _FLUSH_S = 1 / 40  # frames leave at most so often
 _STATE_S = 1 / 200  # but for the station's state, which comes seldom and waits for no curve
 _CHANGES_S = 1.0
 
 
-class Room:
+class StationRoom:
     """The pages that watch one station; all but `hear` belongs to the event loop.
 
     A user from whom the station's checkpoint is hidden is shown other parts than the others. What is hidden
@@ -34,16 +34,16 @@ class Room:
     def __init__(self, station: str, robot: str, loop: asyncio.AbstractEventLoop, heard: Feeds) -> None:
         self.station = station
         self._loop = loop
-        self._feed = heard.of(station)
-        self._encoder = Encoder(robot)
-        self._covering = Encoder(robot, veiled=True)
-        self._covered: dict[str, Part] = {}  # the newest, for those who are not to know
+        self._feed = heard.get(station)
+        self._encoder = StreamEncoder(robot)
+        self._covering = StreamEncoder(robot, veiled=True)
+        self._covered: dict[str, EncodedPart] = {}  # the newest, for those who are not to know
         self._covers = False  # whether anybody is to be shown these
         self._state: dict[str, Any] = {}
         self._unseen = History()  # of which nobody has said yet who may see it
         self._viewers: set[Mailbox] = set()
-        self._newest: dict[str, Part] = {}
-        self._link: Link | None = None
+        self._newest: dict[str, EncodedPart] = {}
+        self._link: LinkState | None = None
         self._history = History()
         self._frames = 0
         self._flushed = 0.0
@@ -53,7 +53,7 @@ class Room:
         self._look_again = False
 
     @property
-    def looks(self) -> Looks | None:
+    def looks(self) -> DrawnRobot | None:
         """The robot in the groups that the station says it has; None where it is not drawn."""
         return self._encoder.looks
 
@@ -61,19 +61,19 @@ class Room:
     def empty(self) -> bool:
         return not self._viewers
 
-    def join(self, deliver: Deliver, user: Any, sight: Sight) -> Mailbox:
+    def join(self, deliver: Deliver, user: Any, sight: Visibility) -> Mailbox:
         """A mailbox for one more page, of `user`, from whom `sight` hides what it hides now."""
         first = not self._viewers
         mailbox = Mailbox(deliver, user)
         mailbox.sight = sight
         self._viewers.add(mailbox)
-        self._judge(mailbox)
+        self._update_viewer(mailbox)
         if first:
-            self._feed.join(self.hear, pictures=True)
+            self._feed.subscribe(self.on_message, pictures=True)
             self._changes = self._loop.create_task(self._follow_changes())
         elif self._link is not None:
             mailbox.put_link(self._link)
-        self.ring()
+        self.schedule_flush()
         return mailbox
 
     def leave(self, mailbox: Mailbox) -> None:
@@ -82,7 +82,7 @@ class Room:
         self._count_covered()
         if self._viewers:
             return
-        self._feed.leave(self.hear)
+        self._feed.unsubscribe(self.on_message)
         for pending in (self._timer, self._changes, self._looking):
             if pending is not None:
                 pending.cancel()
@@ -91,23 +91,23 @@ class Room:
     def watch(self, mailbox: Mailbox, streams: Iterable[str]) -> None:
         """Show a page these streams, at once with what there is."""
         mailbox.watch(streams, self._shown_to(mailbox).values())
-        self.ring()
+        self.schedule_flush()
 
-    def hear(self, stream: str, content: Any) -> None:
+    def on_message(self, stream: str, content: Any) -> None:
         """Encode and pass on a message of the feed, in its thread."""
         encoded = self._encoder.encode(stream, content)
-        covered = encoded if stream.startswith("camera/") else self._cover(stream, content)
+        covered = encoded if stream.startswith("camera/") else self._encode_redacted(stream, content)
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take, stream, content, encoded, covered)
 
-    def _cover(self, stream: str, content: Any) -> list[Part]:
+    def _encode_redacted(self, stream: str, content: Any) -> list[EncodedPart]:
         """The same for those who are not to know, as long as there are any."""
         if not self._covers:
             return []
-        said = veil.state(content, EVERYTHING) if stream == "state" else content
+        said = veil.redact_state(content, FULL_VISIBILITY) if stream == "state" else content
         return self._covering.encode(stream, said)
 
-    def ring(self, after: float = _FLUSH_S) -> None:
+    def schedule_flush(self, after: float = _FLUSH_S) -> None:
         """Something is waiting: send it `after` the last frame [s], together with what comes until then."""
         at = self._flushed + after
         if self._timer is not None and self._timer.when() <= at:
@@ -116,35 +116,37 @@ class Room:
             self._timer.cancel()
         self._timer = self._loop.call_at(at, self._flush)
 
-    def _take(self, stream: str, content: Any, encoded: list[Part], covered: list[Part]) -> None:
+    def _take(
+        self, stream: str, content: Any, encoded: list[EncodedPart], covered: list[EncodedPart]
+    ) -> None:
         if stream == "link":
             self._link = content
             for viewer in self._viewers:
                 viewer.put_link(content)
         elif stream == "events":
             self._unseen = content
-            self._look()
+            self._refresh_visibility()
         elif stream == "state":
             self._state = content
             for viewer in self._viewers:
-                self._judge(viewer)
+                self._update_viewer(viewer)
         for newest, fresh in ((self._newest, encoded), (self._covered, covered)):
             newest.update((part.stream, part) for part in fresh)
         for viewer in self._viewers:
             for part in covered if viewer.veiled else encoded:
                 viewer.put(part)
         if self._viewers:
-            self.ring(_STATE_S if stream in ("state", "link") else _FLUSH_S)
+            self.schedule_flush(_STATE_S if stream in ("state", "link") else _FLUSH_S)
 
     # --- who may see what ------------------------------------------------------------------------------------
 
-    def _shown_to(self, viewer: Mailbox) -> dict[str, Part]:
+    def _shown_to(self, viewer: Mailbox) -> dict[str, EncodedPart]:
         return self._covered if viewer.veiled else self._newest
 
-    def _judge(self, viewer: Mailbox) -> None:
+    def _update_viewer(self, viewer: Mailbox) -> None:
         """Decide if the page sees the station as it is now; where that changes it is told, and shown anew."""
-        veiled = viewer.sight.veils(self.station, self._state)
-        viewer.covers = viewer.sight.veils_events(self.station)
+        veiled = viewer.sight.redacts_snapshot(self.station, self._state)
+        viewer.redacts_events = viewer.sight.redacts_events(self.station)
         if veiled is not viewer.veiled:
             viewer.veiled = veiled
             viewer.put_changed(["sight"])
@@ -157,7 +159,7 @@ class Room:
         if self._covers and not before:
             self._covered.clear()
 
-    def _look(self) -> None:
+    def _refresh_visibility(self) -> None:
         """Ask the database what is hidden from whom; events that came before wait for the answer."""
         if self._looking is None and self._viewers:
             self._looking = self._loop.create_task(self._looked())
@@ -170,12 +172,12 @@ class Room:
             while again:
                 self._look_again = False
                 heard, viewers = self._unseen, list(self._viewers)
-                found = await sights.look({viewer.user.pk: viewer.user for viewer in viewers})
+                found = await sights.current_visibilities({viewer.user.pk: viewer.user for viewer in viewers})
                 for viewer in viewers:
                     viewer.sight = found.get(viewer.user.pk, viewer.sight)
-                    self._judge(viewer)
+                    self._update_viewer(viewer)
                 self._history = heard
-                self.ring()
+                self.schedule_flush()
                 again = self._look_again
         finally:
             self._looking = None
@@ -186,10 +188,10 @@ class Room:
         self._frames += 1
         now, made = time.monotonic(), {}
 
-        def make_frame(wanted: Iterable[Part]) -> bytes:
+        def make_frame(wanted: Iterable[EncodedPart]) -> bytes:
             chosen = tuple(sorted(wanted, key=lambda part: part.stream))
             if chosen not in made:
-                made[chosen] = parts.frame(chosen, self._frames, now)
+                made[chosen] = parts.build_frame(chosen, self._frames, now)
             return made[chosen]
 
         for viewer in self._viewers:
@@ -199,13 +201,13 @@ class Room:
         """Tell the pages what has changed in the database, by any process."""
         known = None
         while True:
-            self._look()
-            found = await changes.look(self.station)
+            self._refresh_visibility()
+            found = await changes.read_marks(self.station)
             if known is not None and found is not None and found != known:
-                what = changes.difference(known, found)
+                what = changes.changed_names(known, found)
                 for viewer in self._viewers:
                     viewer.put_changed(what)
-                self.ring()
+                self.schedule_flush()
             known = found or known
             await asyncio.sleep(_CHANGES_S)
 
@@ -216,13 +218,13 @@ class LiveHub:
     def __init__(self, loop: asyncio.AbstractEventLoop, heard: Feeds = feeds) -> None:
         self._loop = loop
         self._feeds = heard
-        self._rooms: dict[str, Room] = {}
+        self._rooms: dict[str, StationRoom] = {}
 
-    def room(self, station: str, robot: str) -> Room:
+    def room(self, station: str, robot: str) -> StationRoom:
         """The station's room, made for its first page: join it at once, or the next one makes another."""
         found = self._rooms.get(station)
         if found is None or found.empty:
-            found = self._rooms[station] = Room(station, robot, self._loop, self._feeds)
+            found = self._rooms[station] = StationRoom(station, robot, self._loop, self._feeds)
         return found
 
 

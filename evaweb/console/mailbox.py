@@ -10,9 +10,9 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from evaweb.blinding import EVERYTHING, Sight
-from evaweb.console.feed import History, Link
-from evaweb.console.parts import Part
+from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.console.feed import History, LinkState
+from evaweb.console.parts import EncodedPart
 from evaweb.errors import reasoned
 from evaweb.stations import redaction as veil
 
@@ -20,7 +20,7 @@ CREDITS = 2
 EVENTS_AT_ONCE = 200
 _TEXTS_UNHEARD = 30  # texts to a page that has said nothing since
 Deliver = Callable[[str | bytes], None]
-MakeFrame = Callable[[Iterable[Part]], bytes]
+MakeFrame = Callable[[Iterable[EncodedPart]], bytes]
 
 
 class Mailbox:
@@ -32,14 +32,14 @@ class Mailbox:
 
     def __init__(self, deliver: Deliver, user: Any = None) -> None:
         self.user = user
-        self.sight: Sight = EVERYTHING
-        self.veiled = self.covers = False
+        self.sight: Visibility = FULL_VISIBILITY
+        self.veiled = self.redacts_events = False
         self._deliver = deliver
         self._watched: frozenset[str] = frozenset()
-        self._pending: dict[str, Part] = {}
+        self._pending: dict[str, EncodedPart] = {}
         self._credits = CREDITS
         self._unheard = 0
-        self._link: Link | None = None
+        self._link: LinkState | None = None
         self._changed: set[str] = set()
         self._events_of = ""  # the boot that the page has events of
         self._events_after: int | None = None  # None: it has not asked for any
@@ -52,17 +52,17 @@ class Mailbox:
     def watched(self) -> frozenset[str]:
         return self._watched
 
-    def watch(self, streams: Iterable[str], newest: Iterable[Part]) -> None:
+    def watch(self, streams: Iterable[str], newest: Iterable[EncodedPart]) -> None:
         """Set the streams that the page shows from now on, with what there is of them already."""
         self._watched = frozenset(streams)
         self._pending = {part.stream: part for part in newest if part.stream in self._watched}
 
-    def put(self, part: Part) -> None:
+    def put(self, part: EncodedPart) -> None:
         """A newer one of a stream replaces the one that is still waiting."""
         if part.stream in self._watched:
             self._pending[part.stream] = part
 
-    def put_link(self, link: Link) -> None:
+    def put_link(self, link: LinkState) -> None:
         self._link = link
 
     def put_changed(self, what: Iterable[str]) -> None:
@@ -76,7 +76,7 @@ class Mailbox:
         """The page has drawn a frame."""
         self._credits = min(CREDITS, self._credits + 1)
 
-    def heard(self) -> None:
+    def mark_read(self) -> None:
         """The page has said something: it reads what it is sent."""
         self._unheard = 0
 
@@ -97,23 +97,25 @@ class Mailbox:
         if self._events_after is None or not history.boot:
             return
         self._events_of = self._events_of or history.boot
-        beyond = not self.covers and self._events_after > history.newest  # as numbers of covered ones are
+        beyond = (
+            not self.redacts_events and self._events_after > history.newest
+        )  # as numbers of covered ones are
         if self._events_of != history.boot or beyond:
             self._events_of, self._events_after, self._covered_up_to = history.boot, 0, (0, 0)
         rows: Sequence[Any] = history.after(self._events_after)
         covered: Sequence[Any] = ()
-        if self.covers:
+        if self.redacts_events:
             heard, last = self._covered_up_to
-            covered = veil.events(history.after(heard), self.sight, last)
+            covered = veil.redact_events(history.after(heard), self.sight, last)
             rows = [row for row in covered if row["number"] > self._events_after]
         for start in range(0, len(rows), EVENTS_AT_ONCE):
             some = rows[start : start + EVENTS_AT_ONCE]
-            covered = {"covered": True} if self.covers else {}
+            covered = {"covered": True} if self.redacts_events else {}
             if not self._say({"type": "events", "boot": history.boot, "events": some, **covered}):
                 return
             self._events_after = some[-1]["number"]
         last = covered[-1]["number"] if covered else self._covered_up_to[1]
-        self._covered_up_to = (history.newest, last) if self.covers else (0, 0)
+        self._covered_up_to = (history.newest, last) if self.redacts_events else (0, 0)
 
     def _say(self, message: dict[str, object]) -> bool:
         """Send a text, unless the page has not been heard for many of them."""

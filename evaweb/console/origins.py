@@ -7,7 +7,7 @@ from typing import Any
 
 from channels.security.websocket import WebsocketDenier
 
-from evaweb.origins import is_ours, scheme_of
+from evaweb.origins import is_own_origin, scheme_of
 
 
 class SameOrigin:
@@ -18,6 +18,6 @@ class SameOrigin:
 
     async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> Any:
         headers = {name.lower(): value.decode("latin-1") for name, value in scope["headers"]}
-        if is_ours(headers.get(b"origin", ""), headers.get(b"host", ""), scheme_of(scope)):
+        if is_own_origin(headers.get(b"origin", ""), headers.get(b"host", ""), scheme_of(scope)):
             return await self._application(scope, receive, send)
         return await WebsocketDenier()(scope, receive, send)

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 
 _ALIGNMENT = 8
 _AGE = "age"  # stands where a part's age is to be put in
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class EncodedPart:
     """The newest of one stream.
 
     `entry` is its entry in the header in pieces of text; a number between them is an offset into `body`, and
@@ -45,37 +45,37 @@ class Part:
         )
 
 
-def facts(stream: str, content: Mapping[str, Any], received: float) -> Part:
+def encode_facts(stream: str, content: Mapping[str, Any], received: float) -> EncodedPart:
     """A map, such as the state."""
-    return Part(stream, (f'{_key(stream)}:{{"json":{_json(content)}}}',), b"", received)
+    return EncodedPart(stream, (f'{_key(stream)}:{{"json":{_json(content)}}}',), b"", received)
 
 
-def numbers(
+def encode_numbers(
     stream: str, content: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], received: float
-) -> Part:
+) -> EncodedPart:
     """Small facts and float32 arrays beside them, such as the joints."""
     entry: list[str | int] = [f'{_key(stream)}:{{"json":{_json(content)},"arrays":{{']
     body = b""
     for count, (name, array) in enumerate(arrays.items()):
         entry += [f'{"," if count else ""}{_key(name)}:{{"offset":', len(body), f",{_shape(array)}}}"]
         body += _bytes(array)
-    return Part(stream, (*entry, "}}"), body, received)
+    return EncodedPart(stream, (*entry, "}}"), body, received)
 
 
-def array(stream: str, content: NDArray[Any], received: float) -> Part:
+def encode_array(stream: str, content: NDArray[Any], received: float) -> EncodedPart:
     """One float32 array, such as the poses."""
-    return Part(
+    return EncodedPart(
         stream, (f'{_key(stream)}:{{"offset":', 0, f",{_shape(content)}}}"), _bytes(content), received
     )
 
 
-def picture(stream: str, jpeg: bytes, received: float) -> Part:
+def encode_picture(stream: str, jpeg: bytes, received: float) -> EncodedPart:
     """One picture; its entry says how old it is when the frame leaves."""
     entry = (f'{_key(stream)}:{{"mime":"image/jpeg","length":{len(jpeg)},"offset":', 0, ',"age":', _AGE, "}")
-    return Part(stream, entry, _padded(jpeg), received)
+    return EncodedPart(stream, entry, _padded(jpeg), received)
 
 
-def frame(parts: Iterable[Part], number: int, now: float) -> bytes:
+def build_frame(parts: Iterable[EncodedPart], number: int, now: float) -> bytes:
     """The message with these parts, as it leaves at `now`."""
     entries, bodies, offset = [], [], 0
     for part in parts:
@@ -92,7 +92,7 @@ def _key(name: str) -> str:
 
 
 def _json(content: Mapping[str, Any]) -> str:
-    return json.dumps(plain(content), separators=(",", ":"), allow_nan=False)
+    return json.dumps(to_json_value(content), separators=(",", ":"), allow_nan=False)
 
 
 def _shape(content: NDArray[Any]) -> str:

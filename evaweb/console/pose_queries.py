@@ -14,15 +14,15 @@ from uuid import uuid4
 
 import numpy as np
 
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 from evaweb.console.requests import Aim
 from evaweb.errors import EvaError
 from evaweb.roles import Role
-from evaweb.stations.flights import Flights, TooMany
-from evaweb.stations.holders import readable
+from evaweb.stations.flights import RequestCoalescer, TooManyRequests
+from evaweb.stations.holders import with_display_names
 from evaweb.stations.models import Station
-from evaweb.stations.robot_geometry import Looks
-from evaweb.stations.runtime_client import StationWire
+from evaweb.stations.robot_geometry import DrawnRobot
+from evaweb.stations.runtime_client import StationConnection
 from runtime.core.sentences import Pattern, Sentence, identity
 from runtime.ipc import messages
 from runtime.ipc.bus import CodecError
@@ -36,15 +36,19 @@ _NOT_SENDABLE = Pattern("console.aim.not_sendable", "the target cannot be sent: 
 
 _TIMEOUT_S = 3.0  # the first one may have to wait until the station's kinematics are loaded
 _DIGITS = 5  # of a matrix in the answer: a hundredth of a millimetre
-_under_way: Flights[dict[str, Any]] = Flights("aim", most=8)  # of one station, which may hang
-Say = Callable[[dict[str, Any]], None]
-See = Callable[[], Looks | None]  # the robot as it is drawn now
+_under_way: RequestCoalescer[dict[str, Any]] = RequestCoalescer(
+    "aim", most=8
+)  # of one station, which may hang
+SendCallback = Callable[[dict[str, Any]], None]
+LinkPosesCallback = Callable[[], DrawnRobot | None]  # the robot as it is drawn now
 
 
-class Aims:
+class AimQueries:
     """The questions of one page; belongs to the event loop."""
 
-    def __init__(self, station: Station, username: str, role: Role, say: Say, looks: See) -> None:
+    def __init__(
+        self, station: Station, username: str, role: Role, say: SendCallback, looks: LinkPosesCallback
+    ) -> None:
         self._station, self._username, self._role, self._say = station, username, role, say
         self._looks = looks
         self._waiting: Aim | None = None
@@ -64,7 +68,7 @@ class Aims:
         try:
             while (request := self._waiting) is not None:
                 self._waiting = None
-                work = partial(aimed, self._station.name, self._username, request.args, self._looks())
+                work = partial(query_aim, self._station.name, self._username, request.args, self._looks())
                 found = await self._found(work, request.id)
                 self._say({"type": "aimed", "id": request.id, **found})
         finally:
@@ -72,9 +76,9 @@ class Aims:
 
     async def _found(self, work: Callable[[], dict[str, Any]], identity: int) -> dict[str, Any]:
         try:
-            asked = _under_way.ask(self._station.name, work, key=id(self), identity=identity)
+            asked = _under_way.submit(self._station.name, work, key=id(self), identity=identity)
             return await asyncio.wrap_future(asked)
-        except TooMany as fault:
+        except TooManyRequests as fault:
             return _refused(str(fault))
 
 
@@ -84,7 +88,9 @@ def _refused(reason: str) -> dict[str, Any]:
     return {"ok": False, "reason": reason, **known}
 
 
-def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | None) -> dict[str, Any]:
+def query_aim(
+    station: str, username: str, args: Mapping[str, Any], looks: DrawnRobot | None
+) -> dict[str, Any]:
     """The station's answer on a target, and `links`, the poses of its parts there [P * 16]."""
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:
@@ -94,13 +100,13 @@ def aimed(station: str, username: str, args: Mapping[str, Any], looks: Looks | N
         return _refused(_NOT_SENDABLE(error=error))
     except EvaError as gone:
         return _refused(str(gone))
-    data = plain(dict(ack.data))
+    data = to_json_value(dict(ack.data))
     links = _links(looks, data.get("joints")) if ack.status == "done" else []
-    said = {**_refused(readable(ack.reason)), "ok": ack.status == "done"}
+    said = {**_refused(with_display_names(ack.reason)), "ok": ack.status == "done"}
     return {**data, **said, "links": links}
 
 
-def _links(looks: Looks | None, joints: Any) -> list[float]:
+def _links(looks: DrawnRobot | None, joints: Any) -> list[float]:
     """World <- part of every part, each matrix column by column; none where the robot is not drawn."""
     target = np.asarray(joints, np.float64)
     if looks is None or target.shape != (looks.robot.dim,):
@@ -110,5 +116,5 @@ def _links(looks: Looks | None, joints: Any) -> list[float]:
 
 
 @cache
-def _wire_to(name: str) -> StationWire:
-    return StationWire(name)
+def _wire_to(name: str) -> StationConnection:
+    return StationConnection(name)

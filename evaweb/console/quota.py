@@ -9,7 +9,7 @@ PER_SECOND = 200.0  # a page that draws, renews and drags says less than 150
 AT_ONCE = 400.0
 
 
-class Quota:
+class MessageQuota:
     """So many messages at once, and so many a second from then on."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

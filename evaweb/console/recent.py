@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaweb.console import parts
-from evaweb.console.parts import Part
+from evaweb.console.parts import EncodedPart
 
 SAMPLES = 12  # at the 30 a second that the runtime publishes: no gap down to three frames a second
 _CURVES = ("measured", "raw", "planned", "executed")
@@ -25,7 +25,7 @@ class _Sample:
     columns: Mapping[str, Any]
 
 
-class Recent:
+class RecentSamples:
     """Makes stream `recent`: the newest samples in columns, oldest first, `t` on this process's clock [s].
 
     Arrays float32 [K, D]: `measured`; `raw`, what the newest chunk wants; `planned`, what was made of all
@@ -38,9 +38,9 @@ class Recent:
     def __init__(self) -> None:
         self._samples: deque[_Sample] = deque(maxlen=SAMPLES)
 
-    def with_one_more(
+    def add_sample(
         self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
-    ) -> Part:
+    ) -> EncodedPart:
         """The stream after the sample of this moment."""
         sample = _sample(vectors, words, now)
         if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
@@ -48,7 +48,9 @@ class Recent:
         self._samples.append(sample)
         columns = {key: [one.columns[key] for one in self._samples] for key in sample.columns}
         arrays = {name: np.stack([one.curves[i] for one in self._samples]) for i, name in enumerate(_CURVES)}
-        return parts.numbers("recent", {"t": [one.time for one in self._samples], **columns}, arrays, now)
+        return parts.encode_numbers(
+            "recent", {"t": [one.time for one in self._samples], **columns}, arrays, now
+        )
 
 
 def _sample(vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float) -> _Sample:

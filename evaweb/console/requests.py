@@ -95,7 +95,7 @@ class Aim:
 Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
-def may_stop(text: str) -> bool:
+def looks_like_stop(text: str) -> bool:
     """True if a message that there is no time to read may be one that stops a robot."""
     if pressing.parse_json_press(text, "type") is not None:
         return True
@@ -128,7 +128,7 @@ def _streams(said: Mapping[str, Any], cameras: Collection[str]) -> tuple[str, ..
     return tuple(streams)
 
 
-def _whole(said: Mapping[str, Any], key: str) -> int:
+def _int_field(said: Mapping[str, Any], key: str) -> int:
     value = said.get(key)
     if type(value) is not int or not 0 <= value <= 2**53:
         raise BadRequest(_ALLOWED_WHOLE_NUMBER_FROM_0(key=key, value=value))
@@ -150,7 +150,7 @@ def _text(said: Mapping[str, Any], key: str, default: str) -> str:
 
 
 def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
-    return lambda said: Stop(kind, _uuid(said), _whole(said, "epoch"))
+    return lambda said: Stop(kind, _uuid(said), _int_field(said, "epoch"))
 
 
 def _uuid(said: Mapping[str, Any]) -> UUID:
@@ -163,9 +163,9 @@ def _uuid(said: Mapping[str, Any]) -> UUID:
 
 _READ: dict[str, Callable[[Mapping[str, Any]], Request]] = {
     "credit": lambda said: Credit(),
-    "renew": lambda said: Renew(_whole(said, "epoch"), said.get("hidden") is True),
+    "renew": lambda said: Renew(_int_field(said, "epoch"), said.get("hidden") is True),
     "stop": _stop("stop"),
     "halt": _stop("halt"),
-    "events": lambda said: Events(_whole(said, "after"), _text(said, "boot", "")),
-    "aim": lambda said: Aim(_whole(said, "id"), _map(said, "args")),
+    "events": lambda said: Events(_int_field(said, "after"), _text(said, "boot", "")),
+    "aim": lambda said: Aim(_int_field(said, "id"), _map(said, "args")),
 }

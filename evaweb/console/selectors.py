@@ -7,15 +7,15 @@ from typing import Any
 
 from django.contrib.sessions.backends.base import SessionBase
 
-from evaweb.blinding import Sight
-from evaweb.plans.allocation import Progress, progress
-from evaweb.plans.bench_checks import cameras_confirmed, cameras_of, references
+from evaweb.blinding import Visibility
+from evaweb.plans.allocation import Progress, plan_progress
+from evaweb.plans.bench_checks import cameras_of, current_camera_check, references
 from evaweb.plans.models import CameraCheck, Handout, Plan, Reference
 from evaweb.plans.selectors import handout_of, plans_open
 from evaweb.stations.models import Lease, Station
-from evaweb.stations.robot_geometry import facts_of
+from evaweb.stations.robot_geometry import describe_robot
 from evaweb.stations.selectors import last_set_up, leases_open, station_list
-from evaweb.trials.failures import Level, offered
+from evaweb.trials.failures import Level, failure_choices
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED, checkpoint_list, scene_list, trial_list, trial_open
 from evaweb.trials.services import failing
@@ -33,7 +33,7 @@ class StationRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class EvalPanel:
     """Contents of the four steps of an evaluation, as one user may see them.
 
     `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
@@ -68,12 +68,12 @@ class Panel:
     views: tuple[tuple[str, Reference | None], ...] = ()
 
     @property
-    def unseen(self) -> bool:
+    def lacks_references(self) -> bool:
         """True if a camera has no reference yet."""
         return any(row is None for _, row in self.views)
 
     @property
-    def aid(self) -> dict[str, str]:
+    def reference_addresses(self) -> dict[str, str]:
         """Camera -> address of the reference picture of the trial's position."""
         return (
             {camera: f"/pictures/{row.picture}.jpg" for camera, row in self.views if row}
@@ -98,7 +98,7 @@ class Panel:
         return f"/result/trials/{self.last.pk}/" if self.last else ""
 
 
-def station_last_used(*, session: SessionBase) -> Station | None:
+def last_used_station(*, session: SessionBase) -> Station | None:
     """The station that this browser last looked at, else the only one there is."""
     used = session.get(SESSION_KEY)
     found = Station.objects.filter(name=used).first() if used else None
@@ -122,7 +122,7 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
 
     "error" says why; the page goes on without them.
     """
-    found = facts_of(robot)
+    found = describe_robot(robot)
     return {
         "names": found["joint_names"],
         "units": found["units"],
@@ -133,7 +133,9 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
     }
 
 
-def panel(*, station: Station, user: Any, sight: Sight, scene: str = "", plan: str | None = None) -> Panel:
+def eval_panel(
+    *, station: Station, user: Any, sight: Visibility, scene: str = "", plan: str | None = None
+) -> EvalPanel:
     """The evaluation panel of a station; `scene` is the name of the one being chosen, "" for the last one.
 
     `plan`: the name of the one to work on, "" for none; None goes on with that of the last trial.
@@ -146,7 +148,7 @@ def panel(*, station: Station, user: Any, sight: Sight, scene: str = "", plan: s
     worked = handout.plan if handout else None if trial else _plan(plans, plan, last)
     chosen = _chosen_scene(scenes, scene or (last.scene.name if last else ""))
     positions = tuple(chosen.positions.all()) if chosen else ()
-    return Panel(
+    return EvalPanel(
         station=station,
         trial=trial,
         last=last,
@@ -158,14 +160,14 @@ def panel(*, station: Station, user: Any, sight: Sight, scene: str = "", plan: s
         checkpoint=last.checkpoint if last and not sight.hides(last) else None,
         milestones=tuple(trial.scene.milestones.order_by("order")) if trial else (),
         set_up=trial is not None and _is_set_up(trial),
-        failures=offered() if trial else (),
+        failures=failure_choices() if trial else (),
         hidden=trial is not None and sight.hides(trial),
         fails=failing(trial) if trial else "",
         plans=plans,
         plan=worked,
         handout=handout,
-        progress=progress(worked) if worked else None,
-        cameras=cameras_confirmed(user=user, station=station) if worked else None,
+        progress=plan_progress(worked) if worked else None,
+        cameras=current_camera_check(user=user, station=station) if worked else None,
         views=_views(station, trial) if worked else (),
     )
 

@@ -18,10 +18,10 @@ from daphne.server import Server, twisted_loop  # first: it decides which reacto
 # isort: split
 from twisted.internet import reactor, task
 
-from evaweb.console.arrivals import Arrivals, Entrance, Request
+from evaweb.console.arrivals import ConnectionLimiter, LimitedFactory, Request
 from evaweb.console.reading import until_read
-from evaweb.console.sockets import CountedSocket
-from evaweb.lock_wait import for_pages
+from evaweb.console.sockets import LimitedWebSocket
+from evaweb.lock_wait import limit_page_waits
 
 _ACCEPTED = 16  # connections that are taken up in one turn of the loop
 _MOST_WAITING = 4096  # connections without a whole request, where a quarter of all files is as many
@@ -32,7 +32,7 @@ _LARGEST_REQUEST = 2 * 1024 * 1024  # bytes over a websocket, as over REST: a pr
 _TURN_S = 0.001  # of the interpreter, where others wait for it: an e-stop takes several, and each is 5 ms by default
 
 
-class Beside(Protocol):
+class BackgroundService(Protocol):
     """Service of a process, for as long as the process serves."""
 
     def start(self) -> None:
@@ -46,7 +46,7 @@ def serve(
     application: Any,
     listener: socket.socket,
     *,
-    beside: Beside | None,
+    beside: BackgroundService | None,
     lifeline: bool,
     request: type[Request] = Request,
     nice: int = 0,
@@ -59,10 +59,10 @@ def serve(
     sys.setswitchinterval(_TURN_S)
     address = _address(listener)
     arrivals = _arrivals(raise_file_limit())
-    for_pages()
+    limit_page_waits()
     twisted_loop.set_default_executor(ThreadPoolExecutor(_THREADS, "page"))
     server = _Server(
-        partial(Entrance, arrivals=arrivals, request=request),
+        partial(LimitedFactory, arrivals=arrivals, request=request),
         arrivals,
         application,
         endpoints=[f"fd:fileno={listener.detach()}"],  # which is Twisted's from now on
@@ -73,9 +73,9 @@ def serve(
     events: Any = reactor
     if beside is not None:
         events.callWhenRunning(beside.start)
-    events.callWhenRunning(give_way, nice)
+    events.callWhenRunning(set_nice, nice)
     events.callWhenRunning(lambda: print(json.dumps(address), flush=True))
-    events.addSystemEventTrigger("before", "shutdown", _end_for_sure)
+    events.addSystemEventTrigger("before", "shutdown", _exit_after_grace)
     if beside is not None:
         events.addSystemEventTrigger("before", "shutdown", beside.end)
     if lifeline:
@@ -84,7 +84,7 @@ def serve(
 
 
 class _Server(Server):
-    def __init__(self, entrance: Any, arrivals: Arrivals, *given: Any, **named: Any) -> None:
+    def __init__(self, entrance: Any, arrivals: ConnectionLimiter, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self._entrance, self._arrivals = entrance, arrivals
 
@@ -98,17 +98,17 @@ class _Server(Server):
         """Daphne makes its own factory and listens with it: ours stands before it from now on."""
         super().listen_success(port)
         port.factory = self._entrance(port.factory)
-        self.ws_factory.protocol = CountedSocket
+        self.ws_factory.protocol = LimitedWebSocket
 
         def few_at_once() -> None:
             port.numberAccepts = _ACCEPTED  # which Twisted raises as long as there are more
             type(port).doRead(port)
 
         port.doRead = few_at_once
-        task.LoopingCall(self._arrivals.sweep).start(_SWEEP_S)
+        task.LoopingCall(self._arrivals.close_expired).start(_SWEEP_S)
 
 
-def give_way(nice: int) -> None:
+def set_nice(nice: int) -> None:
     """Have all threads of this process that there are, and those that they start, be nicer by so much."""
     for thread in map(int, os.listdir("/proc/self/task")):
         with suppress(ProcessLookupError):  # it has ended
@@ -122,9 +122,9 @@ def raise_file_limit() -> int:
     return hard
 
 
-def _arrivals(files: int) -> Arrivals:
+def _arrivals(files: int) -> ConnectionLimiter:
     most = min(_MOST_WAITING, max(16, files // 4))
-    return Arrivals(most, most // 2)
+    return ConnectionLimiter(most, most // 2)
 
 
 def _address(listener: socket.socket) -> dict[str, Any]:
@@ -141,7 +141,7 @@ def _watch(server: Server) -> None:
     events.callFromThread(server.stop)
 
 
-def _end_for_sure() -> None:
+def _exit_after_grace() -> None:
     """A thread that waits for the database or a station cannot be interrupted; it must not keep us."""
     last = threading.Timer(_LAST_S, os._exit, (1,))
     last.daemon = True

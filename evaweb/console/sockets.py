@@ -10,18 +10,18 @@ from typing import Any
 from daphne.ws_protocol import WebSocketProtocol
 from django.conf import settings
 
-from evaweb.console.quota import Quota
+from evaweb.console.quota import MessageQuota
 
 PING = 20  # messages that a ping counts as: 20 at once, 10 a second
 _MOST_PARTS = 64  # of one message
 _READ = 4096  # bytes of one socket in one turn of the loop; a message is longer seldom
 
 
-class CountedSocket(WebSocketProtocol):  # type: ignore[misc]
+class LimitedWebSocket(WebSocketProtocol):  # type: ignore[misc]
     """A websocket of daphne's that is cut off where it pings or divides without end, or does not read."""
 
     def onConnect(self, request: object) -> object:
-        self._quota, self._parts = Quota(), 0
+        self._quota, self._parts = MessageQuota(), 0
         self.transport.transport.bufferSize = _READ  # our wrapper's
         return super().onConnect(request)
 
@@ -36,7 +36,7 @@ class CountedSocket(WebSocketProtocol):  # type: ignore[misc]
     def onMessageFrameBegin(self, length: int) -> None:
         self._parts += 1
         if self._parts > _MOST_PARTS:
-            self._cut(f"a message in more than {_MOST_PARTS} parts")
+            self._abort(f"a message in more than {_MOST_PARTS} parts")
         else:
             super().onMessageFrameBegin(length)
 
@@ -49,15 +49,15 @@ class CountedSocket(WebSocketProtocol):  # type: ignore[misc]
         super().sendData(*given, **named)
         most = settings.EVA_UNREAD_BYTES
         if unsent(self.transport.transport) > most:
-            self._cut(f"more than {most} bytes were not read")
+            self._abort(f"more than {most} bytes were not read")
 
     def _allowed(self) -> bool:
         allowed = self._quota.take(PING)
         if not allowed:
-            self._cut("too many pings")
+            self._abort("too many pings")
         return allowed
 
-    def _cut(self, why: str) -> None:
+    def _abort(self, why: str) -> None:
         self.wasNotCleanReason = why
         self.dropConnection(abort=True)
 

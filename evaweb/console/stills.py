@@ -25,7 +25,7 @@ _turns: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 def still_of(station: Station) -> bytes:
     """A JPEG, at most KEPT_S old; NotFound where the station does not run or shows nothing."""
-    link = feeds.of(station.name).link
+    link = feeds.get(station.name).link
     cameras = cameras_of(station)[:1]
     if not link.ok or not cameras:
         raise NotFound(link.reason if cameras else _HAS_NO_CAMERA(name=station.name))
@@ -42,6 +42,6 @@ def still_of(station: Station) -> bytes:
 def _asked(station: Station, cameras: list[str]) -> bytes:
     """Empty where none came in time."""
     try:
-        return pictures.now(station, cameras, _PATIENCE_S)[cameras[0]]
+        return pictures.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
     except Conflict:
         return b""

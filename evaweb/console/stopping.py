@@ -18,7 +18,7 @@ from django.utils import timezone
 
 from evaweb import audit
 from evaweb.console.requests import EStop, Stop
-from evaweb.credentials import UNVERIFIED, Busy, Credential, Login, Unverifiable, credentials
+from evaweb.credentials import UNVERIFIED, Credential, Login, LookupOverload, Unverifiable, credentials
 from evaweb.errors import reasoned
 from evaweb.roles import Role
 from evaweb.stations import commands, stops
@@ -26,25 +26,31 @@ from evaweb.stations.models import CommandStatus, Station
 
 log = logging.getLogger(__name__)
 _MOST_UNANSWERED = 200  # of one page; what it says beyond is done, with no word of its own
-Say = Callable[[dict[str, Any]], None]
-GoOn = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the page is closed
+SendCallback = Callable[[dict[str, Any]], None]
+BackgroundCallback = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the page is closed
 
 
-class Stopping:
+class PageStops:
     """The stops of one page at a station; belongs to the event loop. `login` is the user's, once that is known.
 
     `found` are the credentials that it came with, and `share` from where.
     """
 
     def __init__(
-        self, station: str, page: str, found: Sequence[Credential], share: str, say: Say, go_on: GoOn
+        self,
+        station: str,
+        page: str,
+        found: Sequence[Credential],
+        share: str,
+        say: SendCallback,
+        go_on: BackgroundCallback,
     ) -> None:
         self.login: Login | None = None
         self._station, self._page, self._found, self._share = station, page, found, share
         self._say, self._go_on = say, go_on
         self._unanswered = 0
 
-    def heard(self, request: EStop | Stop) -> None:
+    def handle(self, request: EStop | Stop) -> None:
         """Do it; what came of it is said when it is known."""
         at = timezone.now()
         if self.login is None:
@@ -58,8 +64,8 @@ class Stopping:
 
     async def _press_of(self, request: EStop, at: datetime) -> None:
         try:
-            login = await credentials.presser(self._found, self._share)
-        except (Unverifiable, Busy) as fault:  # no crowd refuses an e-stop
+            login = await credentials.resolve_presser(self._found, self._share)
+        except (Unverifiable, LookupOverload) as fault:  # no crowd refuses an e-stop
             audit.estop_unverified(self._station, fault)
             self._press(request, None, at, str(fault))
         else:
@@ -68,8 +74,8 @@ class Stopping:
 
     async def _stop_of(self, request: Stop, at: datetime) -> None:
         try:
-            known = await credentials.stopper(self._found, self._share)
-        except (Unverifiable, Busy) as fault:
+            known = await credentials.resolve_stopper(self._found, self._share)
+        except (Unverifiable, LookupOverload) as fault:
             unknown = stops.Answer(CommandStatus.FAILED, stops.UNKNOWN_STOPPER(why=fault))
             self._acknowledge(request.kind, request.uuid, unknown)
         else:
@@ -79,9 +85,9 @@ class Stopping:
     def _press(self, request: EStop, login: Login | None, at: datetime, unverified: str = "") -> None:
         why, uuid = request.why, request.uuid
         username = login.username if login else UNVERIFIED
-        answer = stops.press(station=self._station, username=username, why=why, uuid=uuid)
+        answer = stops.press_estop(station=self._station, username=username, why=why, uuid=uuid)
         user = login.account if login else None
-        note = partial(commands.estop_noted, user=user, why=why, uuid=uuid, at=at, unverified=unverified)
+        note = partial(commands.record_estop, user=user, why=why, uuid=uuid, at=at, unverified=unverified)
         self._answer("estop", uuid, answer, note)
 
     def _stop(self, request: Stop, login: Login, at: datetime) -> None:
@@ -91,12 +97,12 @@ class Stopping:
             self._acknowledge(request.kind, request.uuid, refused)
             return
         given = {"kind": request.kind, "page": self._page, "epoch": request.epoch, "uuid": request.uuid}
-        answer = stops.ask(stops.order(username=login.username, **given), self._station)
+        answer = stops.request_stop(stops.stop_command(username=login.username, **given), self._station)
         self._answer(
             request.kind,
             request.uuid,
             answer,
-            partial(commands.stop_noted, user=login.account, at=at, **given),
+            partial(commands.record_stop, user=login.account, at=at, **given),
         )
 
     def _answer(

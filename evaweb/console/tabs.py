@@ -24,9 +24,9 @@ _COLLECTING = "station-collect"  # there only where the station's deployment say
 _LAB_TABS = (("Replay", "/replay/"), ("Result", "/result/"))
 
 
-def of(request: HttpRequest) -> list[Tab]:
+def page_tabs(request: HttpRequest) -> list[Tab]:
     """The tabs in their order; those of a station lead to the one this browser last used."""
-    station = selectors.station_last_used(session=request.session)
+    station = selectors.last_used_station(session=request.session)
     match = request.resolver_match
     name = match.url_name if match else ""
     at_station = [

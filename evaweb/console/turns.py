@@ -8,7 +8,7 @@ from collections.abc import Callable
 AT_ONCE = 8  # a request, or the handshake of a websocket, is 1 ms or 2
 
 
-class Turns:
+class TurnScheduler:
     """Work of which `most` is begun in one turn of the loop, the rest in those that follow, in order.
 
     `soon` has something done in the next turn.
@@ -19,7 +19,7 @@ class Turns:
         self._waiting: deque[Callable[[], object]] = deque()
         self._planned = False
 
-    def take(self, work: Callable[[], object]) -> None:
+    def submit(self, work: Callable[[], object]) -> None:
         """Have it done."""
         self._waiting.append(work)
         self._plan()

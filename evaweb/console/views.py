@@ -12,13 +12,13 @@ from django.templatetags.static import static
 from django.urls import reverse
 from django.views.decorators.http import require_safe
 
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.collect import panel as collecting
 from evaweb.console import selectors
 from evaweb.console.history import histories
 from evaweb.console.home import alarms, now
 from evaweb.console.stills import still_of
-from evaweb.datasets.on_robot import offer, recorded_at
+from evaweb.datasets.on_robot import make_offer, playable_episode
 from evaweb.errors import EvaError, NotFound
 from evaweb.lock_wait import lock_wait
 from evaweb.roles import role_of
@@ -39,7 +39,7 @@ def home(request: HttpRequest) -> HttpResponse:
     if part in ("", "stations"):
         context["rows"] = selectors.station_rows()
     if part in ("", "now"):
-        context["now"] = now(user=request.user, sight=sight_for(request))
+        context["now"] = now(user=request.user, sight=visibility_for_request(request))
     if part == "alarms":
         context["now"] = {"alarms": list(alarms())}
     return render(request, f"console/{part or 'home'}.html", context)
@@ -48,7 +48,9 @@ def home(request: HttpRequest) -> HttpResponse:
 @require_safe
 def history(request: HttpRequest) -> HttpResponse:
     """How the stations did in the last week."""
-    return render(request, "console/history.html", {"histories": list(histories(sight_for(request)))})
+    return render(
+        request, "console/history.html", {"histories": list(histories(visibility_for_request(request)))}
+    )
 
 
 @require_safe
@@ -68,8 +70,8 @@ def station(request: HttpRequest, name: str) -> HttpResponse:
 
 def debug(request: HttpRequest, name: str) -> HttpResponse:
     """A station by hand: every command, every figure."""
-    found, seen = _station(name), sight_for(request)
-    if name in seen.at_work:
+    found, seen = _station(name), visibility_for_request(request)
+    if name in seen.busy_stations:
         return _page(request, found, "veiled", {"why": seen.plans})
     shown = {"checkpoints": checkpoint_list(sight=seen), **_replayed(request, found)}
     return _page(request, found, "debug", shown)
@@ -81,8 +83,8 @@ def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
     if not source:
         return {}
     try:
-        recorded = recorded_at(source, request.GET.get("robot", ""))
-        return {"replay": offer(recorded, station, request.GET.get("space", "joint"))}
+        recorded = playable_episode(source, request.GET.get("robot", ""))
+        return {"replay": make_offer(recorded, station, request.GET.get("space", "joint"))}
     except EvaError as error:
         return {"replay_problem": str(error)}
 
@@ -196,10 +198,10 @@ def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, 
 
 
 def _panel(request: HttpRequest, station: Station) -> dict[str, Any]:
-    found = selectors.panel(
+    found = selectors.eval_panel(
         station=station,
         user=request.user,
-        sight=sight_for(request),
+        sight=visibility_for_request(request),
         scene=request.GET.get("scene", ""),
         plan=request.GET.get("plan"),
     )

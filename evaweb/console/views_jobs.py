@@ -13,7 +13,7 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.blinding import HIDDEN, Sight, sight_for
+from evaweb.blinding import HIDDEN, Visibility, visibility_for_request
 from evaweb.datasets import dataset_jobs
 from evaweb.datasets.orders import KIND as DATASET
 from evaweb.errors import EvaError
@@ -25,7 +25,7 @@ from evaweb.lists import Column, Filter, Listing
 from evaweb.names import is_name
 from evaweb.plans.covered_jobs import Cover, cover_of
 from evaweb.plans.models import Plan
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require_role, role_of
 
 PER_PAGE = 50
 # What people call the kinds.
@@ -82,7 +82,7 @@ class Row:
 @require_GET
 def jobs(request: HttpRequest) -> HttpResponseBase:
     """What runs, waits and failed; done ones where they are asked for."""
-    sight = sight_for(request)
+    sight = visibility_for_request(request)
     listing = Listing(request.GET, _columns(sight), _FILTERS)
     found = jobs_listed(**listing.chosen)
     if listing.wants_file:
@@ -105,20 +105,20 @@ def job_act(request: HttpRequest, what: str) -> HttpResponse:
     """Cancel a job, or ask for one again that failed; operators."""
     user: Any = request.user
     try:
-        require(user, Role.OPERATOR)
+        require_role(user, Role.OPERATOR)
         given = request.POST.get("job", "")
         job = job_get(id=int(given) if given.isascii() and given.isdecimal() and len(given) < 16 else 0)
         if what == "cancel":
             services.cancel(user=user, job=job)
         else:
-            services.try_again(user=user, job=job)
+            services.retry_job(user=user, job=job)
         messages.success(request, f"job {job.pk}: {_ACTS[what]}")
     except EvaError as fault:
         messages.error(request, str(fault))
     return redirect(f"{reverse('jobs')}?{request.POST.get('query', '')}")
 
 
-def row_of(job: Job, sight: Sight, having: Served) -> Row:
+def row_of(job: Job, sight: Visibility, having: Served) -> Row:
     """In words; of one that may tell which checkpoint it is about no more than that it is there."""
     title, lacks, said, cover = (
         KINDS.get(job.kind, job.kind),
@@ -141,7 +141,9 @@ def _about(job: Job) -> tuple[str, str]:
         return f"episode {uuid[:8]}", reverse("replay", args=[uuid])
     if job.kind == DATASET:
         name = str(job.args.get("dataset") or job.args.get("to", "")).removeprefix("datasets/")
-        return dataset_jobs.told(job).title, reverse("dataset", args=[name]) if name and is_name(name) else ""
+        return dataset_jobs.summarize_job(job).title, reverse("dataset", args=[name]) if name and is_name(
+            name
+        ) else ""
     if "plan" in job.args:
         plan = Plan.objects.filter(pk=job.args["plan"]).first()
         return (str(plan), reverse("result-plan", args=[plan.name, plan.version])) if plan else ("", "")
@@ -156,7 +158,7 @@ _FILTERS = (
 )
 
 
-def _columns(sight: Sight) -> tuple[Column, ...]:
+def _columns(sight: Visibility) -> tuple[Column, ...]:
     def shown(value: Callable[[Job], Any]) -> Callable[[Job], Any]:
         return lambda job: "" if cover_of(job, sight) is Cover.ALL else value(job)
 

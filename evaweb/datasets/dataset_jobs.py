@@ -29,7 +29,7 @@ _VERBS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class JobSummary:
     """One job: a title, how it stands (waiting, running, done, refused, failed), and a sentence."""
 
     job: Job
@@ -39,13 +39,13 @@ class Told:
     made: tuple[str, ...] = ()  # datasets that came of it
 
     @property
-    def passing(self) -> bool:
+    def is_transient(self) -> bool:
         """True if it changes by itself, so that a page looks again."""
         return self.state in ("waiting", "running")
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class LatestCheck:
     """Findings of the newest check; `fresh` is false where the dataset has changed since."""
 
     at: datetime
@@ -54,31 +54,31 @@ class Checked:
     fresh: bool
 
 
-def jobs_of(name: str = "") -> list[Told]:
+def jobs_of(name: str = "") -> list[JobSummary]:
     """The newest jobs about a dataset, or about all."""
     rows = Job.objects.filter(kind=KIND)
     if name:
         rows = rows.filter(
             Q(args__dataset=name) | Q(args__to=name) | Q(args__datasets__icontains=f'"{name}"')
         )
-    return [told(job) for job in rows[:SHOWN]]
+    return [summarize_job(job) for job in rows[:SHOWN]]
 
 
-def told(job: Job) -> Told:
+def summarize_job(job: Job) -> JobSummary:
     """State of a job, in words."""
     args, result = job.args, job.result
     title = f"{_VERBS.get(args['what'], args['what'])} {_about(args)}"
     if job.status == JobStatus.DONE and not result.get("done"):
-        return Told(job, title, "refused", str(result.get("why", "")))
+        return JobSummary(job, title, "refused", str(result.get("why", "")))
     if job.status == JobStatus.DONE:
         made = [result["dataset"]] if "dataset" in result else result.get("datasets", [])
-        return Told(job, title, "done", _sentence(args["what"], result), tuple(made))
+        return JobSummary(job, title, "done", _sentence(args["what"], result), tuple(made))
     if job.status == JobStatus.FAILED:
-        return Told(job, title, "failed", job.error)
+        return JobSummary(job, title, "failed", job.error)
     if job.status == JobStatus.RUNNING:
-        return Told(job, title, "running", job.progress or "it has begun")
+        return JobSummary(job, title, "running", job.progress or "it has begun")
     words = f"tried again in a moment: {job.error}" if job.error else "for the worker"
-    return Told(job, title, "waiting", waiting_for(job) or words)
+    return JobSummary(job, title, "waiting", waiting_for(job) or words)
 
 
 def _about(args: Mapping[str, Any]) -> str:
@@ -114,7 +114,7 @@ def _counted(count: int, thing: str) -> str:
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
-def checked(name: str) -> Checked | None:
+def latest_check(name: str) -> LatestCheck | None:
     """Findings of the newest finished check of the dataset; None where there is none."""
     key = key_of("check", name, {})
     repaired = key_of("repair", name, {})
@@ -124,4 +124,4 @@ def checked(name: str) -> Checked | None:
     changed = datetime.fromtimestamp((dataset_found(name) / layout.INFO).stat().st_mtime, UTC)
     since = job.finished_at if job.args["what"] == "repair" else job.claimed_at
     said = (tuple(job.result.get(name, ())) for name in ("problems", "remarks"))
-    return Checked(job.finished_at, *said, fresh=changed <= since)
+    return LatestCheck(job.finished_at, *said, fresh=changed <= since)

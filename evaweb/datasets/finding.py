@@ -75,7 +75,7 @@ class Overview:
         return self.frames / self.fps if self.fps else 0.0
 
     @property
-    def lasts(self) -> str:
+    def duration_text(self) -> str:
         """The same in words."""
         seconds = self.seconds
         if seconds < 120:
@@ -173,7 +173,7 @@ def camera_keys(features: dict[str, Any]) -> dict[str, str]:
     return {key.removeprefix("observation.images.").removeprefix("observation."): key for key in keys}
 
 
-def opened(name: str) -> Dataset:
+def open_cached(name: str) -> Dataset:
     """The dataset with its list of episodes; read again only after it has changed. RecordingError."""
     folder = dataset_found(name)
     return _opened(folder, _stamp(folder))

@@ -10,7 +10,7 @@ from uuid import UUID
 from evaweb.datasets.finding import folder_named
 from evaweb.datasets.orders import full_name
 from evaweb.episodes import services
-from evaweb.episodes.dataset_membership import places_read
+from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
 from evaweb.errors import EvaError
 from runtime.core.sentences import Pattern
@@ -25,7 +25,7 @@ _ALLOWED_NAME_DATASETS_NAME_WHAT = Pattern(
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
+class ImportResult:
     """Result of an import: the dataset's name, its episodes in order, and how many of them were new."""
 
     dataset: str
@@ -34,7 +34,7 @@ class Imported:
     problems: tuple[str, ...]  # of datasets that could not be read meanwhile
 
 
-def imported(
+def import_dataset(
     dataset: Path,
     *,
     to: str = "",
@@ -43,7 +43,7 @@ def imported(
     rename: Mapping[str, str] | None = None,
     reencode: bool = False,
     tell: Callable[[str], None] = lambda _: None,
-) -> Imported:
+) -> ImportResult:
     """Import a LeRobot dataset of any version as the dataset `to`; by default of its folder's name. RecordingError.
 
     What was imported before stays as it is, so that one that was cut short is gone on with.
@@ -59,11 +59,11 @@ def imported(
     for entry in copied.episodes:
         tell(f"episode {entry.index + 1} of {len(copied.episodes)}")
         uuid, new = import_episode(copied, entry.index, episodes_dir(), told)
-        services.episode_read(uuid=UUID(uuid))
+        services.sync_episode(uuid=UUID(uuid))
         uuids.append(UUID(uuid))
         made += new
-    problems = places_read()
-    return Imported(target.relative_to(data_dir()).as_posix(), tuple(uuids), made, tuple(problems))
+    problems = sync_memberships()
+    return ImportResult(target.relative_to(data_dir()).as_posix(), tuple(uuids), made, tuple(problems))
 
 
 def _target(dataset: Path, to: str) -> Path:

@@ -8,9 +8,9 @@ from typing import Any
 
 from evaweb.datasets.finding import dataset_found, folder_named
 from evaweb.datasets.orders import KIND, least_for
-from evaweb.episodes.dataset_membership import places_read
+from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.errors import EvaError
-from evaweb.jobs.kinds import Cancelled, Work, job_kind
+from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
 from runtime.recording.files import RecordingError
 
 Found = dict[str, Any]
@@ -18,7 +18,7 @@ _READ = ("check", "push")  # they change no dataset here
 
 
 @job_kind(KIND, least=lambda args: least_for(args["what"]))
-def dataset(work: Work) -> Mapping[str, Any]:
+def dataset(work: JobContext) -> Mapping[str, Any]:
     """Do an order; args: those of evaweb.datasets.orders, checked.
 
     What is refused is a result (`done` false, `why`): to try it again would change nothing.
@@ -30,10 +30,10 @@ def dataset(work: Work) -> Mapping[str, Any]:
         return {"done": False, "why": str(fault)}
     except Cancelled:  # it may have been changed by then
         if work.args["what"] not in _READ:
-            places_read()
+            sync_memberships()
         raise
     if work.args["what"] not in _READ:
-        found["problems"] = [*found.get("problems", ()), *places_read()]
+        found["problems"] = [*found.get("problems", ()), *sync_memberships()]
     return {"done": True, **found}
 
 
@@ -47,23 +47,23 @@ def _names(args: Mapping[str, Any]) -> list[str]:
     return names
 
 
-def _check(work: Work) -> Found:
+def _check(work: JobContext) -> Found:
     from runtime.datasets.consistency import (
         check_with_remarks,
     )  # web processes know this kind too, and never do it
 
-    work.tell("every file is compared with the metadata")
+    work.report_progress("every file is compared with the metadata")
     found = check_with_remarks(_source(work))
     return {"problems": found.problems, "remarks": found.remarks}
 
 
-def _repair(work: Work) -> Found:
+def _repair(work: JobContext) -> Found:
     from runtime.datasets.operations import repair
 
     return {"problems": repair(_source(work))}
 
 
-def _convert(work: Work) -> Found:
+def _convert(work: JobContext) -> Found:
     from runtime.datasets.operations import convert
 
     args = work.args
@@ -74,57 +74,65 @@ def _convert(work: Work) -> Found:
         args["version"],
         rename=args["rename"],
         reencode=args["reencode"],
-        tell=work.tell,
+        tell=work.report_progress,
     )
     return _made(args["to"], made)
 
 
-def _import(work: Work) -> Found:
-    from evaweb.datasets.importing import imported
+def _import(work: JobContext) -> Found:
+    from evaweb.datasets.importing import import_dataset
 
     args = work.args
-    done = imported(_source(work), state=args["state"], robot=args["robot"], tell=work.tell)
+    done = import_dataset(_source(work), state=args["state"], robot=args["robot"], tell=work.report_progress)
     return {"dataset": done.dataset, "episodes": len(done.episodes), "made": done.made}
 
 
-def _merge(work: Work) -> Found:
+def _merge(work: JobContext) -> Found:
     from runtime.datasets.operations import merge
 
     args = work.args
     sources = [dataset_found(name) for name in args["datasets"]]
     target = folder_named(args["to"])
-    made = merge(sources, target, args["version"], reencode=args["reencode"], tell=work.tell)
+    made = merge(sources, target, args["version"], reencode=args["reencode"], tell=work.report_progress)
     return _made(args["to"], made)
 
 
-def _split(work: Work) -> Found:
+def _split(work: JobContext) -> Found:
     from runtime.datasets.operations import split
 
     args = work.args
     targets = {folder_named(f"{args['to']}/{part}"): which for part, which in args["parts"].items()}
-    done = split(_source(work), targets, args["version"], reencode=args["reencode"], tell=work.tell)
+    done = split(
+        _source(work), targets, args["version"], reencode=args["reencode"], tell=work.report_progress
+    )
     parts = [_made(f"{args['to']}/{one.dataset.name}", one) for one in done]
     return {"datasets": [part["dataset"] for part in parts], "parts": parts}
 
 
-def _delete(work: Work) -> Found:
+def _delete(work: JobContext) -> Found:
     from runtime.datasets.operations import delete
 
     args = work.args
     made = delete(
-        _source(work), args["episodes"], reencode=args["reencode"], known=args["known"], tell=work.tell
+        _source(work),
+        args["episodes"],
+        reencode=args["reencode"],
+        known=args["known"],
+        tell=work.report_progress,
     )
     return _made(args["dataset"], made)
 
 
-def _push(work: Work) -> Found:
+def _push(work: JobContext) -> Found:
     from runtime.datasets.hub import push
 
     args = work.args
-    return {"address": push(_source(work), args["repository"], private=args["private"], tell=work.tell)}
+    return {
+        "address": push(_source(work), args["repository"], private=args["private"], tell=work.report_progress)
+    }
 
 
-_KINDS: Mapping[str, Callable[[Work], Found]] = {
+_KINDS: Mapping[str, Callable[[JobContext], Found]] = {
     "check": _check,
     "repair": _repair,
     "convert": _convert,
@@ -136,7 +144,7 @@ _KINDS: Mapping[str, Callable[[Work], Found]] = {
 }
 
 
-def _source(work: Work) -> Path:
+def _source(work: JobContext) -> Path:
     return dataset_found(work.args["dataset"])
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
-from evaweb.datasets.finding import opened
+from evaweb.datasets.finding import open_cached
 from evaweb.episodes.models import Episode
 from evaweb.lists import words_of
 from runtime.datasets import layout
@@ -20,7 +20,7 @@ VERDICTS = ("pass", "fail", "unreviewed")
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class DatasetRow:
     """One episode; `recording` is the lab's own, where it is one of ours that the database knows."""
 
     index: int
@@ -41,21 +41,23 @@ class Row:
         return str(review.verdict) if review else ""
 
 
-def rows(name: str, *, words: str = "", success: str = "", result: str = "", verdict: str = "") -> list[Row]:
+def list_rows(
+    name: str, *, words: str = "", success: str = "", result: str = "", verdict: str = ""
+) -> list[DatasetRow]:
     """The episodes of a dataset, narrowed to those whose task or uuid has all `words`, and so on.
 
     `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; others choose nothing.
     RecordingError; EvaError where there are too many words.
     """
     wanted = words_of(words.lower())
-    dataset = opened(name)
-    told = told_of(dataset)
+    dataset = open_cached(name)
+    told = recorded_lines(dataset)
     known = _known([str(line.get("uuid")) for line in told.values()])
     found = [_row(dataset, listed, told.get(listed.index, {}), known) for listed in dataset.episodes]
     return [row for row in found if _fits(row, wanted, success, result, verdict)]
 
 
-def told_of(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
+def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
     """Our own lines about the episodes of a dataset, by index; {} for one of others."""
     lines = layout.read_lines(dataset.root / layout.EVA_EPISODES)
     try:
@@ -81,9 +83,9 @@ def _known(uuids: Sequence[str]) -> dict[str, Episode]:
     return found
 
 
-def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[str, Episode]) -> Row:
+def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[str, Episode]) -> DatasetRow:
     uuid, success, outcome = str(told.get("uuid", "")), told.get("success"), told.get("outcome")
-    return Row(
+    return DatasetRow(
         index=listed.index,
         length=listed.length,
         seconds=listed.length / dataset.fps,
@@ -104,7 +106,7 @@ def result_of(told: Mapping[str, Any]) -> str:
     return {True: "success", False: "fail"}.get(told.get("success"), "")  # type: ignore[call-overload,no-any-return]
 
 
-def _fits(row: Row, words: Sequence[str], success: str, result: str, verdict: str) -> bool:
+def _fits(row: DatasetRow, words: Sequence[str], success: str, result: str, verdict: str) -> bool:
     text = f"{row.task} {row.uuid} {row.station}".lower()
     wanted = {"yes": True, "no": False, "unknown": None}
     return (

@@ -13,16 +13,16 @@ from django.urls import reverse
 
 import robots
 from evaweb.datasets.orders import full_name
-from evaweb.datasets.playing import Played, played
+from evaweb.datasets.playing import PlayedEpisode, load_played_episode
 from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.episodes.selectors import episode_get
 from evaweb.errors import Conflict, EvaError, NotFound, StationGone
-from evaweb.roles import Role, require
-from evaweb.stations.commands import issue
+from evaweb.roles import Role, require_role
+from evaweb.stations.commands import issue_command
 from evaweb.stations.models import Command, Station
-from evaweb.stations.robot_geometry import facts_of
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.robot_geometry import describe_robot
+from evaweb.stations.runtime_client import connection_to
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
@@ -48,12 +48,12 @@ _EPISODE_DAMAGED = Pattern("datasets.on_robot.episode_damaged", "episode {uuid} 
 _SPACE_ALLOWED = Pattern("datasets.on_robot.space_allowed", "space = {space!r:.40}; allowed: {spaces}")
 
 SPACES = {"joint": "joints", "eef": "end-effector poses"}
-AFTER_S = 1.0  # for which the last row is held before the run ends by itself
+TAIL_S = 1.0  # for which the last row is held before the run ends by itself
 RATE = 5.0  # answers per second; each reaches a second ahead
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class PlayableEpisode:
     """An episode as a robot would get it; `columns` are the names of the numbers by space, and what stores them."""
 
     source: str  # as in addresses
@@ -85,10 +85,10 @@ class Recorded:
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class ReplayOffer:
     """Replay of it at one station in one space; `differences` say why it is not possible."""
 
-    recorded: Recorded
+    recorded: PlayableEpisode
     station: Station
     space: str
     differences: tuple[str, ...]
@@ -130,7 +130,7 @@ class Offer:
     @property
     def run(self) -> str:
         """The arguments of the run, as JSON: it ends by itself after the last row."""
-        return json.dumps({"duration_s": round(self.recorded.seconds + AFTER_S, 3)})
+        return json.dumps({"duration_s": round(self.recorded.seconds + TAIL_S, 3)})
 
     @property
     def address(self) -> str:
@@ -138,12 +138,12 @@ class Offer:
         return f"{reverse('station-debug', args=[self.station.name])}?{query(self.recorded, self.space)}"
 
 
-def query(recorded: Recorded, space: str) -> str:
+def query(recorded: PlayableEpisode, space: str) -> str:
     """Query string for it."""
     return urlencode({"replay": recorded.source, "space": space, **_assumed(recorded)})
 
 
-def _assumed(recorded: Recorded) -> dict[str, str]:
+def _assumed(recorded: PlayableEpisode) -> dict[str, str]:
     return {"robot": recorded.robot} if recorded.columns else {}
 
 
@@ -162,10 +162,10 @@ def replay_command(
 
     EvaError for other commands, Conflict where the station's robot is not the episode's.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     if kind != "setup":
         raise EvaError(_TAKES_NO_REPLAY_SETUP_DOES(kind=kind))
-    found = offer(recorded_at(episode, robot), station, space)
+    found = make_offer(playable_episode(episode, robot), station, space)
     if found.differences:
         raise Conflict("; ".join(found.differences))
     beside = dict(args or {})
@@ -173,10 +173,10 @@ def replay_command(
     if doubled:
         raise EvaError(_ARGS_SAY_BESIDE_REPLAY_WHICH(doubled=", ".join(doubled)))
     args = {**found.set_up, **beside}
-    return issue(user=user, station=station, kind=kind, args=args, vouched=("policy",), **given)
+    return issue_command(user=user, station=station, kind=kind, args=args, vouched=("policy",), **given)
 
 
-def recorded_at(source: str, robot: str = "") -> Recorded:
+def playable_episode(source: str, robot: str = "") -> PlayableEpisode:
     """The episode of that name, with the numbers of `robot` where a person says so; NotFound, Conflict."""
     try:
         uuid = UUID(source)
@@ -185,13 +185,13 @@ def recorded_at(source: str, robot: str = "") -> Recorded:
         if not (name and index.isascii() and index.isdecimal() and len(index) < 10):
             raise NotFound(_NO_EPISODE_ALLOWED_UUID_DATASET(source=source)) from None
         try:
-            return _of_dataset(played(full_name(name), int(index), robot))
+            return _of_dataset(load_played_episode(full_name(name), int(index), robot))
         except RecordingError as error:
             raise Conflict(str(error)) from None
     return _recording(uuid)
 
 
-def _recording(uuid: UUID) -> Recorded:
+def _recording(uuid: UUID) -> PlayableEpisode:
     row = episode_get(uuid=uuid)
     if row.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED(uuid=uuid))
@@ -204,7 +204,7 @@ def _recording(uuid: UUID) -> Recorded:
     told = episode.manifest["robot"]
     robot = told if isinstance(told, Mapping) else {}
     has_poses = "eef_action" in episode.layout.streams
-    return Recorded(
+    return PlayableEpisode(
         source=str(uuid),
         title=row.task or "Episode without a task",
         path=str(episode.path.absolute()),
@@ -220,15 +220,15 @@ def _recording(uuid: UUID) -> Recorded:
     )
 
 
-def _of_dataset(shown: Played) -> Recorded:
+def _of_dataset(shown: PlayedEpisode) -> PlayableEpisode:
     features = shown.dataset.features
     action = shown.action
     poses = next((name for name in ("eef_action", "action_eef") if name in features), "")
     joints = shown.names(action) if action else []
-    if shown.assumed:
-        known = facts_of(shown.robot)["joint_names"]
+    if shown.robot_is_assumed:
+        known = describe_robot(shown.robot)["joint_names"]
         joints = known if len(known) == len(joints) else joints
-    return Recorded(
+    return PlayableEpisode(
         source=f"{shown.name}:{shown.index}",
         title=shown.task or "Episode without a task",
         path=str(shown.dataset.root.absolute()),
@@ -240,27 +240,27 @@ def _of_dataset(shown: Played) -> Recorded:
         joints=joints,
         poses=shown.names(poses) if poses else (),
         columns={"joint": action, "eef": poses},
-        ours=bool(shown.uuid) and shown.told.get("kind") != IMPORTED and not shown.assumed,
+        ours=bool(shown.uuid) and shown.told.get("kind") != IMPORTED and not shown.robot_is_assumed,
     )
 
 
-def offer(recorded: Recorded, station: Station, space: str) -> Offer:
+def make_offer(recorded: PlayableEpisode, station: Station, space: str) -> ReplayOffer:
     """Offer of the station for the episode; EvaError for an unknown space."""
     if space not in SPACES:
         raise EvaError(_SPACE_ALLOWED(space=space, spaces=", ".join(SPACES)))
     facts, running = _facts(station)
-    return Offer(recorded, station, space, tuple(_differences(recorded, facts, space)), running)
+    return ReplayOffer(recorded, station, space, tuple(_differences(recorded, facts, space)), running)
 
 
 def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
     """Facts of the station's robot, and if it answers; where it does not, what is known of such a robot."""
     try:
-        return wire_to(station.name).status()["facts"], True
+        return connection_to(station.name).status()["facts"], True
     except (StationGone, KeyError):
-        return facts_of(station.robot), False
+        return describe_robot(station.robot), False
 
 
-def _differences(recorded: Recorded, facts: Mapping[str, Any], space: str) -> list[str]:
+def _differences(recorded: PlayableEpisode, facts: Mapping[str, Any], space: str) -> list[str]:
     """Everything in which the episode's robot is not the station's; [] where it is the same."""
     found = []
     own = str(facts.get("robot", ""))

@@ -14,7 +14,7 @@ from evaweb.datasets.finding import dataset_found, dataset_names, folder_named
 from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from runtime.core.sentences import Pattern
 from runtime.datasets.layout import INFO
 from runtime.datasets.operations import fingerprint
@@ -132,7 +132,7 @@ def least_for(what: str) -> Role:
     return Role.ADMIN if what in _OF_ADMINS else Role.OPERATOR
 
 
-def order_of(given: Mapping[str, Any]) -> Any:
+def parse_order(given: Mapping[str, Any]) -> Any:
     """The order that is meant; EvaError names what is wrong with it."""
     try:
         return _ADAPTER.validate_python(dict(given))
@@ -149,13 +149,13 @@ def full_name(given: str) -> str:
     return usual if usual in names or (given not in names and "/" not in given) else given
 
 
-def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
+def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
     """Have the worker do it; operators, what takes data away or out of the house administrators.
 
     Raises EvaError where a dataset is not there, a new one is already, or a name leads out of the data folder.
     """
-    order = order_of(given)
-    require(user, least_for(order.what))
+    order = parse_order(given)
+    require_role(user, least_for(order.what))
     sources = list(order.datasets) if isinstance(order, Merge) else [order.dataset]
     names = [full_name(name) for name in sources]
     for name in names:
@@ -171,7 +171,7 @@ def asked(*, user: Any, given: Mapping[str, Any]) -> Job:
         args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
     if isinstance(order, Import) and order.robot and order.robot not in robots.robot_names():
         raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
-    _require_quiet(names)
+    _require_no_deletion(names)
     return enqueue(kind=KIND, key=key_of(order.what, names[0], args), args=args)
 
 
@@ -207,7 +207,7 @@ def _known(name: str) -> str:
         raise Conflict(str(fault)) from None
 
 
-def _require_quiet(names: Sequence[str]) -> None:
+def _require_no_deletion(names: Sequence[str]) -> None:
     """Two deletions that wait for each other would be about different episodes."""
     for job in Job.objects.filter(
         kind=KIND, status__in=(JobStatus.QUEUED, JobStatus.RUNNING), args__what="delete"

@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 import robots
-from evaweb.datasets.finding import camera_keys, opened
-from evaweb.datasets.listing import result_of, told_of
+from evaweb.datasets.finding import camera_keys, open_cached
+from evaweb.datasets.listing import recorded_lines, result_of
 from evaweb.errors import NotFound
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.stations.robot_geometry import drawn_robot
 from runtime.core.sentences import Pattern
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span
@@ -52,7 +52,7 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Played:
+class PlayedEpisode:
     """One episode of a dataset; `robot` is whose numbers are meant, "" where it is not known.
 
     `assumed`: a person says so, whatever the dataset says, and that they are in that robot's order.
@@ -64,7 +64,7 @@ class Played:
     entry: EpisodeEntry
     told: Mapping[str, Any]  # our own line about it; {} for one of others
     robot: str
-    assumed: bool
+    robot_is_assumed: bool
 
     @property
     def result(self) -> str:
@@ -131,21 +131,23 @@ class Played:
         told = [str(name) for name in names] if isinstance(names, list) else []
         return told if len(told) == width else [f"{column}[{k}]" for k in range(width)]
 
-    def beside(self) -> dict[str, Path]:
+    def sidecars(self) -> dict[str, Path]:
         """The side files of the episode by kind."""
         return sidecar_paths(self.dataset.root, self.uuid) if self.uuid else {}
 
 
-def played(name: str, index: int, robot: str = "") -> Played:
+def load_played_episode(name: str, index: int, robot: str = "") -> PlayedEpisode:
     """Episode `index` of a dataset, with the numbers of `robot` where that is given; NotFound, RecordingError."""
-    dataset = opened(name)
+    dataset = open_cached(name)
     listed = next((one for one in dataset.episodes if one.index == index), None)
     if listed is None:
         raise NotFound(_HAS_NO_EPISODE_THERE(name=name, index=index, count=len(dataset.episodes)))
     if robot and robot not in robots.robot_names():
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     own = str(dataset.info.get("robot_type") or "")
-    return Played(name, index, dataset, listed, told_of(dataset).get(index, {}), robot or own, bool(robot))
+    return PlayedEpisode(
+        name, index, dataset, listed, recorded_lines(dataset).get(index, {}), robot or own, bool(robot)
+    )
 
 
 def _vectors(dataset: Dataset) -> list[str]:
@@ -158,7 +160,7 @@ def _vectors(dataset: Dataset) -> list[str]:
     ]
 
 
-def as_recording(shown: Played) -> Episode:
+def as_recording(shown: PlayedEpisode) -> Episode:
     """The episode with the tables that a recording has; the three action streams where they lie beside it.
 
     Where state and action are of different numbers, the joints are those of both. Raises RecordingError.
@@ -174,7 +176,7 @@ def as_recording(shown: Played) -> Episode:
             "qpos": _lists(measured),
         }
     )
-    streams = shown.beside().get("streams")
+    streams = shown.sidecars().get("streams")
     if streams is not None and len(joints) == measured.shape[1]:
         return _with_streams(shown, streams, rows)
     ticks = pa.table(
@@ -198,7 +200,7 @@ def as_recording(shown: Played) -> Episode:
     )
 
 
-def _numbers(shown: Played, table: Any) -> tuple[list[str], Array, Array]:
+def _numbers(shown: PlayedEpisode, table: Any) -> tuple[list[str], Array, Array]:
     """Names of the joints, measured and commanded ones [N, D]; NaN where a column has nothing of a joint."""
     state, action = shown.state, shown.action
     if not state and not action:
@@ -229,25 +231,25 @@ def _lists(values: Array) -> Any:
     return pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def _manifest(shown: Played, joints: list[str]) -> dict[str, Any]:
+def _manifest(shown: PlayedEpisode, joints: list[str]) -> dict[str, Any]:
     return {
         "uuid": shown.uuid or str(uuid5(NAMESPACE_URL, f"{shown.name}#{shown.index}")),
         "fps": shown.fps,
         "control_rate": shown.fps,
         "started_monotonic": 0.0,
         "task": shown.task,
-        "robot": {"name": shown.robot, "dim": len(joints), "joint_names": _called(shown, joints)},
+        "robot": {"name": shown.robot, "dim": len(joints), "joint_names": _renamed_joints(shown, joints)},
         "streams": {},
         "cameras": {},
         "capture_streams": [],
     }
 
 
-def _called(shown: Played, joints: list[str]) -> list[str]:
+def _renamed_joints(shown: PlayedEpisode, joints: list[str]) -> list[str]:
     """The joints as the robot calls them, where a person says that they are that robot's; NotFound for too many."""
-    if not shown.assumed:
+    if not shown.robot_is_assumed:
         return joints
-    known = list(looks_of(shown.robot).robot.joint_names)
+    known = list(drawn_robot(shown.robot).robot.joint_names)
     if len(known) != len(joints):
         raise NotFound(
             _EPISODE_HAS_JOINTS_HAS_CHOOSE(count=len(joints), robot=shown.robot, count_2=len(known))
@@ -256,7 +258,13 @@ def _called(shown: Played, joints: list[str]) -> list[str]:
 
 
 def _episode(
-    shown: Played, form: Layout, manifest: Mapping[str, Any], rows: Any, ticks: Any, smoothed: Any, raw: Any
+    shown: PlayedEpisode,
+    form: Layout,
+    manifest: Mapping[str, Any],
+    rows: Any,
+    ticks: Any,
+    smoothed: Any,
+    raw: Any,
 ) -> Episode:
     return Episode(
         path=shown.dataset.root,
@@ -276,7 +284,7 @@ def _episode(
 # --- the three action streams --------------------------------------------------------------------------------
 
 
-def _with_streams(shown: Played, path: Path, rows: Any) -> Episode:
+def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
     """With what the policy meant, what was planned and what was sent, from the side file."""
     try:
         table = pq.read_table(path)
@@ -321,13 +329,13 @@ def _renamed(table: Any, new: Mapping[str, str], same: tuple[str, ...], numbers:
     return pa.table(columns | {name: table[name].fill_null(-1) for name in numbers})
 
 
-def annotations(shown: Played) -> list[dict[str, Any]]:
+def annotations(shown: PlayedEpisode) -> list[dict[str, Any]]:
     """The segments that travel with the episode; RecordingError where their file is damaged."""
-    path = shown.beside().get("annotations")
+    path = shown.sidecars().get("annotations")
     return [] if path is None else layout.read_lines(path)
 
 
-def reviews(shown: Played) -> list[dict[str, Any]]:
+def reviews(shown: PlayedEpisode) -> list[dict[str, Any]]:
     """The verdicts that travel with the episode, oldest first; RecordingError where their file is damaged."""
-    path = shown.beside().get("reviews")
+    path = shown.sidecars().get("reviews")
     return [] if path is None else layout.read_lines(path)

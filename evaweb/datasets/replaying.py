@@ -12,21 +12,21 @@ from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
 import robots
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.datasets import playing
-from evaweb.datasets.on_robot import AFTER_S, SPACES, offer, recorded_at
+from evaweb.datasets.on_robot import SPACES, TAIL_S, make_offer, playable_episode
 from evaweb.datasets.orders import full_name
-from evaweb.datasets.playing import Played, as_recording
-from evaweb.datasets.sources import dataset_config, episode_of, shown
-from evaweb.datasets.stills import still
-from evaweb.episodes.curves import curves_of
+from evaweb.datasets.playing import PlayedEpisode, as_recording
+from evaweb.datasets.sources import dataset_config, open_dataset_episode, resolve_entry
+from evaweb.datasets.stills import still_image
+from evaweb.episodes.curves import curve_streams
 from evaweb.episodes.models import Episode
-from evaweb.episodes.poses import poses_of
-from evaweb.episodes.robot import looks_in
+from evaweb.episodes.poses import pose_streams
+from evaweb.episodes.robot import drawn_robot_for
 from evaweb.episodes.streaming import file_answer
 from evaweb.episodes.views import player
 from evaweb.errors import Conflict, EvaError, NotFound
-from evaweb.stations.geometry import geometry
+from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
@@ -81,7 +81,7 @@ def side_by_side(request: HttpRequest) -> HttpResponse:
     found, problems = [], []
     for name in names:
         try:
-            found.append(shown(request, name))
+            found.append(resolve_entry(request, name))
         except EvaError as error:
             problems.append(str(error))
     config = player() | {"episodes": [{"name": one.name, "title": one.title, **one.config} for one in found]}
@@ -92,16 +92,16 @@ def side_by_side(request: HttpRequest) -> HttpResponse:
 @require_GET
 def on_robot(request: HttpRequest) -> HttpResponse:
     """Which stations can play an episode, and what they would send."""
-    recorded = recorded_at(request.GET.get("show", ""), request.GET.get("robot", ""))
+    recorded = playable_episode(request.GET.get("show", ""), request.GET.get("robot", ""))
     space = request.GET.get("space", "joint")
-    offers = [offer(recorded, station, space) for station in Station.objects.filter(active=True)]
+    offers = [make_offer(recorded, station, space) for station in Station.objects.filter(active=True)]
     context = {
         "recorded": recorded,
         "offers": sorted(offers, key=lambda one: (bool(one.differences), one.station.name)),
         "space": space,
         "spaces": SPACES,
         "robot": request.GET.get("robot", ""),
-        "after_s": AFTER_S,
+        "after_s": TAIL_S,
     }
     return render(request, "datasets/on_robot.html", context)
 
@@ -126,7 +126,7 @@ def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpRes
     row = _number(request, "row")
     if row >= episode.frames:
         raise NotFound(_ROW_EPISODE_HAS_ROWS_0(row=row, frames=episode.frames - 1))
-    content, kind = _readable(lambda: still(episode, camera, row))
+    content, kind = _or_conflict(lambda: still_image(episode, camera, row))
     return HttpResponse(content, content_type=kind)
 
 
@@ -135,17 +135,17 @@ def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
     """Joint curves, and the action streams where they lie beside it, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     recording = _recording(episode)
-    covered = recording is not None and sight_for(request).hides_episode(recording)
-    return _message(lambda: curves_of(as_recording(episode), covered=covered))
+    covered = recording is not None and visibility_for_request(request).hides_episode(recording)
+    return _binary_response(lambda: curve_streams(as_recording(episode), covered=covered))
 
 
 @require_GET
-def shapes(request: HttpRequest, name: str, index: int) -> HttpResponse:
+def geometry_json(request: HttpRequest, name: str, index: int) -> HttpResponse:
     """Geometry of the robot for the 3D scene, as JSON."""
     episode = _episode(request, name, index)
-    found = _readable(lambda: as_recording(episode))
-    robot = looks_in(found.manifest).robot
-    return JsonResponse(geometry(robot.name, [group.name for group in robot.groups], simulated=False))
+    found = _or_conflict(lambda: as_recording(episode))
+    robot = drawn_robot_for(found.manifest).robot
+    return JsonResponse(scene_geometry(robot.name, [group.name for group in robot.groups], simulated=False))
 
 
 @require_GET
@@ -153,22 +153,24 @@ def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
     """Poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     first = _number(request, "first")
-    return _message(lambda: poses_of(as_recording(episode), first))
+    return _binary_response(lambda: pose_streams(as_recording(episode), first))
 
 
 @require_GET
 def segments(request: HttpRequest, name: str, index: int) -> HttpResponse:
     """The annotations and verdicts that travel with the episode, as JSON."""
     episode = _episode(request, name, index)
-    said = _readable(lambda: {"segments": playing.annotations(episode), "reviews": playing.reviews(episode)})
+    said = _or_conflict(
+        lambda: {"segments": playing.annotations(episode), "reviews": playing.reviews(episode)}
+    )
     return JsonResponse(said)
 
 
-def _episode(request: HttpRequest, name: str, index: int) -> Played:
-    return episode_of(full_name(name), index, request.GET.get("robot", ""))
+def _episode(request: HttpRequest, name: str, index: int) -> PlayedEpisode:
+    return open_dataset_episode(full_name(name), index, request.GET.get("robot", ""))
 
 
-def _recording(episode: Played) -> Episode | None:
+def _recording(episode: PlayedEpisode) -> Episode | None:
     """The lab's own recording of it, where the database knows it."""
     if not episode.uuid:
         return None
@@ -182,12 +184,12 @@ def _number(request: HttpRequest, name: str) -> int:
     return int(given)
 
 
-def _readable(make: Callable[[], Result]) -> Result:
+def _or_conflict(make: Callable[[], Result]) -> Result:
     try:
         return make()
     except RecordingError as error:
         raise Conflict(str(error)) from None
 
 
-def _message(make: Callable[[], bytes]) -> HttpResponse:
-    return HttpResponse(_readable(make), content_type="application/octet-stream")
+def _binary_response(make: Callable[[], bytes]) -> HttpResponse:
+    return HttpResponse(_or_conflict(make), content_type="application/octet-stream")

@@ -10,11 +10,11 @@ from uuid import UUID
 from django.urls import reverse
 
 import robots
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.datasets.orders import full_name
-from evaweb.datasets.playing import Played, played
+from evaweb.datasets.playing import PlayedEpisode, load_played_episode
 from evaweb.episodes.models import Episode
-from evaweb.episodes.selectors import episode_get, stage_of
+from evaweb.episodes.selectors import episode_get, playback_stage
 from evaweb.episodes.views import replay_config
 from evaweb.errors import Conflict, NotFound
 from runtime.core.sentences import Pattern
@@ -31,7 +31,7 @@ _NO_EPISODE_ALLOWED_UUID_RECORDING = Pattern(
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class ReplayEntry:
     """One of the episodes of a page: `name` as in addresses, what the page's modules have to know in `config`."""
 
     name: str
@@ -42,7 +42,7 @@ class Shown:
     config: dict[str, Any]
 
 
-def shown(request: Any, name: str) -> Shown:
+def resolve_entry(request: Any, name: str) -> ReplayEntry:
     """Episode of that name; NotFound, Conflict where it cannot be played."""
     try:
         uuid = UUID(name)
@@ -51,13 +51,13 @@ def shown(request: Any, name: str) -> Shown:
     return _recording(request, episode_get(uuid=uuid))
 
 
-def _recording(request: Any, episode: Episode) -> Shown:
-    stage = stage_of(episode=episode)
+def _recording(request: Any, episode: Episode) -> ReplayEntry:
+    stage = playback_stage(episode=episode)
     if stage.name != "ready":
         raise Conflict(_EPISODE_CANNOT_PLAYED_YET(uuid=episode.uuid, sentence=stage.sentence))
-    made_by = sight_for(request).policy_of(episode)
+    made_by = visibility_for_request(request).policy_of(episode)
     started = f"{episode.started_at:%Y-%m-%d %H:%M:%S}" if episode.started_at else "time unknown"
-    return Shown(
+    return ReplayEntry(
         name=str(episode.uuid),
         title=episode.task or "Episode without a task",
         detail=" · ".join(filter(None, (started, str(episode.station), made_by))),
@@ -67,12 +67,12 @@ def _recording(request: Any, episode: Episode) -> Shown:
     )
 
 
-def _of_dataset(name: str) -> Shown:
+def _of_dataset(name: str) -> ReplayEntry:
     dataset, colon, index = name.rpartition(":")
     if not (colon and index.isascii() and index.isdecimal() and len(index) < 10):
         raise NotFound(_NO_EPISODE_ALLOWED_UUID_RECORDING(name=name))
-    episode = episode_of(full_name(dataset), int(index))
-    return Shown(
+    episode = open_dataset_episode(full_name(dataset), int(index))
+    return ReplayEntry(
         name=f"{episode.name}:{episode.index}",
         title=episode.task or "Episode without a task",
         detail=f"{episode.name.removeprefix('datasets/')}, episode {episode.index}",
@@ -82,21 +82,21 @@ def _of_dataset(name: str) -> Shown:
     )
 
 
-def episode_of(name: str, index: int, robot: str = "") -> Played:
+def open_dataset_episode(name: str, index: int, robot: str = "") -> PlayedEpisode:
     """As `played`; Conflict where the dataset cannot be read."""
     try:
-        return played(name, index, robot)
+        return load_played_episode(name, index, robot)
     except RecordingError as error:
         raise Conflict(str(error)) from None
 
 
-def dataset_address(route: str, episode: Played, *more: Any) -> str:
+def dataset_address(route: str, episode: PlayedEpisode, *more: Any) -> str:
     """The address of something of an episode of a dataset; whose robot's numbers are meant goes along."""
     path = reverse(route, args=[episode.name, episode.index, *more])
-    return f"{path}?{urlencode({'robot': episode.robot})}" if episode.assumed else path
+    return f"{path}?{urlencode({'robot': episode.robot})}" if episode.robot_is_assumed else path
 
 
-def dataset_config(episode: Played) -> dict[str, Any]:
+def dataset_config(episode: PlayedEpisode) -> dict[str, Any]:
     """Settings of the page's modules, as evaweb.episodes.views has them for a recording."""
     known = episode.robot in robots.robot_names()
     videos = []

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import simplejpeg
 from PIL import Image
 
-from evaweb.datasets.playing import Played
+from evaweb.datasets.playing import PlayedEpisode
 from evaweb.errors import NotFound
 from runtime.core.picture_bounds import DAMAGED, TooLargeError, require_scans, require_size
 from runtime.core.sentences import Pattern
@@ -24,7 +24,7 @@ QUALITY = 85
 _SHOWN = {"JPEG": "image/jpeg", "PNG": "image/png"}  # as they are coded
 
 
-def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
+def still_image(episode: PlayedEpisode, camera: str, row: int) -> tuple[bytes, str]:
     """Picture `row` of a camera and its type; coded again only where no browser shows it. RecordingError, NotFound."""
     if episode.video(camera) is not None:
         raise NotFound(_PICTURES_VIDEO(camera=camera))
@@ -46,7 +46,7 @@ def still(episode: Played, camera: str, row: int) -> tuple[bytes, str]:
     return jpeg, "image/jpeg"
 
 
-def _stored(episode: Played, key: str, row: int) -> bytes:
+def _stored(episode: PlayedEpisode, key: str, row: int) -> bytes:
     """Picture in one row of the column, without reading those of other episodes into Python."""
     path = episode.entry.data
     try:
@@ -67,7 +67,7 @@ def _stored(episode: Played, key: str, row: int) -> bytes:
     return _file(episode, key, str(stored["path"]))
 
 
-def _file(episode: Played, key: str, name: str) -> bytes:
+def _file(episode: PlayedEpisode, key: str, name: str) -> bytes:
     root = episode.dataset.root.resolve()
     path = (root / name).resolve()
     if not path.is_relative_to(root):

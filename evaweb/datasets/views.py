@@ -48,7 +48,7 @@ def dataset_list(request: HttpRequest) -> HttpResponseBase:
     if shown.wants_file:
         return shown.file(request, "datasets", fits)
     page = Paginator(fits, PER_PAGE).get_page(shown.number)
-    rows = [(one, None if one.problem else dataset_jobs.checked(one.name)) for one in page]
+    rows = [(one, None if one.problem else dataset_jobs.latest_check(one.name)) for one in page]
     context = {"listing": shown, "page": page, "rows": rows, "name": "", **_work(""), **_rights(request)}
     return render(request, "datasets/list.html", context)
 
@@ -59,11 +59,11 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
     name = orders.full_name(name)
     shown = Listing(request.GET, listed.EPISODE_COLUMNS, listed.EPISODE_FILTERS)
     found = overview(name)
-    rows: list[listing.Row] = []
+    rows: list[listing.DatasetRow] = []
     problem = found.problem
     if not problem:
         try:
-            rows = shown.sorted(listing.rows(name, **shown.chosen))
+            rows = shown.sorted(listing.list_rows(name, **shown.chosen))
         except RecordingError as error:
             problem = str(error)
     if shown.wants_file and not problem:
@@ -71,7 +71,7 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
     context = {
         "dataset": found,
         "problem": problem,
-        "checked": None if problem else dataset_jobs.checked(name),
+        "checked": None if problem else dataset_jobs.latest_check(name),
         "page": Paginator(rows, PER_PAGE).get_page(shown.number),
         "listing": shown,
         "robots": robots.robot_names(),
@@ -106,11 +106,11 @@ def dataset_work(request: HttpRequest) -> HttpResponse:
 def dataset_ask(request: HttpRequest) -> HttpResponse:
     """Have something done, as the forms of the pages say it."""
     try:
-        job = orders.asked(user=request.user, given=_order(request.POST))
+        job = orders.submit_order(user=request.user, given=_order(request.POST))
     except EvaError as error:
         messages.error(request, str(error))
     else:
-        messages.success(request, f"{dataset_jobs.told(job).title}: asked for")
+        messages.success(request, f"{dataset_jobs.summarize_job(job).title}: asked for")
     name = request.POST.get("dataset", "")
     return redirect("dataset", name=name) if name and is_name(name) else redirect("dataset-list")
 
@@ -169,7 +169,7 @@ def _require_confirmed(form: QueryDict) -> None:
 
 def _work(name: str) -> dict[str, Any]:
     jobs = dataset_jobs.jobs_of(name)
-    return {"jobs": jobs, "passing": any(job.passing for job in jobs)}
+    return {"jobs": jobs, "passing": any(job.is_transient for job in jobs)}
 
 
 def _rights(request: HttpRequest) -> dict[str, Any]:

@@ -34,7 +34,7 @@ class EpisodeAdmin(admin.ModelAdmin):
     @admin.action(description="Make the previews anew", permissions=("view",))
     def preview_again(self, request: HttpRequest, episodes: QuerySet) -> None:
         for episode in episodes:
-            services.preview_asked(episode=episode)
+            services.request_preview(episode=episode)
         self.message_user(request, f"{len(episodes)} asked for", messages.SUCCESS)
 
     def has_add_permission(self, request: HttpRequest) -> bool:

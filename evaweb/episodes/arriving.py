@@ -58,7 +58,9 @@ def take_in_arrived() -> int:
             log.warning("episode %s has arrived: %s", uuid, problem)
         episode = Episode.objects.filter(uuid=uuid, away_since=None).first()
         if episode is not None and job_newest(key=f"publish:{uuid}") is not None:
-            services.publish_asked(episode=episode)  # it was asked for when there was nothing to publish yet
+            services.request_publish(
+                episode=episode
+            )  # it was asked for when there was nothing to publish yet
         if uuid in marks:
             marks[uuid].unlink(missing_ok=True)
     return len(here.union(marks))

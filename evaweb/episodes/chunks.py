@@ -15,7 +15,7 @@ Array = NDArray[Any]
 UNKNOWN = -1
 
 
-def chunks(episode: Episode, times_of: Callable[[Array], Array]) -> Stream:
+def chunk_arrays(episode: Episode, times_of: Callable[[Array], Array]) -> Stream:
     """Every chunk of the episode, by its number; `times_of` says when control steps were [s].
 
     Arrays [C]: id i4; observed and arrived f8 [s] (NaN: it never arrived); delay, mistimed and overlap i4

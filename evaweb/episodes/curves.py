@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from evaweb.binary_frames import Stream, encode
 from evaweb.episodes.bench import milestones_reached
-from evaweb.episodes.chunks import chunks
-from evaweb.episodes.robot import looks_in, robot_in
+from evaweb.episodes.chunks import chunk_arrays
+from evaweb.episodes.robot import drawn_robot_for, robot_of_manifest
 from evaweb.errors import NotFound
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.summary import HELD
@@ -27,7 +27,7 @@ _OPEN_MARKS = ("command", "estopped", "released", "truth")
 _JUDGED = ("truth",)  # people score before they hear it
 
 
-def curves(
+def curve_message(
     folder: Path,
     *,
     covered: bool = False,
@@ -47,10 +47,10 @@ def curves(
     `unscored`: without what a simulated bench says of how it went. `milestones` are (time of the run [s], words) as
     they were scored; without any the bench's own are marked.
     """
-    return curves_of(open_episode(folder), covered=covered, unscored=unscored, milestones=milestones)
+    return curve_streams(open_episode(folder), covered=covered, unscored=unscored, milestones=milestones)
 
 
-def curves_of(
+def curve_streams(
     episode: Episode,
     *,
     covered: bool = False,
@@ -60,16 +60,16 @@ def curves_of(
     """The same of an episode that is open already."""
     start = _start(episode)
     if covered:
-        episode = _covered(episode)
-    made, makers = _makers(episode)
+        episode = _redacted(episode)
+    made, makers = _contribution_ranges(episode)
     streams = {
         "ticks": _ticks(episode, start, made),
         "makers": makers,
         "raw": _raw(episode, start),
-        "chunks": chunks(episode, lambda steps: _times_of(episode, steps) - start),
+        "chunks": chunk_arrays(episode, lambda steps: _times_of(episode, steps) - start),
     }
-    names = robot_in(episode.manifest).get("joint_names")
-    held = held_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps)
+    names = robot_of_manifest(episode.manifest).get("joint_names")
+    held = hold_spans(episode.rows.column("control_source").to_pylist(), episode.layout.fps)
     return encode(
         streams,
         joints=names if isinstance(names, list) else [f"joint {k}" for k in range(episode.layout.dim)],
@@ -86,7 +86,7 @@ def curves_of(
     )
 
 
-def _covered(episode: Episode) -> Episode:
+def _redacted(episode: Episode) -> Episode:
     """Without the policy's answers, the plans that were made of them, and what was said of them."""
     events = tuple(
         {**event, "text": str(event.get("text", "")).partition(",")[0]}
@@ -108,7 +108,7 @@ def _covered(episode: Episode) -> Episode:
 def _numbers(episode: Episode) -> dict[str, Any]:
     """The `units` of the joints and which are `grippers`; not known where the robot is another one today."""
     try:
-        looks = looks_in(episode.manifest)
+        looks = drawn_robot_for(episode.manifest)
     except NotFound:
         return {"units": [""] * episode.layout.dim, "grippers": []}
     return {"units": list(looks.units), "grippers": list(looks.robot.gripper_dims)}
@@ -131,7 +131,7 @@ def vectors(table: Any, name: str, width: int) -> Array:
     return np.ascontiguousarray(values.T)
 
 
-def _asked(episode: Episode) -> tuple[Array, Array]:
+def _requested_rows(episode: Episode) -> tuple[Array, Array]:
     """Of the rows of the smoothed stream: the tick of each, and whether that was recorded."""
     steps = episode.ticks.column("step").to_numpy()
     asked = episode.smoothed.column("step").to_numpy()
@@ -141,9 +141,9 @@ def _asked(episode: Episode) -> tuple[Array, Array]:
     return places, known
 
 
-def _makers(episode: Episode) -> tuple[Array, Stream]:
+def _contribution_ranges(episode: Episode) -> tuple[Array, Stream]:
     """Places where the makers of each tick begin and end (int32 [M + 1]), and all makers, tick by tick."""
-    places, known = _asked(episode)
+    places, known = _requested_rows(episode)
     table = episode.smoothed.filter(known)
     chunk_ids, weights = (table.column(name).combine_chunks() for name in ("chunk_ids", "weights"))
     counts = np.zeros(episode.ticks.num_rows, np.int64)
@@ -158,7 +158,7 @@ def _makers(episode: Episode) -> tuple[Array, Stream]:
 def _ticks(episode: Episode, start: float, made: Array) -> Stream:
     ticks, dim = episode.ticks, episode.layout.dim
     smoothed = np.full((dim, ticks.num_rows), np.nan, np.float32)
-    places, known = _asked(episode)
+    places, known = _requested_rows(episode)
     smoothed[:, places[known]] = vectors(episode.smoothed, "smoothed", dim)[:, known]
     changed = np.asarray([bool(changes) for changes in ticks.column("changes").to_pylist()], np.uint8)
     refused = ticks.column("refused").to_numpy(zero_copy_only=False).astype(np.uint8)
@@ -213,7 +213,7 @@ def _period(episode: Episode) -> float:
     return 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0 / episode.layout.fps
 
 
-def held_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
+def hold_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
     """Spans [s] in which the robot was not asked for anything."""
     return _spans([source in HELD for source in sources], fps)
 

@@ -20,7 +20,7 @@ from runtime.recording.files import RecordingError
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Membership:
     """Place of an episode in one dataset, and what that says of it."""
 
     dataset: str  # relative to the data folder
@@ -30,13 +30,13 @@ class Place:
     at: datetime
 
 
-def places_read() -> list[str]:
+def sync_memberships() -> list[str]:
     """Make the rows say in which dataset their episodes are, and in none where they are in none any more.
 
     Of several the one counts that it was published into, not a copy of that; then the one that knows its success, the
     one that counted before. What cannot be read is returned as sentences, and rows that are there stay as they are.
     """
-    places: dict[UUID, list[Place]] = defaultdict(list)
+    places: dict[UUID, list[Membership]] = defaultdict(list)
     problems, unread = [], set()
     for folder in _datasets():
         try:
@@ -47,7 +47,7 @@ def places_read() -> list[str]:
             unread.add(_name(folder))
     rows = Episode.objects.values_list("uuid", "dataset", "dataset_index")
     for uuid, dataset, index in rows.iterator():
-        home = home_of(places.get(uuid, ()), dataset)
+        home = primary_membership(places.get(uuid, ()), dataset)
         if home is None:
             if index is not None and dataset not in unread:
                 Episode.objects.filter(uuid=uuid).update(dataset="", dataset_index=None, published_at=None)
@@ -62,7 +62,7 @@ def places_read() -> list[str]:
     return problems
 
 
-def home_of(places: Sequence[Place], before: str) -> Place | None:
+def primary_membership(places: Sequence[Membership], before: str) -> Membership | None:
     """The place that counts; `before` is the dataset that counted until now."""
     return min(
         places,
@@ -87,7 +87,7 @@ def _name(folder: Path) -> str:
     return str(folder.relative_to(data_dir()))
 
 
-def _places(folder: Path) -> list[tuple[UUID, Place]]:
+def _places(folder: Path) -> list[tuple[UUID, Membership]]:
     """The episodes of ours in a dataset; those of others have no uuid, and no row."""
     told = folder / EVA_EPISODES
     if not (folder / INFO).exists():
@@ -100,7 +100,7 @@ def _places(folder: Path) -> list[tuple[UUID, Place]]:
     found = []
     for line in lines:
         success = line.get("success")
-        place = Place(
+        place = Membership(
             dataset=_name(folder),
             index=int(str(line["episode_index"])),
             copied=COPIED_FROM in line,
@@ -116,4 +116,4 @@ def _publish_outdated(uuid: UUID, success: bool | None) -> None:
     newest = success_of(scores_file(uuid))
     if newest is not None and newest != success and journal_folder(uuid).is_dir():
         for episode in Episode.objects.filter(uuid=uuid):
-            services.publish_asked(episode=episode)
+            services.request_publish(episode=episode)

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from uuid import UUID
 
-SideGiver = Callable[[UUID, Path], Mapping[str, Path]]
+SidecarWriter = Callable[[UUID, Path], Mapping[str, Path]]
 
-_givers: list[SideGiver] = []
+_givers: list[SidecarWriter] = []
 
 
-def gives_sides(function: SideGiver) -> SideGiver:
+def register_sidecar_writer(function: SidecarWriter) -> SidecarWriter:
     """Declare what goes beside a published episode, by kind of side file: an app above this one, from its `ready`.
 
     It is given the episode and a folder of its own, and writes JSON Lines there.
@@ -21,6 +21,6 @@ def gives_sides(function: SideGiver) -> SideGiver:
     return function
 
 
-def sides_of(uuid: UUID, folder: Path) -> dict[str, Path]:
+def write_sidecars(uuid: UUID, folder: Path) -> dict[str, Path]:
     """Side files of the episode, written into `folder`."""
     return {kind: path for give in _givers for kind, path in give(uuid, folder).items()}

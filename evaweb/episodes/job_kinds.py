@@ -13,16 +13,16 @@ from django.utils import timezone
 
 from evaweb.episodes import services, verifying
 from evaweb.episodes.arriving import take_in_arrived, whereabouts
-from evaweb.episodes.dataset_sidecars import sides_of
+from evaweb.episodes.dataset_sidecars import write_sidecars
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
-from evaweb.episodes.manifest import recorded_in
+from evaweb.episodes.manifest import read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.preview import make_preview
 from evaweb.episodes.publishing import dataset_name, success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.smoothness import Smoothness, smoothness_in
 from evaweb.episodes.videos import put_videos, unstored
-from evaweb.jobs.kinds import Work, at_start, chore, job_kind
+from evaweb.jobs.kinds import JobContext, job_kind, periodic_task, startup_task
 from evaweb.jobs.services import enqueue
 from evaweb.object_stores import the_store
 from runtime.datasets.published import never_published, publish
@@ -36,10 +36,10 @@ _AT_ONCE = 20  # asked for in one look
 
 
 @job_kind("preview")
-def preview(work: Work) -> Mapping[str, Any]:
+def preview(work: JobContext) -> Mapping[str, Any]:
     """Make the episode playable; args: uuid."""
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
-    frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.tell)
+    frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.report_progress)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
     if the_store() is not None:
         services.storing_asked(uuid=episode.uuid)
@@ -47,12 +47,12 @@ def preview(work: Work) -> Mapping[str, Any]:
 
 
 @job_kind("store")
-def store_videos(work: Work) -> Mapping[str, Any]:
+def store_videos(work: JobContext) -> Mapping[str, Any]:
     """Put the videos of a preview into the lab's store, where they are played from then on; args: uuid."""
     return {"videos": put_videos(UUID(work.args["uuid"]))}
 
 
-@at_start("videos to be stored")
+@startup_task("videos to be stored")
 def store_at_start() -> None:
     """Those that were made when there was no store, or when it was away."""
     for uuid in unstored():
@@ -60,14 +60,14 @@ def store_at_start() -> None:
 
 
 @job_kind("export")
-def export_episode(work: Work) -> Mapping[str, Any]:
+def export_episode(work: JobContext) -> Mapping[str, Any]:
     """Write its three streams as one parquet table, unless the station has done so; args: uuid."""
     path = write_export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
 
 
 @job_kind("smoothness")
-def measure_smoothness(work: Work) -> Mapping[str, Any]:
+def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
     """Measure how smoothly the robot moved, or keep why that is not known; args: uuid."""
     uuid = UUID(work.args["uuid"])
     try:
@@ -84,7 +84,7 @@ def measure_smoothness(work: Work) -> Mapping[str, Any]:
 
 
 @job_kind("publish")
-def publish_episode(work: Work) -> Mapping[str, Any]:
+def publish_episode(work: JobContext) -> Mapping[str, Any]:
     """Write the episode into its dataset with the success of its newest score; args: uuid, and a new one's version.
 
     An interrupted one goes there only where it was scored, one that was discarded never.
@@ -99,16 +99,16 @@ def publish_episode(work: Work) -> Mapping[str, Any]:
     try:
         return _published(work, episode, folder)
     except RecordingError:
-        verdict = verifying.known_better(episode, verify_episode(folder))
+        verdict = verifying.compare_with_row(episode, verify_episode(folder))
         if verdict.state != "damaged":
             raise
-        verifying.found(verdict)
+        verifying.record_verification(verdict)
         return {"published": False, "why": str(DamagedError(verdict))}
 
 
-def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
-    recorded = recorded_in(folder)
-    if recorded.closed and (changed := services.another_than(episode, recorded.facts["seal"])):
+def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str, Any]:
+    recorded = read_recorded_episode(folder)
+    if recorded.closed and (changed := services.outcome_change(episode, recorded.facts["seal"])):
         raise RecordingError(f"{folder}: outcome.json {changed}")
     if recorded.closed and not recorded.facts["frames"]:
         return {"published": False, "why": "it has no rows: its run ended before the first"}
@@ -123,7 +123,7 @@ def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
         return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}
     simulated = recorded.simulated or episode.station.simulated
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
-    work.tell(f"into {name}")
+    work.report_progress(f"into {name}")
     dataset_folder = datasets_dir() / name
     work.hold([dataset_folder.relative_to(data_dir()).as_posix()])
     with TemporaryDirectory() as beside:
@@ -133,7 +133,7 @@ def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
             success=success,
             include_interrupted=success is not None,
             version=work.args.get("version"),
-            sides=sides_of(episode.uuid, Path(beside)),
+            sides=write_sidecars(episode.uuid, Path(beside)),
         )
     dataset = str(placed.dataset.relative_to(data_dir()))
     Episode.objects.filter(uuid=episode.uuid).update(
@@ -151,13 +151,13 @@ def _published(work: Work, episode: Episode, folder: Path) -> Mapping[str, Any]:
 
 
 @job_kind("scrub")
-def scrub(work: Work) -> Mapping[str, Any]:
+def scrub(work: JobContext) -> Mapping[str, Any]:
     """Verify recordings against their digests, those that were not looked at for longest."""
-    return verifying.scrubbed(work)
+    return verifying.scrub_due(work)
 
 
 @job_kind("reconcile")
-def reconcile_all(work: Work) -> Mapping[str, Any]:
+def reconcile_all(work: JobContext) -> Mapping[str, Any]:
     """Read the data folder into the database."""
     report = reconcile()
     return {
@@ -170,31 +170,31 @@ def reconcile_all(work: Work) -> Mapping[str, Any]:
     }
 
 
-@at_start("reconcile")
+@startup_task("reconcile")
 def reconcile_at_start() -> None:
     """Reconcile with what happened on the disk while no worker was there."""
     enqueue(kind="reconcile", key="reconcile", args={})
 
 
-@chore("closed recordings")
-def look_for_closed() -> int:
+@periodic_task("closed recordings")
+def find_closed_episodes() -> int:
     """Episodes that a station has repaired, or closed while the web was away."""
-    return services.catch_up()
+    return services.close_unheard_episodes()
 
 
-@chore("arrived recordings")
+@periodic_task("arrived recordings")
 def look_for_arrived() -> int:
     """Episodes of stations on other computers that have come here."""
     return take_in_arrived()
 
 
-@chore("recordings to be verified")
-def look_for_unverified() -> bool:
+@periodic_task("recordings to be verified")
+def find_unverified_episodes() -> bool:
     """Recordings not verified for long, while the worker has nothing else to do."""
-    return verifying.scrub_asked() is not None
+    return verifying.request_scrub() is not None
 
 
-@chore("runs to be measured")
-def look_for_unmeasured() -> int:
+@periodic_task("runs to be measured")
+def find_unmeasured_episodes() -> int:
     """Runs that were closed, here or elsewhere, since the last look."""
-    return services.smoothness_asked(most=_AT_ONCE)
+    return services.request_smoothness(most=_AT_ONCE)

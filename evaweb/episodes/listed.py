@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.selectors import QUALITY, REVIEW, tag_counts
 from evaweb.lists import SEARCH, Column, Filter
 from evaweb.stations.models import Station
 
 
-def filters(sight: Sight) -> list[Filter]:
+def filters(sight: Visibility) -> list[Filter]:
     """What it is narrowed by; none is about a checkpoint, whose names are looked for by words."""
     stations = [(station.name, str(station)) for station in Station.objects.all()]
     return [
@@ -25,9 +25,9 @@ def filters(sight: Sight) -> list[Filter]:
     ]
 
 
-def columns(sight: Sight) -> list[Column]:
+def columns(sight: Visibility) -> list[Column]:
     """By checkpoint it is sorted only where none is hidden: the order of codes would tell which are of one."""
-    checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.clear else ()
+    checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.sees_everything else ()
     return [
         Column("picture", "Picture", quiet=True),
         Column("recorded", "Recorded", ("started_at",), lambda row: row.started_at, down=True),

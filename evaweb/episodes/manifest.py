@@ -18,7 +18,7 @@ CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILE
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class RecordedEpisode:
     """One folder; `facts` are fields of models.Episode, without those that the folder does not know."""
 
     uuid: str
@@ -35,7 +35,7 @@ class Recorded:
         return self.facts["status"] in CLOSED
 
 
-def recorded_in(folder: Path) -> Recorded:
+def read_recorded_episode(folder: Path) -> RecordedEpisode:
     """Read it; RecordingError names the file that is absent, damaged, or says what cannot be."""
     manifest = read_json(folder / "manifest.json")
     layout = Layout.from_manifest(manifest)
@@ -60,7 +60,7 @@ def recorded_in(folder: Path) -> Recorded:
     if path.exists():
         require_intact(folder, (MANIFEST,))
     outcome = read_outcome(folder) if path.exists() else {}
-    return Recorded(
+    return RecordedEpisode(
         uuid=layout.uuid,
         station=_text(manifest, "station", 63),
         simulated=simulated(manifest),

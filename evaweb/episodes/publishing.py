@@ -6,8 +6,8 @@ import json
 import re
 from pathlib import Path
 
-from evaweb.episodes.manifest import Recorded
-from evaweb.journal import numbered
+from evaweb.episodes.manifest import RecordedEpisode
+from evaweb.journal import read_numbered_lines
 from runtime.recording.files import RecordingError
 
 DATASET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
@@ -17,7 +17,7 @@ _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 def success_of(path: Path) -> bool | None:
     """Success by the newest score; None without a score. To void a trial changes no score."""
     success = None
-    for _, line in numbered(path):
+    for _, line in read_numbered_lines(path):
         try:
             said = json.loads(line)
         except (ValueError, RecursionError):  # it never counted
@@ -29,7 +29,7 @@ def success_of(path: Path) -> bool | None:
     return success
 
 
-def dataset_name(recorded: Recorded, *, scored: bool, simulated: bool) -> str:
+def dataset_name(recorded: RecordedEpisode, *, scored: bool, simulated: bool) -> str:
     """Rollouts and demonstrations, real and simulated, scored and unscored ones are kept apart, robot by robot.
 
     What was collected in a session goes where that says. RecordingError where a name cannot name a folder.

@@ -12,7 +12,7 @@ from uuid import UUID
 from django.db import DataError, IntegrityError
 
 from evaweb.episodes import services
-from evaweb.episodes.dataset_membership import places_read
+from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir, episodes_dir
 from evaweb.episodes.models import Episode
 from evaweb.errors import EvaError
@@ -29,7 +29,7 @@ _OF_ONE_RUN = (
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class RestorableRun:
     """Data on the disk of one run: its folder, if `recorded`, and the `lines` of its scores file that say something.
 
     `uuid` is the episode's; of a run that was not recorded, whatever the writers of its lines named it by. `say` takes
@@ -39,15 +39,15 @@ class Kept:
     uuid: UUID
     recorded: bool
     lines: Sequence[Any]
-    say: Callable[[str], None] = field(default=log.warning, compare=False)
+    report_problem: Callable[[str], None] = field(default=log.warning, compare=False)
 
 
-Restorer = Callable[[Kept], int]
+Restorer = Callable[[RestorableRun], int]
 
 _restorers: list[Restorer] = []
 
 
-def restores(function: Restorer) -> Restorer:
+def register_restorer(function: Restorer) -> Restorer:
     """Declare the reader of scores and the `trial` of a manifest: an app above this one, from its `ready`.
 
     It is given every run once, after the readers before it were, makes the rows that are not there, and returns how
@@ -63,7 +63,7 @@ Conclusion = Callable[[], Iterable[str]]
 _conclusions: list[Conclusion] = []
 
 
-def concludes(function: Conclusion) -> Conclusion:
+def register_conclusion(function: Conclusion) -> Conclusion:
     """Declare what says, once all runs were read, what a person should look at: an app above this one."""
     if function not in _conclusions:
         _conclusions.append(function)
@@ -88,14 +88,14 @@ def reconcile() -> Report:
     found, problems = _folders()
     read = []
     for uuid in found:
-        problem = services.problem_of(uuid)
+        problem = services.sync_problem(uuid)
         if problem:
             problems.append(problem)
         else:
             read.append(uuid)
-    services.exports_asked(uuids=read)
-    missing = services.missing_marked()
-    problems += places_read()
+    services.request_exports(uuids=read)
+    missing = services.mark_missing()
+    problems += sync_memberships()
     restored = _restored(read, problems)
     problems += [sentence for conclude in _conclusions for sentence in conclude()]
     for problem in problems:
@@ -113,9 +113,9 @@ def reconcile() -> Report:
 def taken_in(uuid: UUID | str) -> list[str]:
     """Read one episode that has come to the disk, or what was said of it, into the database; what is wrong with it."""
     uuid, problems = UUID(str(uuid)), list[str]()
-    if problem := services.problem_of(uuid):
+    if problem := services.sync_problem(uuid):
         return [problem]
-    services.exports_asked(uuids=[uuid])
+    services.request_exports(uuids=[uuid])
     _give([uuid], {uuid}, problems)
     return problems
 
@@ -126,10 +126,10 @@ def _folders() -> tuple[list[UUID], list[str]]:
     # Folders with a dot are of what is on its way from other computers, or on its way out.
     named = (path for path in root.iterdir() if not path.name.startswith(".")) if root.is_dir() else ()
     there = (path for path in named if path.is_dir())
-    return sorted(_named(there, "", "no episode", problems)), problems
+    return sorted(_uuids_from_names(there, "", "no episode", problems)), problems
 
 
-def _named(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
+def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
     """What they are named by: a uuid as this program writes it, or it would not be found again."""
     found = set()
     for path in sorted(paths):
@@ -147,7 +147,9 @@ def _named(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[st
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:
     """Give every run to its readers, one reader after the other; what cannot be restored is added to `problems`."""
     files = {
-        folder: _named((data_dir() / folder).glob("*.jsonl"), ".jsonl", f"no file of {folder}", problems)
+        folder: _uuids_from_names(
+            (data_dir() / folder).glob("*.jsonl"), ".jsonl", f"no file of {folder}", problems
+        )
         for folder in folders()
     }
     recorded, scored = set(read), files.get(_SCORES.folder, set())
@@ -161,13 +163,13 @@ def _give(uuids: Iterable[UUID], recorded: Collection[UUID], problems: list[str]
     for uuid in uuids:
         try:
             lines = _SCORES.read(uuid, problems.append)
-            runs.append(Kept(uuid, uuid in recorded, lines, problems.append))
+            runs.append(RestorableRun(uuid, uuid in recorded, lines, problems.append))
         except RecordingError as error:
             problems.append(f"run {uuid}: {error}")
     return sum(_made(restore, kept, problems) for restore in _restorers for kept in runs)
 
 
-def _made(restore: Restorer, kept: Kept, problems: list[str]) -> int:
+def _made(restore: Restorer, kept: RestorableRun, problems: list[str]) -> int:
     try:
         return restore(kept)
     except _OF_ONE_RUN as error:

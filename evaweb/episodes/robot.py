@@ -7,7 +7,7 @@ from typing import Any
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations.robot_geometry import Looks, groups_of, looks_of
+from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot, groups_of
 from runtime.core.sentences import Pattern
 
 _ROBOT_DOES_NOT_EXIST_THERE = Pattern(
@@ -24,28 +24,28 @@ _JOINTS_HAVE_OTHER_NAMES_ANOTHER = Pattern(
 )
 
 
-def robot_in(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
+def robot_of_manifest(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
     """Robot of a manifest; {} where it names none."""
     robot = manifest.get("robot")
     return robot if isinstance(robot, Mapping) else {}
 
 
-def groups_in(manifest: Mapping[str, Any]) -> tuple[str, ...] | None:
+def groups_of_manifest(manifest: Mapping[str, Any]) -> tuple[str, ...] | None:
     """The groups that the recorded joints are in; None where their names were not recorded."""
-    names = robot_in(manifest).get("joint_names")
+    names = robot_of_manifest(manifest).get("joint_names")
     return groups_of(map(str, names)) if isinstance(names, list) and names else None
 
 
-def looks_in(manifest: Mapping[str, Any]) -> Looks:
+def drawn_robot_for(manifest: Mapping[str, Any]) -> DrawnRobot:
     """The robot as it is described today; NotFound where it is not, or has other joints than were recorded."""
-    looks = looks_of(str(robot_in(manifest).get("name", "")), groups_in(manifest))
+    looks = drawn_robot(str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest))
     _require_same(looks.robot, manifest)
     return looks
 
 
-def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
+def robot_for(manifest: Mapping[str, Any]) -> robots.Robot:
     """The same without its looks, where nothing is drawn."""
-    name, groups = str(robot_in(manifest).get("name", "")), groups_in(manifest)
+    name, groups = str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest)
     if name not in robots.robot_names():
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.robot_names())))
     try:
@@ -57,8 +57,8 @@ def described_in(manifest: Mapping[str, Any]) -> robots.Robot:
 
 
 def _require_same(robot: robots.Robot, manifest: Mapping[str, Any]) -> None:
-    recorded = robot_in(manifest)
+    recorded = robot_of_manifest(manifest)
     if robot.dim != recorded.get("dim"):
         raise NotFound(_EPISODE_HAS_JOINTS_HAS_TODAY(get=recorded.get("dim"), name=robot.name, dim=robot.dim))
-    if groups_in(manifest) is not None and list(robot.joint_names) != recorded["joint_names"]:
+    if groups_of_manifest(manifest) is not None and list(robot.joint_names) != recorded["joint_names"]:
         raise NotFound(_JOINTS_HAVE_OTHER_NAMES_ANOTHER(name=robot.name))

@@ -9,7 +9,7 @@ from uuid import UUID
 
 from django.db.models import Count, F, Q, QuerySet
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.episodes.arriving import whereabouts
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED
@@ -58,14 +58,14 @@ REVIEW = {
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class PlaybackStage:
     """Stage of an episode on its way to be played: recording, elsewhere, preparing, ready, failed, empty or missing."""
 
     name: str
     sentence: str = ""
 
     @property
-    def passing(self) -> bool:
+    def is_transient(self) -> bool:
         """True if it changes by itself, so that a page looks again."""
         return self.name in ("recording", "elsewhere", "preparing")
 
@@ -87,7 +87,7 @@ def episode_list(
     review: str = "",
     tag: str = "",
     words: str = "",
-    sight: Sight = EVERYTHING,
+    sight: Visibility = FULL_VISIBILITY,
 ) -> QuerySet[Episode]:
     """The newest first; `words` are looked for in task, checkpoint, operator, scene, code and uuid.
 
@@ -112,7 +112,11 @@ def episode_list(
     for word in words_of(words):
         found = found.filter(
             Q(task__icontains=word)
-            | (Q(checkpoint__icontains=word) & seen if not sight.clear else Q(checkpoint__icontains=word))
+            | (
+                Q(checkpoint__icontains=word) & seen
+                if not sight.sees_everything
+                else Q(checkpoint__icontains=word)
+            )
             | Q(trial__handout__code__iexact=word)
             | Q(operator__icontains=word)
             | Q(trial__scene__title__icontains=word)
@@ -121,24 +125,24 @@ def episode_list(
     return found
 
 
-def tag_counts(*, sight: Sight = EVERYTHING) -> dict[str, int]:
+def tag_counts(*, sight: Visibility = FULL_VISIBILITY) -> dict[str, int]:
     """The lab's tags in the order of the alphabet, and how many episodes have each."""
     seen = ~Q(episode__checkpoint__in=sight.names) & ~Q(episode__trial__checkpoint__in=sight.checkpoints)
     rows = Tag.objects.filter(_by_someone(seen, "by", sight)).order_by("words").values_list("words")
     return {words: n for words, n in rows.annotate(n=Count("pk")) if not sight.named_in(words)}
 
 
-def _by_someone(seen: Q, author: str, sight: Sight) -> Q:
+def _by_someone(seen: Q, author: str, sight: Visibility) -> Q:
     """What somebody said of an episode that is not hidden, or this user of any."""
-    return Q() if sight.clear else seen | Q(**{author: sight.user})
+    return Q() if sight.sees_everything else seen | Q(**{author: sight.user})
 
 
-def stage_of(*, episode: Episode) -> Stage:
+def playback_stage(*, episode: Episode) -> PlaybackStage:
     """Stage of the episode, from its row, the disk and its newest job."""
     if preview_folder(episode.uuid).is_dir() and episode.status != EpisodeStatus.RECORDING:
-        return Stage("ready")
+        return PlaybackStage("ready")
     if episode.status == EpisodeStatus.RECORDING:
-        return Stage(
+        return PlaybackStage(
             "recording",
             episode.reason
             or f"{episode.station} is still writing it. If the station was cut off meanwhile, it completes the "
@@ -146,18 +150,18 @@ def stage_of(*, episode: Episode) -> Stage:
         )
     if episode.status == EpisodeStatus.MISSING or not journal_folder(episode.uuid).is_dir():
         if episode.away_since is not None:
-            return Stage("elsewhere", whereabouts(episode))
-        return Stage(
+            return PlaybackStage("elsewhere", whereabouts(episode))
+        return PlaybackStage(
             "missing",
             "Its folder is not on this machine: it was moved, or recorded elsewhere. Bring it back, then run "
             "manage.py reconcile.",
         )
     if not episode.frames:
-        return Stage("empty", f"Nothing was recorded: {episode.reason or 'it has no rows'}.")
+        return PlaybackStage("empty", f"Nothing was recorded: {episode.reason or 'it has no rows'}.")
     return _preparing(job_newest(key=f"preview:{episode.uuid}"))
 
 
-def unrecorded_because(*, episode: Episode | None) -> str:
+def why_unrecorded(*, episode: Episode | None) -> str:
     """Why there is no evidence that a run ever moved anything, not one recorded row; "" where there is."""
     if episode is None:
         return "nothing of its run was recorded"
@@ -183,21 +187,21 @@ def _rows_written(folder: Path) -> int:
         return 0
 
 
-def _preparing(job: Job | None) -> Stage:
+def _preparing(job: Job | None) -> PlaybackStage:
     if job is None or job.status == JobStatus.DONE:
-        return Stage("failed", "There is no preview yet, and none is being made.")
+        return PlaybackStage("failed", "There is no preview yet, and none is being made.")
     if job.status == JobStatus.FAILED:
-        return Stage("failed", job.error)
+        return PlaybackStage("failed", job.error)
     if job.status == JobStatus.RUNNING:
-        return Stage(
+        return PlaybackStage(
             "preparing", f"The videos are being prepared{': ' if job.progress else ''}{job.progress}."
         )
     if job.error:
-        return Stage("preparing", f"Another attempt follows in a moment: {job.error}")
-    return Stage("preparing", waiting_for(job) or "The videos wait for the worker to prepare them.")
+        return PlaybackStage("preparing", f"Another attempt follows in a moment: {job.error}")
+    return PlaybackStage("preparing", waiting_for(job) or "The videos wait for the worker to prepare them.")
 
 
-def unscored_for(*, episode: Episode, sight: Sight) -> bool:
+def unscored_for(*, episode: Episode, sight: Visibility) -> bool:
     """True if the user is to score the trial in this recording before hearing how it went."""
     return sight.hides_episode(episode) and not getattr(trial_of(episode=episode), "verdict_id", None)
 

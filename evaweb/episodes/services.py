@@ -15,7 +15,7 @@ from django.utils import timezone
 
 from evaweb.episodes.exporting import exported, job_key
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
-from evaweb.episodes.manifest import CLOSED, Recorded, recorded_in
+from evaweb.episodes.manifest import CLOSED, RecordedEpisode, read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
@@ -41,7 +41,7 @@ APPEARS_WITHIN = timedelta(seconds=60)  # the folder of an episode that was anno
 
 
 @transaction.atomic
-def episode_opened(
+def record_opened(
     *,
     station: Station,
     uuid: UUID | str,
@@ -76,7 +76,7 @@ def _require_own(station: Station, uuid: UUID) -> None:
         raise Conflict(_ANOTHERS(uuid=uuid, owner=other.station.name, station=station.name))
 
 
-def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
+def record_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
     """The station says that an episode is on disk: read it there, and ask for its preview.
 
     `data` is that of the runtime's event: uuid, status, reason, rows, error, waits. Where the folder is not on this
@@ -85,7 +85,7 @@ def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
     uuid = _uuid(data.get("uuid"))
     _require_own(station, uuid)
     try:
-        episode = episode_read(uuid=uuid, station=station)
+        episode = sync_episode(uuid=uuid, station=station)
         if data.get("waits") and episode.status == EpisodeStatus.RECORDING:
             episode.reason = f"its end waits for room on the disk: {data.get('reason')}"
             episode.save(update_fields=["reason"])
@@ -108,7 +108,7 @@ def episode_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
 
 
 @transaction.atomic
-def episode_unopened(*, station: Station, uuid: UUID | str) -> None:
+def forget_unopened(*, station: Station, uuid: UUID | str) -> None:
     """Forget an episode that was announced and could not be opened; one that has a folder, or a trial, stays."""
     announced = station.episodes.filter(uuid=_uuid(uuid), status=EpisodeStatus.RECORDING, trial=None)
     if not journal_folder(_uuid(uuid)).exists():
@@ -116,7 +116,7 @@ def episode_unopened(*, station: Station, uuid: UUID | str) -> None:
 
 
 @transaction.atomic
-def episode_missed(*, station: Station, uuid: UUID, **facts: Any) -> Episode:
+def create_missing_episode(*, station: Station, uuid: UUID, **facts: Any) -> Episode:
     """The row of an episode that others still know of, although its folder is gone."""
     episode, _ = Episode.objects.get_or_create(
         uuid=uuid,
@@ -126,15 +126,15 @@ def episode_missed(*, station: Station, uuid: UUID, **facts: Any) -> Episode:
 
 
 @transaction.atomic
-def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
+def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
     """Make the row say what the folder says, and ask for a preview where there is something to play.
 
     RecordingError where the folder is absent or damaged, or is not that of the recording that was closed: then the row
     stays as it is, and is verified next.
     """
-    recorded = recorded_in(journal_folder(uuid))
+    recorded = read_recorded_episode(journal_folder(uuid))
     row = Episode.objects.filter(uuid=uuid, status__in=CLOSED).first()
-    if row is not None and (why := another_than(row, recorded.facts.get("seal"))):
+    if row is not None and (why := outcome_change(row, recorded.facts.get("seal"))):
         Episode.objects.filter(uuid=uuid).update(verified_at=None)
         raise RecordingError(f"{journal_folder(uuid)}: {OUTCOME} {why}")
     facts = dict(recorded.facts) | {
@@ -148,14 +148,14 @@ def episode_read(*, uuid: UUID, station: Station | None = None) -> Episode:
         create_defaults={"station": station or _station_of(recorded), **facts},
     )
     if episode.status in CLOSED and episode.frames and episode.cameras and episode.previewed_at is None:
-        preview_asked(episode=episode)
+        request_preview(episode=episode)
     if episode.smoothness is None and episode.smoothness_detail is not None:
         episode.smoothness_detail = None  # what the folder lacked may be there now
         episode.save(update_fields=["smoothness_detail"])
     return episode
 
 
-def another_than(row: Episode, seal: str | None) -> str:
+def outcome_change(row: Episode, seal: str | None) -> str:
     """Change of the outcome of a closed row, in words that follow its name; "" where it is the same.
 
     `seal` is that of the one that is there now: None where there is none, "" where it has none.
@@ -173,7 +173,7 @@ def trial_changed(*, uuid: UUID) -> None:
     trials._default_manager.filter(episode=uuid).update(changed_at=Now())
 
 
-def preview_asked(*, episode: Episode) -> Job:
+def request_preview(*, episode: Episode) -> Job:
     """Have the worker make what a browser can play."""
     return enqueue(kind="preview", key=f"preview:{episode.uuid}", args={"uuid": str(episode.uuid)})
 
@@ -183,12 +183,12 @@ def storing_asked(*, uuid: UUID) -> Job:
     return enqueue(kind="store", key=f"store:{uuid}", args={"uuid": str(uuid)})
 
 
-def export_asked(*, episode: Episode) -> Job:
+def request_export(*, episode: Episode) -> Job:
     """Have the worker write its three streams as one table; it leaves one alone that is there."""
     return enqueue(kind="export", key=job_key(episode.uuid), args={"uuid": str(episode.uuid)})
 
 
-def smoothness_asked(*, most: int) -> int:
+def request_smoothness(*, most: int) -> int:
     """Have the worker measure closed runs not yet asked for, at most so many; how many."""
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
@@ -202,7 +202,7 @@ def smoothness_asked(*, most: int) -> int:
     return len(found)
 
 
-def publish_asked(*, episode: Episode, version: str = "") -> Job | None:
+def request_publish(*, episode: Episode, version: str = "") -> Job | None:
     """Have the worker write the episode into its dataset, or write it anew with the score that counts now.
 
     `version` is that of a dataset that is new, "" for the usual one. None for a run with a simulated robot, which
@@ -214,16 +214,16 @@ def publish_asked(*, episode: Episode, version: str = "") -> Job | None:
     return enqueue(kind="publish", key=f"publish:{episode.uuid}", args=args)
 
 
-def catch_up() -> int:
+def close_unheard_episodes() -> int:
     """Close rows of recordings that were closed unheard, as repair does; how many."""
     closed = 0
     for uuid in Episode.objects.filter(status=EpisodeStatus.RECORDING).values_list("uuid", flat=True):
         if (journal_folder(uuid) / "outcome.json").exists():
-            closed += not problem_of(uuid)
+            closed += not sync_problem(uuid)
     return closed
 
 
-def missing_marked() -> int:
+def mark_missing() -> int:
     """Say of every row whose folder is gone that it is missing; how many there are now."""
     fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
     known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
@@ -236,7 +236,7 @@ def missing_marked() -> int:
     return Episode.objects.filter(status=EpisodeStatus.MISSING).count()
 
 
-def exports_asked(*, uuids: Iterable[UUID]) -> int:
+def request_exports(*, uuids: Iterable[UUID]) -> int:
     """Have the worker export those that their station has not; how many. A damaged one has no table."""
     asked = 0
     for episode in Episode.objects.filter(uuid__in=list(uuids), status__in=CLOSED):
@@ -246,15 +246,15 @@ def exports_asked(*, uuids: Iterable[UUID]) -> int:
             log.warning("episode %s is not exported: %s", episode.uuid, error)
             continue
         if missing:
-            export_asked(episode=episode)
+            request_export(episode=episode)
             asked += 1
     return asked
 
 
-def problem_of(uuid: UUID) -> str:
+def sync_problem(uuid: UUID) -> str:
     """Read one folder into its row; the sentence that says why that cannot be, "" where it could."""
     try:
-        episode_read(uuid=uuid)
+        sync_episode(uuid=uuid)
     except RecordingError as error:
         open_rows = Episode.objects.filter(uuid=uuid, status=EpisodeStatus.RECORDING)
         if (journal_folder(uuid) / "outcome.json").exists():
@@ -268,9 +268,9 @@ def _previewed_at(uuid: UUID) -> datetime | None:
     return datetime.fromtimestamp(folder.stat().st_mtime, UTC) if folder.is_dir() else None
 
 
-def _station_of(recorded: Recorded) -> Station:
+def _station_of(recorded: RecordedEpisode) -> Station:
     """The station it was recorded at; one that is not known any more is known from it again."""
-    return station_known(
+    return get_or_create_station(
         name=recorded.station or "unknown",
         robot=recorded.facts.get("robot", ""),
         simulated=recorded.simulated,
@@ -279,7 +279,9 @@ def _station_of(recorded: Recorded) -> Station:
     )
 
 
-def station_known(*, name: str, robot: str, simulated: bool, source: str, active: bool = True) -> Station:
+def get_or_create_station(
+    *, name: str, robot: str, simulated: bool, source: str, active: bool = True
+) -> Station:
     """The station of that name; one that is not in the database any more is made from what `source` says."""
     station, made = Station.objects.get_or_create(
         name=name, defaults={"robot": robot, "simulated": simulated, "title": name, "active": active}

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaweb.episodes.curves import vectors
-from evaweb.episodes.robot import described_in
+from evaweb.episodes.robot import robot_for
 from evaweb.errors import NotFound
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.smoothness import CUT_OFF, sparc
@@ -55,7 +55,7 @@ def smoothness_in(folder: Path) -> Smoothness:
 def smoothness_of(episode: Episode) -> Smoothness:
     """The same of an episode that is open already."""
     try:
-        robot = described_in(episode.manifest)
+        robot = robot_for(episode.manifest)
     except NotFound as error:
         return _none(str(error))
     rate = episode.manifest.get("control_rate")
@@ -64,17 +64,17 @@ def smoothness_of(episode: Episode) -> Smoothness:
             f"control_rate = {rate!r}: SPARC looks at up to {CUT_OFF:g} Hz, which takes twice the rate"
         )
     forward = ChainForward(robot)
-    measured = _tracked(_measured(episode), float(rate), forward)
+    measured = _tip_track(_measured(episode), float(rate), forward)
     seen = measured.seen
     if seen is not None and seen < _LEAST_RATE:
         measured = replace(measured, spans=())
     arms: dict[str, dict[str, float | None]] = {arm.name: {} for arm in robot.arms}
     for stream, track in (
         ("measured", measured),
-        ("commanded", _tracked(_commanded(episode, rate), float(rate), forward)),
+        ("commanded", _tip_track(_commanded(episode, rate), float(rate), forward)),
     ):
         for index, arm in enumerate(robot.arms):
-            way = _way(track.spans, index)
+            way = _path_lengths(track.spans, index)
             arms[arm.name] |= {stream: _sparc(way, float(rate)), f"{stream}_m": float(way.sum())}
     moved = {
         name: facts for name, facts in arms.items() if any(facts[stream] is not None for stream in _STREAMS)
@@ -104,7 +104,7 @@ class _Samples:
 
 
 @dataclass(frozen=True, slots=True)
-class _Track:
+class _TipTrack:
     """Positions of all end effectors [steps, arms, 3] at the control rate, one span for each stretch without a pause.
 
     What was not sampled lies on the straight line between what was; `seen`: samples a second, None for none.
@@ -136,7 +136,7 @@ def _asked(table: Any) -> NDArray[np.bool_]:
     return np.array([source not in HELD for source in table.column("control_source").to_pylist()], bool)
 
 
-def _tracked(samples: _Samples, rate: float, forward: ChainForward) -> _Track:
+def _tip_track(samples: _Samples, rate: float, forward: ChainForward) -> _TipTrack:
     known = np.isfinite(samples.joints).all(axis=1) & np.isfinite(samples.times)
     spans, count, duration = [], 0, 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], samples.asked.astype(np.int8), [0]])))
@@ -152,10 +152,10 @@ def _tracked(samples: _Samples, rate: float, forward: ChainForward) -> _Track:
         grid = at[0] + np.arange(int((at[-1] - at[0]) * rate + 1e-6) + 1) / rate
         every = [np.interp(grid, at, places[:, a, x]) for a in range(places.shape[1]) for x in range(3)]
         spans.append(np.stack(every, axis=-1).reshape(len(grid), places.shape[1], 3))
-    return _Track(tuple(spans), count / duration if duration > 0 else None)
+    return _TipTrack(tuple(spans), count / duration if duration > 0 else None)
 
 
-def _way(spans: Sequence[Array], arm: int) -> Array:
+def _path_lengths(spans: Sequence[Array], arm: int) -> Array:
     """Distance that the arm's end effector went in each step [m]; empty where it did not move."""
     if not spans:
         return np.empty(0)

@@ -9,7 +9,7 @@ from evaweb.episodes import views
 urlpatterns = [
     path("replay/", views.replay_list, name="replay-list"),
     path("replay/<uuid:uuid>/", views.replay, name="replay"),
-    path("replay/<uuid:uuid>/stage", views.stage, name="replay-stage"),
+    path("replay/<uuid:uuid>/stage", views.playback_stage, name="replay-stage"),
     path("replay/<uuid:uuid>/preview", views.preview, name="replay-preview"),
     path("episodes/<uuid:uuid>/video/<str:camera>", views.video, name="episode-video"),
     path("episodes/<uuid:uuid>/sheet/<str:camera>", views.sheet, name="episode-sheet"),

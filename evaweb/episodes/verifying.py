@@ -16,8 +16,8 @@ from django.utils import timezone
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode
-from evaweb.episodes.services import another_than
-from evaweb.jobs.kinds import Work
+from evaweb.episodes.services import outcome_change
+from evaweb.jobs.kinds import JobContext
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.recording.files import RecordingError
@@ -34,7 +34,7 @@ LATE_AFTER = timedelta(days=1)
 MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # of one job: whatever is asked for meanwhile waits for its end
 
 
-def scrub_asked() -> Job | None:
+def request_scrub() -> Job | None:
     """Have the worker verify what is due, once it has nothing else to do."""
     at_work = Job.objects.filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING))
     if at_work.exists() or not _due().exists():
@@ -42,16 +42,16 @@ def scrub_asked() -> Job | None:
     return enqueue(kind="scrub", key="scrub", args={})
 
 
-def scrubbed(work: Work) -> Mapping[str, Any]:
+def scrub_due(work: JobContext) -> Mapping[str, Any]:
     """Verify the next that are due, and remember each at once; what was found of how many."""
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
     for uuid in _next():
         if read >= MOST_BYTES:
             break
-        work.tell(f"{sum(counts.values())} verified, {len(damaged)} damaged")
+        work.report_progress(f"{sum(counts.values())} verified, {len(damaged)} damaged")
         try:
-            verdict = found(_looked_at(journal_folder(uuid)))
+            verdict = record_verification(_verify_folder(journal_folder(uuid)))
         except RecordingError as error:
             problems.append(str(error))
             Episode.objects.filter(uuid=uuid).update(verified_at=timezone.now())
@@ -62,10 +62,10 @@ def scrubbed(work: Work) -> Mapping[str, Any]:
     return {**counts, "bytes": read, "found": damaged, "problems": problems}
 
 
-def found(verdict: IntegrityCheck) -> IntegrityCheck:
+def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
     """Keep what was found of an episode of this lab, on the disk and in its row; as it then stands."""
     row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
-    verdict = known_better(row, verdict) if row else verdict
+    verdict = compare_with_row(row, verdict) if row else verdict
     if verdict.state == "damaged":
         log.error("episode %s is damaged: %s", verdict.path.name, verdict.text)
     update_mark(verdict)
@@ -79,17 +79,17 @@ def found(verdict: IntegrityCheck) -> IntegrityCheck:
     return verdict
 
 
-def known_better(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
+def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
     """A closed recording that lost its outcome, or has another one than that with which it was closed, is damaged."""
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
-    why = another_than(row, None if verdict.state == "open" else verdict.seal)
+    why = outcome_change(row, None if verdict.state == "open" else verdict.seal)
     if not why:
         return verdict
     return replace(verdict, state="damaged", damage=(Damage(OUTCOME, why),), seal=row.seal)
 
 
-def _looked_at(folder: Path) -> IntegrityCheck:
+def _verify_folder(folder: Path) -> IntegrityCheck:
     """A folder that has nothing left by which it is an episode is that of a closed one all the same."""
     lost = [Damage(name, "is absent") for name in (MANIFEST, OUTCOME) if not (folder / name).exists()]
     if folder.is_dir() and len(lost) == 2 and not (folder / OUTCOME_COPY).exists():

@@ -17,23 +17,23 @@ from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.episodes import listed, selectors, services
 from evaweb.episodes.bench import bench_course
-from evaweb.episodes.curves import curves
+from evaweb.episodes.curves import curve_message
 from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
 from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_sheet
 from evaweb.episodes.models import Episode
-from evaweb.episodes.poses import poses
-from evaweb.episodes.robot import looks_in
-from evaweb.episodes.selectors import episode_get, stage_of
+from evaweb.episodes.poses import pose_message
+from evaweb.episodes.robot import drawn_robot_for
+from evaweb.episodes.selectors import episode_get
 from evaweb.episodes.sheets import Grid
 from evaweb.episodes.streaming import file_answer
 from evaweb.episodes.videos import TYPE, video_address, video_file
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.lists import Listing
-from evaweb.roles import Role, require, role_of
-from evaweb.stations.geometry import geometry
+from evaweb.roles import Role, require_role, role_of
+from evaweb.stations.geometry import scene_geometry
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError, read_json
@@ -62,20 +62,20 @@ PER_PAGE = 50
 @require_GET
 def replay_list(request: HttpRequest) -> HttpResponseBase:
     """All episodes, the newest first unless they are sorted in another way."""
-    sight = sight_for(request)
+    sight = visibility_for_request(request)
     listing = Listing(request.GET, listed.columns(sight), listed.filters(sight))
     found = selectors.episode_list(**listing.chosen, sight=sight)
     if listing.wants_file:
         return listing.file(request, "episodes", found)
     page = listing.page(found, PER_PAGE)
-    rows = [(episode, stage_of(episode=episode)) for episode in page]
+    rows = [(episode, selectors.playback_stage(episode=episode)) for episode in page]
     context = {
         "listing": listing,
         "page": page,
         "rows": rows,
         "may_review": role_of(request.user) is not Role.VIEWER,
         "tags": selectors.tag_counts(sight=sight),
-        "passing": any(stage.passing for _, stage in rows),
+        "passing": any(stage.is_transient for _, stage in rows),
     }
     htmx: Any = request.htmx  # type: ignore[attr-defined]
     template = "episodes/rows.html" if htmx and not htmx.target else "episodes/list.html"
@@ -86,24 +86,24 @@ def replay_list(request: HttpRequest) -> HttpResponseBase:
 def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """One episode: cameras, robot and curves on one clock."""
     episode = episode_get(uuid=uuid)
-    stage = stage_of(episode=episode)
+    stage = selectors.playback_stage(episode=episode)
     context = {
         "episode": episode,
         "trial": selectors.trial_of(episode=episode),
         "stage": stage,
         "table": table_of(episode=episode),
         "may_review": role_of(request.user) is not Role.VIEWER,
-        "tags_known": selectors.tag_counts(sight=sight_for(request)),
+        "tags_known": selectors.tag_counts(sight=visibility_for_request(request)),
         "config": replay_config(episode) | player() if stage.name == "ready" else None,
     }
     return render(request, "episodes/replay.html", context)
 
 
 @require_GET
-def stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
+def playback_stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Stage of an episode; tells a page that it can be played now."""
     episode = episode_get(uuid=uuid)
-    found = stage_of(episode=episode)
+    found = selectors.playback_stage(episode=episode)
     answer = render(request, "episodes/stage.html", {"episode": episode, "stage": found})
     if found.name == "ready":
         answer["HX-Refresh"] = "true"
@@ -115,14 +115,14 @@ async def export(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
     episode = await _known(uuid)
     if request.method == "POST":
         return await sync_to_async(_export_asked)(request, episode)
-    await sync_to_async(lambda: sight_for(request).require_episode(episode))()
+    await sync_to_async(lambda: visibility_for_request(request).require_episode(episode))()
     path = await sync_to_async(table_file)(uuid)
     return await file_answer(request, path, CONTENT_TYPE, path.name)
 
 
 def _export_asked(request: HttpRequest, episode: Episode) -> HttpResponse:
-    require(request.user, Role.OPERATOR)
-    services.export_asked(episode=episode)
+    require_role(request.user, Role.OPERATOR)
+    services.request_export(episode=episode)
     return table(request, episode.uuid)
 
 
@@ -136,8 +136,8 @@ def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
 @require_POST
 def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Ask for the videos anew."""
-    require(request.user, Role.OPERATOR)
-    services.preview_asked(episode=episode_get(uuid=uuid))
+    require_role(request.user, Role.OPERATOR)
+    services.request_preview(episode=episode_get(uuid=uuid))
     return redirect("replay", uuid=uuid)
 
 
@@ -210,13 +210,13 @@ async def _known_camera(uuid: UUID, camera: str) -> None:
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
     """Joint curves and events, as one message of evaweb.binary_frames."""
-    episode, sight = episode_get(uuid=uuid), sight_for(request)
+    episode, sight = episode_get(uuid=uuid), visibility_for_request(request)
     told = {
         "covered": sight.hides_episode(episode),
         "unscored": selectors.unscored_for(episode=episode, sight=sight),
         "milestones": selectors.milestones_of(episode=episode),
     }
-    return _message(lambda: curves(journal_folder(uuid), **told))
+    return _binary_response(lambda: curve_message(journal_folder(uuid), **told))
 
 
 @require_GET
@@ -227,9 +227,9 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
         manifest = read_json(journal_folder(uuid) / "manifest.json")
     except RecordingError as error:
         raise Conflict(str(error)) from None
-    robot = looks_in(manifest).robot
+    robot = drawn_robot_for(manifest).robot
     groups = [group.name for group in robot.groups]
-    return JsonResponse(geometry(robot.name, groups, simulated=simulated(manifest)))
+    return JsonResponse(scene_geometry(robot.name, groups, simulated=simulated(manifest)))
 
 
 @require_GET
@@ -246,10 +246,10 @@ def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:
         raise EvaError(_FIRST_ALLOWED_WHOLE_NUMBER_FROM(first=first))
-    return _message(lambda: poses(journal_folder(uuid), int(first)))
+    return _binary_response(lambda: pose_message(journal_folder(uuid), int(first)))
 
 
-def _message(make: Callable[[], bytes]) -> HttpResponse:
+def _binary_response(make: Callable[[], bytes]) -> HttpResponse:
     return HttpResponse(_readable(make), content_type="application/octet-stream")
 
 

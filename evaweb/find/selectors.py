@@ -13,7 +13,7 @@ from django.db.models import Case, IntegerField, Q, QuerySet, Value, When
 from django.urls import reverse
 from django.utils.timezone import localtime
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.datasets.finding import dataset_names
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import tag_counts
@@ -63,7 +63,7 @@ class Group:
 Candidate = tuple[Found, str]  # with what else it is known by
 
 
-def find(*, query: str, user: Any, sight: Sight) -> list[Group]:
+def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
     """Groups of what fits, without empty ones. EvaError unless the query has 1 to LONGEST characters."""
     query = " ".join(query.split())
     if not 0 < len(query) <= LONGEST:
@@ -149,7 +149,7 @@ def _plans(query: str, user: Any) -> Iterator[Candidate]:
         )
 
 
-def _checkpoints(query: str, role: Role, sight: Sight) -> Iterator[Candidate]:
+def _checkpoints(query: str, role: Role, sight: Visibility) -> Iterator[Candidate]:
     rows = checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None).only("name", "active")
     for row in _narrowed(rows, _without(query, "checkpoint"), "name"):
         detail = "" if row.active else "not offered"
@@ -170,7 +170,7 @@ def _administered(kind: str, key: int, name: str, role: Role) -> str:
     return f"{reverse('replay-list')}?{urlencode({'words': name})}"
 
 
-def _tags(sight: Sight) -> Iterator[Candidate]:
+def _tags(sight: Visibility) -> Iterator[Candidate]:
     """Each leads to the episodes that have it."""
     for words, n in tag_counts(sight=sight).items():
         detail = f"{n} episode{'' if n == 1 else 's'}"

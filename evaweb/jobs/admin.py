@@ -33,7 +33,7 @@ class JobAdmin(admin.ModelAdmin):
     def try_again(self, request: HttpRequest, jobs: QuerySet) -> None:
         failed = list(jobs.filter(status=JobStatus.FAILED))
         for job in failed:
-            services.try_again(user=request.user, job=job)
+            services.retry_job(user=request.user, job=job)
         self.message_user(request, f"{len(failed)} asked for anew", messages.SUCCESS)
 
     def has_add_permission(self, request: HttpRequest) -> bool:

@@ -15,7 +15,7 @@ _Result = TypeVar("_Result")
 WAITS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 5.0, 5.0, 5.0)
 
 
-def patiently(action: Callable[[], _Result]) -> _Result:
+def retry_while_locked(action: Callable[[], _Result]) -> _Result:
     """The result of `action`, tried again while the database is locked or away; its error after half a minute.
 
     `action` must be a whole transaction, so that nothing of a failed attempt is left.

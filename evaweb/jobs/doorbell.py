@@ -9,7 +9,7 @@ log = logging.getLogger(__name__)
 TASK = "evaweb.jobs.work"  # by name: what it does asks for jobs itself
 
 
-def ring(queue: str) -> bool:
+def notify_workers(queue: str) -> bool:
     """Tell the broker; False where it did not take it: a worker finds the row when it next looks."""
     from celery.exceptions import CeleryError  # here, for most programs of a lab never ring
     from kombu.exceptions import KombuError

@@ -22,18 +22,20 @@ class Queue(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class JobContext:
     """One job as its kind sees it: what is asked for, and how to say how far it is.
 
     `hold` waits until no other job holds any of these names, and holds them instead of what this one held before.
     """
 
     args: Args
-    tell: Callable[[str], None]  # at most 160 characters, best "... n of m"; raises TakenOver or Cancelled
+    report_progress: Callable[
+        [str], None
+    ]  # at most 160 characters, best "... n of m"; raises TakenOver or Cancelled
     hold: Callable[[Collection[str]], None] = lambda names: None  # raises as `tell` does
 
 
-Kind = Callable[[Work], Args]
+Kind = Callable[[JobContext], Args]
 Least = Callable[[Args], Role]  # who may ask for such a job
 Chore = Callable[[], object]
 
@@ -92,7 +94,7 @@ def least_role(name: str, args: Args) -> Role:
     return declared(name).least(args) if name in _kinds else Role.OPERATOR
 
 
-def chore(name: str) -> Callable[[Chore], Chore]:
+def periodic_task(name: str) -> Callable[[Chore], Chore]:
     """Declare something cheap that workers of the lab's data folder that take `cpu` look after every few seconds."""
 
     def declare(function: Chore) -> Chore:
@@ -102,7 +104,7 @@ def chore(name: str) -> Callable[[Chore], Chore]:
     return declare
 
 
-def at_start(name: str) -> Callable[[Chore], Chore]:
+def startup_task(name: str) -> Callable[[Chore], Chore]:
     """Declare what workers of the lab's data folder that take `cpu` do once, when they start."""
 
     def declare(function: Chore) -> Chore:
@@ -131,11 +133,11 @@ def without_folder() -> list[str]:
     return sorted(name for name, kind in _kinds.items() if not kind.folder)
 
 
-def chores() -> Mapping[str, Chore]:
+def periodic_tasks() -> Mapping[str, Chore]:
     """All chores by name."""
     return dict(_chores)
 
 
-def starts() -> Mapping[str, Chore]:
+def startup_tasks() -> Mapping[str, Chore]:
     """All that is done once, by name."""
     return dict(_starts)

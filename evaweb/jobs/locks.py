@@ -22,7 +22,7 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one with each star
 _TRIES, _AGAIN_S = 20, 0.05  # a sweep looks at a lock for a moment
 
 
-class Worker(Enum):
+class ClaimantState(Enum):
     """State of the worker that claimed a job, by the job's lock."""
 
     ALIVE = "at work"
@@ -31,7 +31,7 @@ class Worker(Enum):
 
 
 @contextmanager
-def alone(key: str, owner: UUID | None) -> Iterator[bool]:
+def exclusive_job(key: str, owner: UUID | None) -> Iterator[bool]:
     """Keep the job of that key to oneself while it is done; False where another process is still at it."""
     path = _path(key)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,16 +48,16 @@ def alone(key: str, owner: UUID | None) -> Iterator[bool]:
         os.close(descriptor)
 
 
-def worker_of(key: str, owner: UUID | None) -> Worker:
+def claimant_state(key: str, owner: UUID | None) -> ClaimantState:
     """State of `owner`, which has claimed the job of that key."""
     try:
         descriptor = os.open(_path(key), os.O_RDWR | os.O_CLOEXEC)
     except OSError:
-        return Worker.UNKNOWN
+        return ClaimantState.UNKNOWN
     try:
         if not _taken(descriptor):
-            return Worker.ALIVE
-        return Worker.ENDED if os.read(descriptor, 200) == _mark(owner) else Worker.UNKNOWN
+            return ClaimantState.ALIVE
+        return ClaimantState.ENDED if os.read(descriptor, 200) == _mark(owner) else ClaimantState.UNKNOWN
     finally:
         os.close(descriptor)
 

@@ -24,14 +24,14 @@ from django.db.models.functions import Now
 
 from evaweb.errors import Conflict
 from evaweb.jobs import doorbell
-from evaweb.jobs.database_retry import patiently
+from evaweb.jobs.database_retry import retry_while_locked
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
-from evaweb.jobs.kinds import Args, Cancelled, TakenOver, Work, declared, kind_named, least_role
-from evaweb.jobs.locks import Worker, alone, worker_of
+from evaweb.jobs.kinds import Args, Cancelled, JobContext, TakenOver, declared, kind_named, least_role
+from evaweb.jobs.locks import ClaimantState, claimant_state, exclusive_job
 from evaweb.jobs.models import Hold, Job, JobStatus
 from evaweb.jobs.selectors import jobs_ready
 from evaweb.jobs.workers import has_lab_folder
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ def enqueue(*, kind: str, key: str, args: Args) -> Job:
     queue = declared(kind).queue
     with transaction.atomic():
         job = _waiting(kind, key, args, queue)
-        transaction.on_commit(partial(doorbell.ring, queue))
+        transaction.on_commit(partial(doorbell.notify_workers, queue))
     return job
 
 
@@ -86,9 +86,9 @@ def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
     raise RuntimeError(f"job {key} is claimed faster than it can be asked for")
 
 
-def try_again(*, user: Any, job: Job) -> Job:
+def retry_job(*, user: Any, job: Job) -> Job:
     """Ask anew for what a failed job was about, by a user who may ask for it; Conflict where it has not failed."""
-    require(user, least_role(job.kind, job.args))
+    require_role(user, least_role(job.kind, job.args))
     if job.status != JobStatus.FAILED:
         raise Conflict(_JOB_ONLY_ONE_FAILED_TRIED(job=job.pk, key=job.key, status=job.get_status_display()))
     return enqueue(kind=job.kind, key=job.key, args=job.args)
@@ -97,7 +97,7 @@ def try_again(*, user: Any, job: Job) -> Job:
 @transaction.atomic
 def cancel(*, user: Any, job: Job) -> Job:
     """End a job, for good: at once where it waits, else at its next step. Operators; Conflict where it has ended."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     row = Job.objects.filter(pk=job.pk)
     waiting = row.filter(status=JobStatus.QUEUED)
     ended = {"status": JobStatus.FAILED, "finished_at": Now(), "error": _cancelled_words(user)}
@@ -135,13 +135,13 @@ def claim(*, queue: str, owner: UUID) -> Job | None:
     return None
 
 
-def work(queue: str) -> int:
+def run_queue(queue: str) -> int:
     """Do what is ready in `queue`, one job after the other; how many. None while this process is at work already."""
     if not _busy.acquire(blocking=False):
         return 0
     try:
         done = 0
-        while not _ending.is_set() and (job := patiently(partial(claim, queue=queue, owner=OWNER))):
+        while not _ending.is_set() and (job := retry_while_locked(partial(claim, queue=queue, owner=OWNER))):
             _perform(job)
             done += 1
         return done
@@ -155,7 +155,7 @@ def _perform(job: Job) -> None:
     with ExitStack() as stack:
         ended: Callable[[], object]
         try:
-            if stack.enter_context(alone(job.key, job.owner)):
+            if stack.enter_context(exclusive_job(job.key, job.owner)):
                 ended = partial(job_done, job=job, result=_result_of(job))
             else:
                 ended = partial(job_postponed, job=job)
@@ -167,15 +167,15 @@ def _perform(job: Job) -> None:
         except Exception as error:  # whatever a job raises is its own, never the worker's
             log.warning("job %s failed: %s", job.key, error, exc_info=True)
             ended = partial(job_failed, job=job, error=str(error) or type(error).__name__)
-        patiently(ended)
+        retry_while_locked(ended)
 
 
 def _result_of(job: Job) -> Args:
     stale_s = settings.EVA_JOB_STALE_S
     # Where there may be workers of other machines, whose locks of files may not reach this one, a claim ends in time.
     lapse = None if connection.vendor == "sqlite" else Lapse(stale_s * _LAPSES, partial(_lapsed, job))
-    with Heartbeat(partial(seen, job=job), stale_s / 6, lapse):
-        return kind_named(job.kind)(Work(job.args, partial(_tell, job), partial(hold, job)))
+    with Heartbeat(partial(heartbeat, job=job), stale_s / 6, lapse):
+        return kind_named(job.kind)(JobContext(job.args, partial(_tell, job), partial(hold, job)))
 
 
 def _lapsed(job: Job) -> None:
@@ -191,7 +191,7 @@ def hold(job: Job, names: Collection[str]) -> None:
 
     They replace what it held before, so that no two jobs wait for each other. Raises TakenOver or Cancelled.
     """
-    while (by := patiently(partial(_held_by_another, job, sorted(set(names))))) is not None:
+    while (by := retry_while_locked(partial(_held_by_another, job, sorted(set(names))))) is not None:
         _tell(job, f"waits for another job at work on the same: {by}")
         time.sleep(_HOLD_AGAIN_S)
 
@@ -212,14 +212,16 @@ def _held_by_another(job: Job, names: Sequence[str]) -> str | None:
 
 def _tell(job: Job, progress: str) -> None:
     ours = _ours(job)
-    if patiently(lambda: ours.filter(cancelled_by=None).update(progress=progress[:160], seen_at=Now())):
+    if retry_while_locked(
+        lambda: ours.filter(cancelled_by=None).update(progress=progress[:160], seen_at=Now())
+    ):
         return
-    if patiently(ours.exists):
+    if retry_while_locked(ours.exists):
         raise Cancelled
     raise TakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
 
 
-def seen(*, job: Job) -> bool:
+def heartbeat(*, job: Job) -> bool:
     """A sign of life; False where the job is not this claim's any more."""
     return bool(_ours(job).update(seen_at=Now()))
 
@@ -238,14 +240,14 @@ def job_failed(*, job: Job, error: str) -> bool:
     if attempts >= MOST_ATTEMPTS:
         return _finish(job, status=JobStatus.FAILED, attempts=attempts, error=error)
     again = Now() + timedelta(seconds=RETRY_AFTER_S[attempts - 1])
-    return _waits(_ours(job), attempts=attempts, error=error, not_before=again)
+    return _requeue_row(_ours(job), attempts=attempts, error=error, not_before=again)
 
 
 def job_postponed(*, job: Job) -> bool:
     """Look at it again in a few seconds: the process that it was taken from has not ended yet."""
     why = "the worker that had it before is still at it: it is waited for; end that one if it hangs"
     log.warning("job %s: %s", job.key, why)
-    return _waits(_ours(job), progress=why, not_before=Now() + timedelta(seconds=_AGAIN_S))
+    return _requeue_row(_ours(job), progress=why, not_before=Now() + timedelta(seconds=_AGAIN_S))
 
 
 def _finish(job: Job, **facts: Any) -> bool:
@@ -269,7 +271,7 @@ def _ended_if_cancelled(row: QuerySet[Job]) -> bool:
     return bool(row.update(status=JobStatus.FAILED, owner=None, finished_at=Now(), error=words))
 
 
-def _waits(row: QuerySet[Job], **facts: Any) -> bool:
+def _requeue_row(row: QuerySet[Job], **facts: Any) -> bool:
     """Let it wait again, unless it was cancelled; where a newer one of its key waits, that one is done instead."""
     if _ended_if_cancelled(row):
         return True
@@ -284,19 +286,19 @@ def _waits(row: QuerySet[Job], **facts: Any) -> bool:
 # --- what is left behind -------------------------------------------------------------------------------------
 
 
-def sweep() -> int:
+def reclaim_stale_jobs() -> int:
     """Take jobs back from workers that have ended or show no sign of life; how many. Any process may do it at any time.
 
     One that is known to be at work keeps its job; one that is known to have ended is not waited for.
     """
-    return sum(_take_back(job) for job in Job.objects.filter(status=JobStatus.RUNNING))
+    return sum(_reclaim(job) for job in Job.objects.filter(status=JobStatus.RUNNING))
 
 
-def _take_back(job: Job) -> bool:
-    worker, row = worker_of(job.key, job.owner), _ours(job)
-    if worker is Worker.UNKNOWN:
+def _reclaim(job: Job) -> bool:
+    worker, row = claimant_state(job.key, job.owner), _ours(job)
+    if worker is ClaimantState.UNKNOWN:
         row = row.filter(seen_at__lt=Now() - timedelta(seconds=settings.EVA_JOB_STALE_S))
-    if worker is Worker.ALIVE or not row.exists():
+    if worker is ClaimantState.ALIVE or not row.exists():
         return False
     deaths = job.deaths + 1
     silence = f"its worker {job.owner} ended or went silent, which is number {deaths} of {MOST_DEATHS}"
@@ -308,15 +310,15 @@ def _take_back(job: Job) -> bool:
     wait = (0.0, *RETRY_AFTER_S)[min(deaths - 1, len(RETRY_AFTER_S))]  # others have their turn meanwhile
     # None is at once also for whoever looks within this millisecond.
     again = Now() + timedelta(seconds=wait) if wait else None
-    return _waits(row, deaths=deaths, error=silence, not_before=again)
+    return _requeue_row(row, deaths=deaths, error=silence, not_before=again)
 
 
-def put_back(*, owner: UUID) -> int:
+def requeue(*, owner: UUID) -> int:
     """Let the jobs of a process that is about to end wait for another one; that is no death."""
     mine = Job.objects.filter(status=JobStatus.RUNNING, owner=owner)
-    return sum(_waits(_ours(job)) for job in mine)
+    return sum(_requeue_row(_ours(job)) for job in mine)
 
 
-def end_work() -> None:
+def stop_claiming() -> None:
     """Claim nothing any more in this process; what is being done goes on."""
     _ending.set()

@@ -10,4 +10,4 @@ from evaweb.jobs.doorbell import TASK
 @app.task(name=TASK)
 def work(queue: str) -> None:
     """The doorbell of a queue."""
-    services.work(queue)
+    services.run_queue(queue)

@@ -16,9 +16,9 @@ from django.db import close_old_connections, connection
 
 from evaweb.celery import app
 from evaweb.jobs import services, workers
-from evaweb.jobs.database_retry import patiently
+from evaweb.jobs.database_retry import retry_while_locked
 from evaweb.jobs.heartbeat import Heartbeat
-from evaweb.jobs.kinds import Queue, chores, starts
+from evaweb.jobs.kinds import Queue, periodic_tasks, startup_tasks
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ LOOK_EVERY_S = 3.0
 BROKER_AGAIN_S = 30.0
 
 
-def run(queues: Sequence[str], *, lifeline: bool) -> None:
+def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
     """Work until SIGTERM, SIGINT or, with `lifeline`, the end of standard input.
 
     What is being done then is finished, or put back after EVA_WORKER_GRACE_S seconds.
@@ -35,7 +35,7 @@ def run(queues: Sequence[str], *, lifeline: bool) -> None:
     ending = _ending_by_signal()
     if lifeline:
         threading.Thread(target=_watch_input, name="lifeline", daemon=True).start()
-    looking = threading.Thread(target=_look, args=(queues, ending), name="looking")
+    looking = threading.Thread(target=_poll, args=(queues, ending), name="looking")
     looking.start()
     there = Heartbeat(
         partial(workers.worker_seen, owner=services.OWNER, queues=queues), settings.EVA_JOB_STALE_S / 6
@@ -61,7 +61,7 @@ def _ending_by_signal() -> threading.Event:
         if ending.is_set():
             return
         ending.set()
-        services.end_work()
+        services.stop_claiming()
         celery_state.should_stop = 0  # where its own handlers would put it
         threading.Thread(target=_put_back_later, name="grace", daemon=True).start()
 
@@ -74,7 +74,7 @@ def _put_back_later() -> None:
     """End the process at the end of its grace; every kind of job can be ended at any moment and done again."""
     threading.Event().wait(settings.EVA_WORKER_GRACE_S)
     try:
-        count = patiently(lambda: services.put_back(owner=services.OWNER))
+        count = retry_while_locked(lambda: services.requeue(owner=services.OWNER))
         log.warning("not done within %g s of grace: %d put back", settings.EVA_WORKER_GRACE_S, count)
     finally:
         os._exit(0)  # the row tells the rest: a job that is not put back is swept
@@ -100,22 +100,27 @@ def _answer_doorbell(queues: Sequence[str]) -> None:
     worker.start()
 
 
-def _look(queues: Sequence[str], ending: threading.Event) -> None:
+def _poll(queues: Sequence[str], ending: threading.Event) -> None:
     """Sweep, look after the chores, and do what waits, whether or not a doorbell has rung."""
     _attempt(
         "list of workers",
-        partial(patiently, partial(workers.worker_seen, owner=services.OWNER, queues=queues)),
+        partial(retry_while_locked, partial(workers.worker_seen, owner=services.OWNER, queues=queues)),
     )
     begun = False
     while not ending.is_set():
         close_old_connections()
-        _attempt("sweep", partial(patiently, services.sweep))
-        if Queue.CPU in queues and _attempt("the data folder", partial(patiently, workers.has_lab_folder)):
-            for name, task in {**(chores() if begun else starts()), **chores()}.items():
-                _attempt(name, partial(patiently, task))
+        _attempt("sweep", partial(retry_while_locked, services.reclaim_stale_jobs))
+        if Queue.CPU in queues and _attempt(
+            "the data folder", partial(retry_while_locked, workers.has_lab_folder)
+        ):
+            for name, task in {
+                **(periodic_tasks() if begun else startup_tasks()),
+                **periodic_tasks(),
+            }.items():
+                _attempt(name, partial(retry_while_locked, task))
             begun = True
         for queue in queues:
-            _attempt(f"queue {queue}", partial(services.work, queue))
+            _attempt(f"queue {queue}", partial(services.run_queue, queue))
         ending.wait(LOOK_EVERY_S)
     connection.close()
 

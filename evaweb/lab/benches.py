@@ -9,7 +9,7 @@ from pathlib import Path
 from django.conf import settings
 
 from evaweb.lab import programs
-from evaweb.lab.processes import LabError, Program
+from evaweb.lab.processes import LabError, ProgramSpec
 from evaweb.lab.seed import station_registered
 from runtime.config.loader import ConfigurationError, load
 
@@ -38,7 +38,7 @@ def registered(bench: Bench) -> str:
     return station.name
 
 
-def program_of(bench: Bench) -> Program:
+def program_of(bench: Bench) -> ProgramSpec:
     """The runtime of a bench's station."""
     assignments = [f'data_dir="{settings.DATA_DIR}"', *bench.assignments]
     return programs.station(str(bench.deployment), assignments)

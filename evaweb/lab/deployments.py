@@ -31,7 +31,7 @@ from evaweb.errors import Conflict, EvaError, NotFound, StationGone
 from evaweb.lab.processes import LabError
 from evaweb.plans.models import Plan
 from evaweb.stations.models import STATION_NAME, Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from evaweb.stations.selectors import lease_open
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Trial
@@ -264,7 +264,7 @@ def _deleted(station: Station) -> bool:
 
 
 def _require_no_trial(station: Station) -> None:
-    trial = Trial.objects.filter(station=station, status__in=lifecycle.OPEN).order_by("pk").first()
+    trial = Trial.objects.filter(station=station, status__in=lifecycle.OPEN_STATES).order_by("pk").first()
     if trial is not None:
         raise Conflict(
             f"trial {trial.pk} of {station} is {trial.get_status_display()}: end or abandon it first (one that was cut "
@@ -278,7 +278,7 @@ def _require_no_holder(station: Station) -> None:
     if lease is None:
         return
     try:
-        holder = wire_to(station.name).status(timeout=_ASK_S)["lease"]["holder"]
+        holder = connection_to(station.name).status(timeout=_ASK_S)["lease"]["holder"]
     except StationGone:
         return
     if holder:

@@ -11,17 +11,17 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from evaweb.lab.once import recorded, run_to_its_end, score_by_truth, set_up_and_run, take
-from evaweb.lab.patience import VisitFailed, until
+from evaweb.lab.once import run_to_its_end, score_by_truth, set_up_and_run, take_station, wait_for_recorded
+from evaweb.lab.patience import DemoFailed, wait_until
 from evaweb.lab.progress import Progress
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.visitor import LivePage, RestClient
 
 _TRIES = 3  # of one trial, whose set-up or run was interrupted
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class CompletedTrial:
     """One trial that counts, as the operator knows it; `times`: milestone -> when it was reached [s of the run]."""
 
     code: str
@@ -35,22 +35,22 @@ class Made:
     times: Mapping[str, float]
 
 
-def carry_out(
-    operator: Visitor, station: str, plan: str, count: int, tell: Tell, progress: Progress
-) -> list[Made]:
+def run_plan(
+    operator: RestClient, station: str, plan: str, count: int, tell: Tell, progress: Progress
+) -> list[CompletedTrial]:
     """The next `count` trials of a plan, or fewer where its design ends it.
 
     VisitFailed where one does not come about, or tells what it is of.
     """
     made = []
     with closing(LivePage(operator, station)) as page:
-        take(page)
+        take_station(page)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
             try:
                 with progress.during(f"trial {number} of {count}"):
-                    one = _made(operator, page, station, plan)
-            except VisitFailed:
+                    one = _run_trial(operator, page, station, plan)
+            except DemoFailed:
                 if operator.get(f"plans/{plan}")["state"] == "frozen":
                     raise
                 tell(f"the plan's design has ended after {number - 1} trials")
@@ -58,10 +58,10 @@ def carry_out(
             made.append(one)
             verdict = "success" if one.success else "no success"
             tell(f"{number:>3} of {count}  {one.code}  position {one.position}  {verdict}, {one.score:.0%}")
-    return [replace(one, duration_s=recorded(operator, one.trial)["duration_s"]) for one in made]
+    return [replace(one, duration_s=wait_for_recorded(operator, one.trial)["duration_s"]) for one in made]
 
 
-def revealed(owner: Visitor, plan: str, made: list[Made]) -> dict[str, Any]:
+def close_and_reveal(owner: RestClient, plan: str, made: list[CompletedTrial]) -> dict[str, Any]:
     """Close and reveal the plan: what was committed to, its key, and the trials with the names of their checkpoints."""
     if owner.get(f"plans/{plan}")["state"] == "frozen":  # else its design has ended it
         owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
@@ -77,7 +77,7 @@ def revealed(owner: Visitor, plan: str, made: list[Made]) -> dict[str, Any]:
     }
 
 
-def _made(operator: Visitor, page: LivePage, station: str, plan: str) -> Made:
+def _run_trial(operator: RestClient, page: LivePage, station: str, plan: str) -> CompletedTrial:
     fault = ""
     for _ in range(_TRIES):
         handed = operator.post(f"plans/{plan}/next", {"station": station})
@@ -87,29 +87,29 @@ def _made(operator: Visitor, page: LivePage, station: str, plan: str) -> Made:
             set_up_and_run(page, trial["id"], lockstep=True)
             run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), lockstep=True)
             scored = score_by_truth(operator, trial["id"])
-        except VisitFailed as failed:
+        except DemoFailed as failed:
             fault = str(failed)
             _give_up(operator, page, trial["id"], fault)
             continue
         facts = {name: scored[name] for name in ("scene", "position", "success", "score", "duration_s")}
         times = operator.get(f"trials/{trial['id']}")["truth"].get("reached", {})
-        return Made(code=code, trial=trial["id"], attempt=handed["attempt"], times=times, **facts)
-    raise VisitFailed(f"a trial of {plan} was not made in {_TRIES} attempts: {fault}")
+        return CompletedTrial(code=code, trial=trial["id"], attempt=handed["attempt"], times=times, **facts)
+    raise DemoFailed(f"a trial of {plan} was not made in {_TRIES} attempts: {fault}")
 
 
 def _require_blind(code: str, trial: Mapping[str, Any]) -> None:
     if trial["checkpoint"] != code:
-        raise VisitFailed(
+        raise DemoFailed(
             f"the plan is not blind for its operator, who was told {trial['checkpoint']!r} of {code}: nothing is run"
         )
 
 
-def _give_up(operator: Visitor, page: LivePage, trial: int, fault: str) -> None:
+def _give_up(operator: RestClient, page: LivePage, trial: int, fault: str) -> None:
     """Leave the station free for the next attempt, whatever was under way."""
     status = operator.get(f"trials/{trial}")["status"]
     if status in ("running", "paused"):
         page.command("stop")
-        over = until(
+        over = wait_until(
             lambda: operator.get(f"trials/{trial}"),
             lambda found: found["status"] not in ("running", "paused"),
             "waiting for the end of the trial",

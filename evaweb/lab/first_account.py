@@ -11,8 +11,8 @@ from django.contrib.auth.models import User
 from django.db import Error, transaction
 
 from evaweb.errors import Conflict
-from evaweb.lab.seed import fresh_password, nobody_can_log_in
-from evaweb.roles import Role, grant
+from evaweb.lab.seed import fresh_password, has_no_accounts
+from evaweb.roles import Role, set_role
 from runtime.recording.files import write_atomic
 
 log = logging.getLogger(__name__)
@@ -39,7 +39,7 @@ def is_offered() -> bool:
 def is_missing() -> bool:
     """True if nobody can log in; False also where the database does not say: the login will."""
     try:
-        return nobody_can_log_in()
+        return has_no_accounts()
     except Error:
         return False
 
@@ -56,13 +56,13 @@ def is_code(given: str) -> bool:
 @transaction.atomic
 def administrator_make(*, username: str, password: str) -> User:
     """The first administrator, once: of two who ask at once, one gets Conflict."""
-    if not nobody_can_log_in():
+    if not has_no_accounts():
         raise Conflict("this lab has an account already: log in, or ask an administrator for one")
     user, _ = User.objects.get_or_create(username=username)
     user.set_password(password)
     user.is_active = True
     user.save()
-    grant(user=user, role=Role.ADMIN)
+    set_role(user=user, role=Role.ADMIN)
     try:
         _path().unlink()
     except FileNotFoundError:

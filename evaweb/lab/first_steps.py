@@ -18,7 +18,7 @@ from evaweb.lab.seed import demo_scene
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.plans.models import CameraCheck
 from evaweb.stations.models import CARRIED_OUT, Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from evaweb.trials.models import Checkpoint, Scene, Trial, TrialStatus
 
 _ASK_S = 1.0  # how long a page waits for a station
@@ -177,7 +177,7 @@ def _snapshot(station: Station | None) -> dict[str, Any]:
     if station is None:
         return {}
     try:
-        return wire_to(station.name).status(timeout=_ASK_S)
+        return connection_to(station.name).status(timeout=_ASK_S)
     except StationGone:
         return {}
 

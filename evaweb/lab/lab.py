@@ -15,11 +15,11 @@ from evaweb.jobs.workers import lab_folder_named
 from evaweb.lab import first_account, lifetime, programs
 from evaweb.lab.benches import Bench, program_of, registered
 from evaweb.lab.pickup import Pickup
-from evaweb.lab.processes import Processes
+from evaweb.lab.processes import ChildProcesses
 from evaweb.lab.progress import Progress, silent
 from evaweb.lab.simulated import Benches
-from evaweb.listening import listen
-from evaweb.stop_port import StopPort, forget
+from evaweb.listening import open_listener
+from evaweb.stop_port import StopPort, remove_stop_port
 from runtime.core.environment import program_environment
 
 _WATCH_S = 0.5
@@ -31,7 +31,7 @@ class Lab:
     STEPS = 3  # of a start, and one for each station
 
     def __init__(
-        self, processes: Processes, host: str, port: int, listener: socket.socket, progress: Progress
+        self, processes: ChildProcesses, host: str, port: int, listener: socket.socket, progress: Progress
     ) -> None:
         """Worker and web begin at once: a machine with a second core starts them beside benches and stations.
 
@@ -43,7 +43,7 @@ class Lab:
         self.processes.start(programs.worker())
         self._web = self.processes.begin(programs.web(host, port))
 
-    def up(self, benches: Sequence[Bench]) -> str:
+    def start(self, benches: Sequence[Bench]) -> str:
         """Start the stations and the process for stops; returns the address of the web."""
         names = [registered(bench) for bench in benches]
         for name, bench in zip(names, benches, strict=True):
@@ -72,7 +72,7 @@ class Lab:
 
 
 @contextmanager
-def a_lab(
+def open_lab(
     host: str, port: int, stop_port: int | None = None, progress: Progress | None = None
 ) -> Iterator[Lab]:
     """A lab that is coming up, on a migrated database; everything it started ends with the block.
@@ -85,7 +85,7 @@ def a_lab(
     for wanted, option in ((port, "--port"), (stop_port, "--stop-port")):
         if wanted:
             lifetime.require_free(host, wanted, option)
-    with lifetime.only_one(settings.DATA_DIR):
+    with lifetime.hold_data_folder(settings.DATA_DIR):
         lifetime.end_on_signals()
         with told.step("the database"):
             call_command("migrate", verbosity=0, interactive=False)
@@ -94,12 +94,12 @@ def a_lab(
             "EVA_DATA_DIR": str(settings.DATA_DIR),
             "PYTHONUNBUFFERED": "1",
         }
-        processes = Processes(settings.BASE_DIR, settings.DATA_DIR / "logs", environment)
-        with listen(host, stop_port) as listener:
+        processes = ChildProcesses(settings.BASE_DIR, settings.DATA_DIR / "logs", environment)
+        with open_listener(host, stop_port) as listener:
             try:
                 yield Lab(processes, host, port, listener, told)
             finally:
                 with told.during("ending"):
                     processes.end()
                 first_account.withdraw()
-                forget()
+                remove_stop_port()

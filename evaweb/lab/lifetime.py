@@ -17,12 +17,12 @@ from evaweb.lab.processes import LabError
 _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Ended(BaseException):
+class StopRequested(BaseException):
     """The lab was asked to end; nothing that catches errors on the way holds it up."""
 
 
 @contextmanager
-def only_one(data_dir: Path) -> Iterator[None]:
+def hold_data_folder(data_dir: Path) -> Iterator[None]:
     """Hold the data folder; LabError names the process that holds it already."""
     with (data_dir / "lab.lock").open("a+", encoding="utf-8") as lock:
         try:
@@ -69,4 +69,4 @@ def _end(number: int, frame: FrameType | None) -> None:
             if stat.S_ISCHR(os.fstat(descriptor).st_mode):  # of a terminal that is gone isatty says no
                 os.dup2(nowhere, descriptor)
         os.close(nowhere)
-    raise Ended
+    raise StopRequested

@@ -21,8 +21,8 @@ from evaweb.errors import EvaError, StationGone
 from evaweb.lab import lifetime
 from evaweb.lab.deployments import lab_runs
 from evaweb.stations.models import Station
-from evaweb.stations.runtime_client import wire_to
-from evaweb.stop_port import told
+from evaweb.stations.runtime_client import connection_to
+from evaweb.stop_port import read_stop_port
 
 _PATIENCE_S = 10.0
 _STATION_S = 1.0
@@ -221,7 +221,7 @@ def sockets() -> Line:
 def ports() -> Line:
     """The ports of web and stops: those of the lab that runs, else the usual ones."""
     means = "Browsers reach the web at one, and its process for stops at the other."
-    kept = told()
+    kept = read_stop_port()
     if lab_runs() and kept:
         return Line("Ports", State.GOOD, f"web {kept.web_port}, stops {kept.port}: this lab's", means)
     taken = []
@@ -246,7 +246,7 @@ def stations() -> list[Line]:
         return []
     for name in names:
         try:
-            snapshot = wire_to(name).status(timeout=_STATION_S)
+            snapshot = connection_to(name).status(timeout=_STATION_S)
         except StationGone:
             continue
         control, reception = (

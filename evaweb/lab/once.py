@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 from uuid import uuid4
 
-from evaweb.lab.patience import VisitFailed, until
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.patience import DemoFailed, wait_until
+from evaweb.lab.visitor import LivePage, RestClient
 
 _RESUMES = 3
 _REST_S = 1.0  # how long success has to last before the operator presses Stop
@@ -18,7 +18,7 @@ _OVER_S = 30.0  # of the station's own time, after which a run should have ended
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class TrialChoice:
     """Station, trial and checkpoint of the one run."""
 
     station: str
@@ -29,7 +29,7 @@ class Choice:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class TrialReport:
     """A complete scored and recorded trial."""
 
     trial: int
@@ -46,15 +46,15 @@ class Done:
     wall_s: float
 
 
-def perform(visitor: Visitor, choice: Choice) -> Done:
+def run_one_trial(visitor: RestClient, choice: TrialChoice) -> TrialReport:
     """Take the station, set up, run until it succeeds or its time is over, stop, score, wait for the dataset."""
     begun = time.monotonic()
     with closing(LivePage(visitor, choice.station)) as page:
         trial = start(visitor, page, choice)
         resumed = run_to_its_end(page, trial, float(visitor.get(f"trials/{trial}")["time_limit_s"]))
         episode = _published(visitor, score_by_truth(visitor, trial)["episode"])
-        scored = whole(visitor, trial, episode)
-    return Done(
+        scored = wait_for_recording(visitor, trial, episode)
+    return TrialReport(
         trial=trial,
         success=scored["success"],
         score=scored["score"],
@@ -70,23 +70,27 @@ def perform(visitor: Visitor, choice: Choice) -> Done:
     )
 
 
-def start(visitor: Visitor, page: LivePage, choice: Choice) -> int:
+def start(visitor: RestClient, page: LivePage, choice: TrialChoice) -> int:
     """Take the station, prepare a trial, set up and run; its id."""
-    take(page)
+    take_station(page)
     named = {name: value for name, value in asdict(choice).items() if name != "station"}
     trial: int = visitor.post(f"stations/{choice.station}/trials", named)["id"]
     set_up_and_run(page, trial)
     return trial
 
 
-def take(page: LivePage) -> None:
+def take_station(page: LivePage) -> None:
     """Take the station once it is there."""
-    page.follow(lambda state: state["state_is"]["connected"], "waiting for the station", went_on)
+    page.wait_with_progress(
+        lambda state: state["state_is"]["connected"], "waiting for the station", progress_marker
+    )
     page.claim()
-    page.follow(lambda state: state["lease"]["epoch"] == page.epoch, "waiting for the lease", went_on)
+    page.wait_with_progress(
+        lambda state: state["lease"]["epoch"] == page.epoch, "waiting for the lease", progress_marker
+    )
 
 
-def went_on(state: Mapping[str, Any]) -> object:
+def progress_marker(state: Mapping[str, Any]) -> object:
     """Facts of a station that change whenever something goes on; the clock alone is no progress."""
     stages = [stage["state"] for stage in state.get("stages", ())]
     facts = [state.get(name) for name in ("boot", "sequence", "state", "reason", "phase", "stage")]
@@ -101,17 +105,19 @@ def _elapsed(state: Mapping[str, Any]) -> float:
 def set_up_and_run(page: LivePage, trial: int, lockstep: bool = False) -> None:
     """Set the station up for a prepared trial, and begin its run."""
     page.command("setup", trial)
-    set_up = page.follow(lambda state: not state["state_is"]["preparing"], "setting up", went_on)
+    set_up = page.wait_with_progress(
+        lambda state: not state["state_is"]["preparing"], "setting up", progress_marker
+    )
     if not set_up["state_is"]["ready"]:
-        raise VisitFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
+        raise DemoFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
     page.command("run", trial)
     # One that holds at once, because an observation was late, has begun too: it is resumed. In lockstep, as fast as the
     # machine, one may have begun and ended between two looks.
     begun = "set_up" if lockstep else "run_open"
-    page.follow(lambda state: state["state_is"][begun], "starting the run", went_on)
+    page.wait_with_progress(lambda state: state["state_is"][begun], "starting the run", progress_marker)
 
 
-def report(done: Done) -> dict[str, Any]:
+def report(done: TrialReport) -> dict[str, Any]:
     """The result as JSON."""
     return asdict(done)
 
@@ -127,7 +133,7 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
     def over(state: Mapping[str, Any]) -> bool:
         nonlocal succeeded
         if _elapsed(state) > limit + _OVER_S:
-            raise VisitFailed(f"the run goes on beyond its {limit:g} s: {_elapsed(state):.0f} s")
+            raise DemoFailed(f"the run goes on beyond its {limit:g} s: {_elapsed(state):.0f} s")
         if lockstep or not state["truth"].get("success"):
             succeeded = 0.0
         elif not succeeded:
@@ -135,20 +141,20 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
         return not state["state_is"]["going"] or bool(succeeded and state["clock"] - succeeded >= _REST_S)
 
     for resumed in range(_RESUMES + 1):
-        state = page.follow(over, "running", lambda now: (went_on(now), _elapsed(now)))
+        state = page.wait_with_progress(over, "running", lambda now: (progress_marker(now), _elapsed(now)))
         if not state["state_is"]["held"] or resumed == _RESUMES:
             break
         page.command("resume", trial)
-        page.follow(lambda now: not now["state_is"]["held"], "resuming", went_on)
+        page.wait_with_progress(lambda now: not now["state_is"]["held"], "resuming", progress_marker)
     if state["state_is"]["run_open"]:
         page.command("stop")
-    page.follow(lambda now: not now["state_is"]["run_open"], "stopping", went_on)
+    page.wait_with_progress(lambda now: not now["state_is"]["run_open"], "stopping", progress_marker)
     return resumed
 
 
-def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
+def score_by_truth(visitor: RestClient, trial: int) -> Mapping[str, Any]:
     """Tick what the bench says was reached, and when, once truth and recording of the trial are there."""
-    facts = until(
+    facts = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda found: found["status"] in ("ended", "interrupted") and found["truth"] is not None,
         "waiting for the end of the trial and the bench's truth",
@@ -161,27 +167,27 @@ def score_by_truth(visitor: Visitor, trial: int) -> Mapping[str, Any]:
         for milestone in milestones
         if reached[str(milestone["id"])]
     }
-    recorded(visitor, trial)
+    wait_for_recorded(visitor, trial)
     words = {"note": "scored from the bench's truth", "source": "truth"}
     content = {"milestones": reached, "times": when, "uuid": str(uuid4()), **words}
-    scored: Mapping[str, Any] = until(
+    scored: Mapping[str, Any] = wait_until(
         lambda: visitor.post(f"trials/{trial}/score", content), lambda found: True, "scoring"
     )
     return scored
 
 
-def recorded(visitor: Visitor, trial: int) -> Mapping[str, Any]:
+def wait_for_recorded(visitor: RestClient, trial: int) -> Mapping[str, Any]:
     """The trial once it is as long as its recording, whatever becomes of that later."""
     uuid = visitor.get(f"trials/{trial}")["episode"]
     episode = _worked_on(visitor, uuid, ("duration_s",), "waiting for the recording")
-    return whole(visitor, trial, episode)
+    return wait_for_recording(visitor, trial, episode)
 
 
-def _published(visitor: Visitor, episode: str) -> Mapping[str, Any]:
+def _published(visitor: RestClient, episode: str) -> Mapping[str, Any]:
     return _worked_on(visitor, episode, ("dataset_index", "duration_s"), "waiting for the dataset")
 
 
-def _worked_on(visitor: Visitor, uuid: str, facts: Sequence[str], what: str) -> Mapping[str, Any]:
+def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) -> Mapping[str, Any]:
     """The episode once these facts are known of it; what the worker does meanwhile is progress."""
 
     def ask() -> tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]:
@@ -190,15 +196,15 @@ def _worked_on(visitor: Visitor, uuid: str, facts: Sequence[str], what: str) -> 
     def known(found: tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]) -> bool:
         for job in found[1]:
             if job["key"] == f"publish:{uuid}" and job["status"] == "failed":
-                raise VisitFailed(f"{what}: job {job['key']} has failed: {job['error']}")
+                raise DemoFailed(f"{what}: job {job['key']} has failed: {job['error']}")
         return all(found[0][name] is not None for name in facts)
 
-    return until(ask, known, what)[0]
+    return wait_until(ask, known, what)[0]
 
 
-def whole(visitor: Visitor, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
+def wait_for_recording(visitor: RestClient, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
     """The trial once it is as long as its recording: until then its duration is that of the commands."""
-    found: Mapping[str, Any] = until(
+    found: Mapping[str, Any] = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda facts: facts["duration_s"] == episode["duration_s"],
         "waiting for the exact duration",

@@ -11,7 +11,7 @@ from evaweb.errors import EvaError
 from evaweb.lab import deployments, simulated
 from evaweb.lab.benches import Bench, program_of, registered
 from evaweb.lab.deployments import Kept, Standing, is_simulated
-from evaweb.lab.processes import LabError, Processes
+from evaweb.lab.processes import ChildProcesses, LabError
 
 log = logging.getLogger(__name__)
 Coming = Generator[
@@ -22,7 +22,7 @@ Coming = Generator[
 class Pickup:
     """The simulated stations of the data folder, one after the other; `look` is called every now and then."""
 
-    def __init__(self, processes: Processes, how: simulated.Benches) -> None:
+    def __init__(self, processes: ChildProcesses, how: simulated.Benches) -> None:
         self._processes, self._how = processes, how
         self._tried: dict[str, int] = {}  # by name, when the file that was last tried had been changed
         self._up: set[str] = set()

@@ -39,7 +39,7 @@ class LabError(EvaError):
 
 
 @dataclass(frozen=True)
-class Program:
+class ProgramSpec:
     """One process: `python ARGUMENTS --lifeline`.
 
     One that `announces` prints its addresses as a line of JSON when it is ready; started again after a death
@@ -58,7 +58,7 @@ class Program:
 
 @dataclass
 class _Child:
-    program: Program
+    program: ProgramSpec
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     addresses: Mapping[str, Any] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class _Child:
     killed_at: float = 0.0  # when one that is dropped is killed, unless it has ended
 
 
-class Processes:
+class ChildProcesses:
     """All children; `start` in order, `watch` now and then, `end` in reverse order."""
 
     def __init__(self, folder: Path, logs: Path, environment: Mapping[str, str]) -> None:
@@ -79,14 +79,14 @@ class Processes:
         self._ending: list[_Child] = []  # dropped, and not seen to have ended
         logs.mkdir(parents=True, exist_ok=True)
 
-    def start(self, program: Program, ready_s: float = 60.0) -> Mapping[str, Any]:
+    def start(self, program: ProgramSpec, ready_s: float = 60.0) -> Mapping[str, Any]:
         """Start it; returns the addresses that it announces, {} where it announces none.
 
         It may be slow, as its machine is: LabError where it does nothing for `ready_s`, or far too much.
         """
         return self.begin(program, ready_s)()
 
-    def begin(self, program: Program, ready_s: float = 60.0) -> Callable[[], Mapping[str, Any]]:
+    def begin(self, program: ProgramSpec, ready_s: float = 60.0) -> Callable[[], Mapping[str, Any]]:
         """Start it, while others are being started; what is returned waits until it is ready, as `start` does."""
         begun = self.starting(program, ready_s, wait_s=0.2)
         found: list[Mapping[str, Any]] = []
@@ -105,7 +105,7 @@ class Processes:
         look()
         return wait
 
-    def starting(self, program: Program, ready_s: float = 60.0, wait_s: float = 0.0) -> Starting:
+    def starting(self, program: ProgramSpec, ready_s: float = 60.0, wait_s: float = 0.0) -> Starting:
         """The same, a look at a time of at most `wait_s`: what else there is to watch is watched between two looks.
 
         One that does not start is ended, and is none of ours any more.
@@ -187,7 +187,7 @@ class Processes:
         child.log.close()
 
     def _spawn(
-        self, program: Program, arguments: tuple[str, ...], heard: bool
+        self, program: ProgramSpec, arguments: tuple[str, ...], heard: bool
     ) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
         path = self._logs / f"{program.name}.log"
         if path.exists() and path.stat().st_size > _LONGEST_LOG:

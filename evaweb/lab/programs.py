@@ -8,18 +8,18 @@ from typing import Any
 
 from django.conf import settings
 
-from evaweb.lab.processes import Program
+from evaweb.lab.processes import ProgramSpec
 
 _MANAGE = str(settings.BASE_DIR / "manage.py")
 
 
-def web(host: str, port: int) -> Program:
+def web(host: str, port: int) -> ProgramSpec:
     """Pages, REST and websockets."""
 
     def arguments(where: object) -> tuple[str, ...]:
         return (_MANAGE, "serve", "--host", host, "--port", str(where))
 
-    return Program(
+    return ProgramSpec(
         "web",
         arguments(port),
         announces=True,
@@ -30,9 +30,9 @@ def web(host: str, port: int) -> Program:
     )
 
 
-def stops(descriptor: int, web_port: str) -> Program:
+def stops(descriptor: int, web_port: str) -> ProgramSpec:
     """E-stop, stop and halt of the web's pages, on a socket that listens; the web gives way to it."""
-    return Program(
+    return ProgramSpec(
         "stops",
         (_MANAGE, "stops", "--descriptor", str(descriptor), "--web-port", web_port),
         announces=True,
@@ -42,9 +42,9 @@ def stops(descriptor: int, web_port: str) -> Program:
     )
 
 
-def gate(host: str, port: int) -> Program:
+def gate(host: str, port: int) -> ProgramSpec:
     """Where stations on other computers connect: at this port, with their pictures at the next."""
-    return Program(
+    return ProgramSpec(
         "gate",
         (_MANAGE, "gate", "--host", host, "--port", str(port)),
         announces=True,
@@ -53,15 +53,15 @@ def gate(host: str, port: int) -> Program:
     )
 
 
-def worker() -> Program:
+def worker() -> ProgramSpec:
     """Worker of every queue; what it was about to do is done at the next start."""
-    return Program("worker", (_MANAGE, "worker"), patience_s=20.0, of_web=True)
+    return ProgramSpec("worker", (_MANAGE, "worker"), patience_s=20.0, of_web=True)
 
 
-def station(deployment: str, assignments: Sequence[str]) -> Program:
+def station(deployment: str, assignments: Sequence[str]) -> ProgramSpec:
     """A runtime: a family of processes with a supervisor of its own."""
     sets = [part for assignment in assignments for part in ("--set", assignment)]
-    return Program(f"station-{_stem(deployment)}", ("-m", "runtime", deployment, *sets), patience_s=15.0)
+    return ProgramSpec(f"station-{_stem(deployment)}", ("-m", "runtime", deployment, *sets), patience_s=15.0)
 
 
 def bench(seed: int, width: int, height: int) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ def bench(seed: int, width: int, height: int) -> tuple[str, ...]:
     return ("--seed", str(seed), "--width", str(width), "--height", str(height))
 
 
-def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program:
+def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> ProgramSpec:
     """The simulated bench with these options, on free ports that it keeps."""
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
         return ("-m", "runtime.sim.node", "--robot", robot, "--bench", "tabletop", *options, *ends)
 
     free = "tcp://127.0.0.1:0"
-    return Program(
+    return ProgramSpec(
         name,
         arguments(free, free),
         announces=True,
@@ -85,14 +85,14 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
     )
 
 
-def leader(robot: str, observations: str, seed: int) -> Program:
+def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
     """A demonstrator of the simulated bench's task with a leader arm, on a free port that it keeps."""
 
     def arguments(endpoint: str) -> tuple[str, ...]:
         watching = ("-m", "runtime.sim.leader", "--robot", robot, "--obs-endpoint", observations)
         return (*watching, "--seed", str(seed), "--endpoint", endpoint)
 
-    return Program(
+    return ProgramSpec(
         "leader",
         arguments("tcp://127.0.0.1:0"),
         announces=True,
@@ -106,13 +106,13 @@ def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tup
     return (*what, "--name", name, "--port", str(port), *options)
 
 
-def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Program:
+def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
     """A scripted policy on that port, or on a free one that it keeps."""
 
     def arguments(port: object) -> tuple[str, ...]:
         return ("-m", "runtime.sim.serve", *_serving(name, robot, options, port))
 
-    return Program(
+    return ProgramSpec(
         f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(port_of(found))
     )
 
@@ -123,7 +123,7 @@ def lockstep(
     robot: str,
     policies: Mapping[str, tuple[Sequence[str], int]],
     options: Sequence[str],
-) -> Program:
+) -> ProgramSpec:
     """A station, its simulated bench and its policy servers in one process on a virtual clock.
 
     `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses. `options`:
@@ -136,7 +136,7 @@ def lockstep(
         for part in ("--serve", shlex.join(_serving(name, robot, skill, port)))
     ]
     arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, *options)
-    return Program(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
+    return ProgramSpec(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
 
 
 def port_of(found: Mapping[str, Any]) -> str:

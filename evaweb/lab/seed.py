@@ -11,8 +11,8 @@ from django.db import transaction
 
 from evaweb.plans.documents import checkpoint_of
 from evaweb.plans.models import Allocation, Plan, PlanState, StoppingRule
-from evaweb.plans.services import plan_amend, plan_freeze
-from evaweb.roles import Role, grant
+from evaweb.plans.services import amend_plan, freeze_plan
+from evaweb.roles import Role, set_role
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 
@@ -20,7 +20,7 @@ _ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # nothing that looks like somethi
 
 
 @dataclass(frozen=True, slots=True)
-class Login:
+class DemoLogin:
     """An account and its fresh password."""
 
     username: str
@@ -33,18 +33,18 @@ def fresh_password() -> str:
 
 
 @transaction.atomic
-def demo_login(*, username: str, role: Role) -> Login:
+def demo_login(*, username: str, role: Role) -> DemoLogin:
     """The account of that name with its role and a password that was never used before."""
     user, _ = User.objects.get_or_create(username=username)
     password = fresh_password()
     user.set_password(password)
     user.is_active = True
     user.save()
-    grant(user=user, role=role)
-    return Login(username, password)
+    set_role(user=user, role=role)
+    return DemoLogin(username, password)
 
 
-def nobody_can_log_in() -> bool:
+def has_no_accounts() -> bool:
     """True if there is no account yet, or none that is switched on."""
     return not User.objects.filter(is_active=True).exists()
 
@@ -144,8 +144,8 @@ def demo_plan(
         now = {row.name: checkpoint_of(row) for row in plan.checkpoints.all()}
         if now == {row["name"]: row for row in (plan.document or {})["checkpoints"]}:
             return plan
-        plan = plan_amend(user=user, plan=plan, reason=_PLAN_CHANGED)
-    return plan_freeze(user=user, plan=plan) if plan.state == PlanState.DRAFT else plan
+        plan = amend_plan(user=user, plan=plan, reason=_PLAN_CHANGED)
+    return freeze_plan(user=user, plan=plan) if plan.state == PlanState.DRAFT else plan
 
 
 def demo_checkpoint(*, name: str, description: str, policy: Mapping[str, object]) -> Checkpoint:

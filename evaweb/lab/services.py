@@ -14,7 +14,7 @@ from evaweb.jobs.models import Job
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.services import enqueue
 from evaweb.lab.diagnosis.bundle import folder
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 
 log = logging.getLogger(__name__)
 _NAME = re.compile(r"eva-diagnosis-\d{8}-\d{6}\.zip")
@@ -22,7 +22,7 @@ _NAME = re.compile(r"eva-diagnosis-\d{8}-\d{6}\.zip")
 
 def bundle_ask(*, user: User) -> Job:
     """Have a bundle made, as this administrator may see the lab."""
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     name = f"eva-diagnosis-{timezone.now():%Y%m%d-%H%M%S}.zip"
     log.info("%a asks for the diagnostic bundle %s", user.get_username(), name)
     return enqueue(kind="diagnose", key=_key(user), args={"user": user.pk, "name": name})

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 from evaweb.errors import EvaError
 from evaweb.lab import lifetime, programs, seed
-from evaweb.lab.processes import LabError, Processes, Program
+from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec
 from evaweb.trials.models import Checkpoint
 
 SKILLED, CLUMSY = "pick-place-40k", "pick-place-8k"
@@ -69,7 +69,9 @@ def benches_of(options: Mapping[str, Any]) -> Benches:
     return Benches(options.get("seed", Benches.seed), options["pictures"], options["set"])
 
 
-def bring(processes: Processes, station: str, robot: str, how: Benches) -> Generator[str, None, list[str]]:
+def bring(
+    processes: ChildProcesses, station: str, robot: str, how: Benches
+) -> Generator[str, None, list[str]]:
     """Start the bench and the policies of a station, a look at a time; yields what is being started.
 
     Returns what its deployment is to be given besides. A policy serves all stations with this robot; its checkpoint is
@@ -92,7 +94,9 @@ def bring(processes: Processes, station: str, robot: str, how: Benches) -> Gener
     ]
 
 
-def _starting(processes: Processes, program: Program, what: str) -> Generator[str, None, Mapping[str, Any]]:
+def _starting(
+    processes: ChildProcesses, program: ProgramSpec, what: str
+) -> Generator[str, None, Mapping[str, Any]]:
     begun = processes.starting(program)
     while True:
         try:

@@ -25,8 +25,8 @@ from evaweb.lab.draft_form import form_of
 from evaweb.lab.first_steps import Walk, walk
 from evaweb.lab.seed import station_registered
 from evaweb.plans import pictures
-from evaweb.plans.bench_checks import cameras_confirm, cameras_of
-from evaweb.roles import Role, require
+from evaweb.plans.bench_checks import cameras_of, confirm_cameras
+from evaweb.roles import Role, require_role
 from evaweb.stations.selectors import station_get
 
 _BACKEND = "django.contrib.auth.backends.ModelBackend"
@@ -86,14 +86,14 @@ def make_first_account(request: HttpRequest) -> HttpResponse:
 @require_GET
 def steps(request: HttpRequest) -> HttpResponse:
     """The way to the first scored trial."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     return _steps(request)
 
 
 @require_GET
 def news(request: HttpRequest) -> HttpResponse:
     """Nothing as long as the steps stand as the page shows them; else the page is told to load again."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     answer = HttpResponse(status=204)
     if _walk(request).mark != request.GET.get("mark", ""):
         answer["HX-Refresh"] = "true"
@@ -103,7 +103,7 @@ def news(request: HttpRequest) -> HttpResponse:
 @require_POST
 def simulated(request: HttpRequest) -> HttpResponse:
     """Write the deployment of a simulated station."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     name = request.POST.get("station", "").strip()
     try:
         deployments.write_simulated(name=name, robot=request.POST.get("robot", ""))
@@ -115,7 +115,7 @@ def simulated(request: HttpRequest) -> HttpResponse:
 @require_http_methods(["GET", "HEAD", "POST"])
 def draft(request: HttpRequest) -> HttpResponse:
     """The form of a draft as its choices stand, to be put into the page; posted, the draft is written."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     if request.method != "POST":
         return render(request, "lab/draft_form.html", {"draft": form_of(request.GET.dict())})
     form = form_of(request.POST.dict())
@@ -132,14 +132,14 @@ def draft(request: HttpRequest) -> HttpResponse:
 @require_GET
 def check_draft(request: HttpRequest, name: str) -> HttpResponse:
     """What the runtime's own check says of a deployment, to be put into the page."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     return render(request, "lab/checked.html", {"faults": deployments.faults_of(_kept(name).path)})
 
 
 @require_GET
 def deployment(request: HttpRequest, name: str) -> HttpResponse:
     """The deployment file, to be kept."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     found = _kept(name)
     return FileResponse(found.path.open("rb"), as_attachment=True, filename=found.path.name)
 
@@ -147,7 +147,7 @@ def deployment(request: HttpRequest, name: str) -> HttpResponse:
 @require_POST
 def again(request: HttpRequest, name: str) -> HttpResponse:
     """Have the lab start a station anew that it could not start."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     deployments.try_again(name=name)
     return _to(name)
 
@@ -155,7 +155,7 @@ def again(request: HttpRequest, name: str) -> HttpResponse:
 @require_POST
 def remove(request: HttpRequest, name: str) -> HttpResponse:
     """Remove the deployment of a station."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     deployments.remove(name=name)
     messages.success(request, f"{name} is removed")
     return _to("")
@@ -164,13 +164,13 @@ def remove(request: HttpRequest, name: str) -> HttpResponse:
 @require_GET
 def camera(request: HttpRequest, name: str, camera: str) -> HttpResponse:
     """What a camera shows now."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     station = station_get(name=name)
     if camera not in cameras_of(station):
         raise NotFound(
             f"{name} has no camera {camera!r:.60}; it has {', '.join(cameras_of(station)) or 'none'}"
         )
-    answer = HttpResponse(pictures.now(station, [camera])[camera], content_type="image/jpeg")
+    answer = HttpResponse(pictures.current_images(station, [camera])[camera], content_type="image/jpeg")
     answer["Cache-Control"] = "no-store"
     return answer
 
@@ -178,12 +178,12 @@ def camera(request: HttpRequest, name: str, camera: str) -> HttpResponse:
 @require_POST
 def cameras(request: HttpRequest, name: str) -> HttpResponse:
     """Confirm that each camera has its right name; where names were exchanged, exchange them in the deployment."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     station = station_get(name=name)
     shown = {key: request.POST.get(f"shows.{key}", key) for key in cameras_of(station)}
     try:
         if all(key == right for key, right in shown.items()):
-            cameras_confirm(user=request.user, station=station, first=True)
+            confirm_cameras(user=request.user, station=station, first=True)
         else:
             deployments.cameras_exchanged(name=name, shown=shown)
             messages.success(request, f"the names are exchanged: start {name} anew, then look again")
@@ -195,7 +195,7 @@ def cameras(request: HttpRequest, name: str) -> HttpResponse:
 @require_POST
 def scene(request: HttpRequest) -> HttpResponse:
     """Make the starter scene."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     first_steps.starter_scene()
     return _to(request.POST.get("station", ""))
 
@@ -236,7 +236,7 @@ def _kept(name: str) -> deployments.Kept:
 @require_GET
 def machine(request: HttpRequest) -> HttpResponse:
     """What a lab needs of this machine, and what was found."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     return render(request, "lab/machine.html", {"lines": machine_check.lines()})
 
 
@@ -246,7 +246,7 @@ def machine(request: HttpRequest) -> HttpResponse:
 @require_http_methods(["GET", "HEAD", "POST"])
 def diagnosis(request: HttpRequest) -> HttpResponse:
     """The bundles that this administrator had made; posted, another one is asked for."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     if request.method == "POST":
         services.bundle_ask(user=request.user)
         return redirect("diagnosis")
@@ -263,6 +263,6 @@ def diagnosis(request: HttpRequest) -> HttpResponse:
 @require_GET
 def diagnosis_file(request: HttpRequest, file: str) -> HttpResponse:
     """One of them."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     path = services.bundle_get(user=request.user, name=file)
     return FileResponse(path.open("rb"), as_attachment=True, filename=path.name)

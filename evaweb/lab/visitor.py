@@ -27,7 +27,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from evaweb.binary_frames import decode
 from evaweb.errors import EvaError
-from evaweb.lab.patience import NoReply, Patience, VisitFailed
+from evaweb.lab.patience import DemoFailed, NoReply, ProgressTimeout
 
 _RENEW_S = 1.0
 _LOOK_S = 1.0  # between two looks at whether something goes on
@@ -36,7 +36,7 @@ _LARGEST_FRAME = 16 * 1024 * 1024
 _TOKEN = re.compile(r'name="csrfmiddlewaretoken" value="([^"]+)"')
 
 
-class NotYet(VisitFailed):
+class StateTimeout(DemoFailed):
     """No state came in time that is as it was wanted."""
 
 
@@ -47,7 +47,7 @@ class _NoRedirect(HTTPRedirectHandler):
         return None
 
 
-class Visitor:
+class RestClient:
     """One logged-in session over HTTP."""
 
     def __init__(self, url: str) -> None:
@@ -64,7 +64,7 @@ class Visitor:
         page = self._open(Request(f"{self.url}/login/")).decode()
         found = _TOKEN.search(page)
         if not found:
-            raise VisitFailed(f"{self.url}/login/ has no login form")
+            raise DemoFailed(f"{self.url}/login/ has no login form")
         form = {"username": username, "password": password, "csrfmiddlewaretoken": found[1]}
         request = Request(f"{self.url}/login/", urlencode(form).encode(), {"Referer": f"{self.url}/login/"})
         try:
@@ -73,8 +73,8 @@ class Visitor:
             answer.close()
             if answer.code == 302:
                 return
-            raise VisitFailed(f"login as {username}: HTTP {answer.code}") from None
-        raise VisitFailed(f"login as {username}: name or password is wrong")
+            raise DemoFailed(f"login as {username}: HTTP {answer.code}") from None
+        raise DemoFailed(f"login as {username}: name or password is wrong")
 
     def get(self, path: str) -> Any:
         """The JSON of `path` under /api/v1."""
@@ -114,7 +114,7 @@ class Visitor:
         except HTTPError as refusal:
             with refusal:
                 body = refusal.read().decode("utf-8", "replace")
-            raise VisitFailed(
+            raise DemoFailed(
                 f"{request.get_method()} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
             ) from None
         except (URLError, TimeoutError, ConnectionError) as error:  # the latter while the body is read
@@ -143,7 +143,7 @@ class LivePage:
     `page` is the id of a page that was open before, under which it goes on; "" makes another one.
     """
 
-    def __init__(self, visitor: Visitor, station: str, page: str = "") -> None:
+    def __init__(self, visitor: RestClient, station: str, page: str = "") -> None:
         self.page = page or uuid.uuid4().hex
         self.station = station
         self.epoch = 0  # of our lease; 0: none
@@ -171,7 +171,7 @@ class LivePage:
                 proxy=None,
             )
         except (OSError, InvalidHandshake, ConnectionClosed) as error:  # closed while it was being opened
-            raise VisitFailed(f"the live connection to {self.station} does not open: {error}") from error
+            raise DemoFailed(f"the live connection to {self.station} does not open: {error}") from error
 
     def wait(
         self, reached: Callable[[Mapping[str, Any]], bool], seconds: float, what: str
@@ -184,25 +184,27 @@ class LivePage:
         with self._changed:
             while not (self._state and self._is_news() and reached(self._state)):
                 if self._failure:
-                    raise VisitFailed(f"{what}: {self._failure}")
+                    raise DemoFailed(f"{what}: {self._failure}")
                 if not self._changed.wait(deadline - time.monotonic()) and time.monotonic() >= deadline:
-                    raise NotYet(f"{what}: not within {seconds:g} s; the station is {_words(self._state)}")
+                    raise StateTimeout(
+                        f"{what}: not within {seconds:g} s; the station is {_words(self._state)}"
+                    )
             return self._state
 
-    def follow(
+    def wait_with_progress(
         self,
         reached: Callable[[Mapping[str, Any]], bool],
         what: str,
         mark: Callable[[Mapping[str, Any]], object],
     ) -> Mapping[str, Any]:
         """As `wait`, while there is progress: `mark` of the state is another one whenever something went on."""
-        patience = Patience(what)
+        patience = ProgressTimeout(what)
         while True:
             try:
                 return self.wait(reached, _LOOK_S, what)
-            except NotYet:
+            except StateTimeout:
                 state = self._state
-                patience.look(mark(state) if state else None, _words(state))
+                patience.update(mark(state) if state else None, _words(state))
 
     def claim(self) -> None:
         """Take the station; renewed from then on."""
@@ -243,7 +245,7 @@ class LivePage:
                 if isinstance(message, bytes):
                     self._frame(message)
                 else:
-                    self._told(json.loads(message))
+                    self._on_message(json.loads(message))
         except (ConnectionClosed, EvaError, ValueError) as error:
             self._fail(f"the live connection broke: {error}")
         else:
@@ -258,7 +260,7 @@ class LivePage:
             self._changed.notify_all()
         self._send({"type": "credit"})
 
-    def _told(self, message: Mapping[str, Any]) -> None:
+    def _on_message(self, message: Mapping[str, Any]) -> None:
         if message.get("type") == "renewed" and message.get("lost") and message.get("epoch") == self.epoch:
             self._fail(f"the lease was lost: {message.get('reason')}")
 

@@ -17,7 +17,7 @@ from django.utils.safestring import SafeString, mark_safe
 
 from evaweb.errors import EvaError
 from evaweb.plans.design import looks_of
-from evaweb.plans.exchange import exported, exported_with_pictures, imported
+from evaweb.plans.exchange import export_archive, export_toml, import_file
 from evaweb.plans.models import Plan, PlanEvent, PlanState
 from evaweb.plans.references import LARGEST, unpacked
 from evaweb.trials.admin import ReadOnly, Table
@@ -207,7 +207,7 @@ class PlanAdmin(admin.ModelAdmin):
         if request.method == "POST" and form.is_valid():
             text, pictures = form.cleaned_data["file"]
             try:
-                lines = imported(user=request.user, text=text, pictures=pictures)
+                lines = import_file(user=request.user, text=text, pictures=pictures)
             except EvaError as error:
                 form.add_error("file", str(error))
             else:
@@ -231,20 +231,20 @@ class PlanAdmin(admin.ModelAdmin):
             "plans": list(newest.values()),
         }
         if "pictures" in request.GET:
-            return _download(exported_with_pictures(**everything), "lab.zip", "application/zip")
-        return _download(exported(**everything), "lab.toml")
+            return _download(export_archive(**everything), "lab.zip", "application/zip")
+        return _download(export_toml(**everything), "lab.toml")
 
     @admin.action(description="Export as TOML")
     def export(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
         """Those chosen, with the scenes and checkpoints that they are made of."""
         plans = _newest(rows)
-        return _download(exported(plans=plans), f"{_title(plans)}.toml")
+        return _download(export_toml(plans=plans), f"{_title(plans)}.toml")
 
     @admin.action(description="Export with reference pictures (zip)")
     def export_archive(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
         """The same with the reference pictures of their positions."""
         plans = _newest(rows)
-        return _download(exported_with_pictures(plans=plans), f"{_title(plans)}.zip", "application/zip")
+        return _download(export_archive(plans=plans), f"{_title(plans)}.zip", "application/zip")
 
     @admin.display(description="trials")
     def trials(self, plan: Plan) -> str:

@@ -19,21 +19,21 @@ from evaweb.plans.counting import require_scored_first
 from evaweb.plans.design import (
     crossed_while_waiting,
     dropped_of,
+    end_reason,
     ended_at_an_ask,
-    ended_because,
     findings_of,
-    told_reason,
+    visible_close_reason,
 )
 from evaweb.plans.documents import require_checkpoints, require_scene, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.selectors import without_dropped
-from evaweb.plans.services import plan_end, slots_of
-from evaweb.roles import Role, require
+from evaweb.plans.services import end_plan_if_decided, slots_of
+from evaweb.roles import Role, require_role
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.services import require_none_open, trial_create
-from evaweb.trials.voids import voids_lapse, voids_waiting
+from evaweb.trials.services import create_trial, require_none_open
+from evaweb.trials.voids import lapse_void_requests, open_void_requests
 from runtime.core.sentences import Pattern
 
 _HAS_ENDED = Pattern("plans.allocation.has_ended", "{plan} has ended: {why}")
@@ -70,31 +70,31 @@ class Progress:
     attempts: int
 
 
-def progress(plan: Plan) -> Progress:
+def plan_progress(plan: Plan) -> Progress:
     """Progress of a plan; it tells nothing of any checkpoint."""
     slots = _with_newest(plan.slots.all())
     counted = slots.filter(newest=TrialStatus.SCORED).count()
     return Progress(plan.slots.count(), counted, plan.handouts.count())
 
 
-def hand_out(*, user: User, station: Station, plan: Plan) -> Handout:
+def allocate_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     """Prepare the next trial of `plan` on `station`.
 
     Conflict where nothing is left for it, its last trial is not finished, or scene or checkpoint are not as frozen;
     NotAllowed for a user who has looked behind the blind.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _check(plan, user, station)
     require_none_open(station)  # before anything is said of the design: then there is one answer
     with transaction.atomic():  # kept also where no trial is handed out
         held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
-        voids_lapse(Trial.objects.filter(handout__plan=held), user=user)
-    plan_end(user=user, plan=plan, asked=True)
-    return _handed_out(user, station, plan)
+        lapse_void_requests(Trial.objects.filter(handout__plan=held), user=user)
+    end_plan_if_decided(user=user, plan=plan, asked=True)
+    return _allocate(user, station, plan)
 
 
 @transaction.atomic
-def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
+def _allocate(user: User, station: Station, plan: Plan) -> Handout:
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner", "evaluation").get(pk=plan.pk)
     _check(held, user, station)
     _check_goes_on(held)
@@ -104,7 +104,7 @@ def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
     if slot.station_id is None:
         held.slots.filter(block=slot.block).update(station=station)
     number = (held.handouts.aggregate(last=Max("number"))["last"] or 0) + 1
-    trial = trial_create(
+    trial = create_trial(
         user=user,
         station=station,
         evaluation=held.evaluation,
@@ -120,18 +120,18 @@ def _handed_out(user: User, station: Station, plan: Plan) -> Handout:
         number=number,
         slot=slot,
         trial=trial,
-        code=blinding.codes(bytes(held.key or b""), number)[-1],
-        reason=_why_again(before) if before else "",
+        code=blinding.draw_codes(bytes(held.key or b""), number)[-1],
+        reason=_repeat_reason(before) if before else "",
     )
 
 
 @transaction.atomic
-def give_back(*, user: User, plan: Plan, station: Station, reason: str) -> int:
+def release_slots(*, user: User, plan: Plan, station: Station, reason: str) -> int:
     """Take the slots that `station` has not begun from it, for others: a robot broke. How many it were."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
     mine = _with_newest(held.slots.filter(station=station))
-    idle = [slot.pk for slot in mine if slot.newest is None or slot.newest in lifecycle.REPEATED]
+    idle = [slot.pk for slot in mine if slot.newest is None or slot.newest in lifecycle.REPEATABLE_STATES]
     freed = Slot.objects.filter(pk__in=idle).update(station=None)
     if freed:
         PlanEvent.objects.create(
@@ -142,7 +142,7 @@ def give_back(*, user: User, plan: Plan, station: Station, reason: str) -> int:
 
 def _check(plan: Plan, user: User, station: Station) -> None:
     if plan.state != PlanState.FROZEN:
-        why = told_reason(plan, sealed=True)
+        why = visible_close_reason(plan, sealed=True)
         raise Conflict(
             _HAS_ENDED(plan=plan, why=why)
             if why
@@ -156,10 +156,10 @@ def _check(plan: Plan, user: User, station: Station) -> None:
 
 
 def _check_goes_on(plan: Plan) -> None:
-    waits = voids_waiting(Trial.objects.filter(handout__plan=plan)).order_by("pk").first()
+    waits = open_void_requests(Trial.objects.filter(handout__plan=plan)).order_by("pk").first()
     ended = ended_at_an_ask(plan) or (crossed_while_waiting(plan, waits.at) if waits else "")
     if not ended and (found := findings_of(plan)) is not None and found.ended == "boundary":
-        ended = ended_because(plan, found)  # since this ask began
+        ended = end_reason(plan, found)  # since this ask began
     if ended:
         then = f"the void of trial {waits.trial_id} is answered" if waits else "its last trial is scored"
         raise Conflict(_HAS_ENDED_CLOSED_ONCE(plan=plan, ended_because=ended, then=then))
@@ -170,12 +170,12 @@ def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
     tried = without_dropped(plan.slots.all(), dropped_of(plan))
     slots = _with_newest(tried.select_related("scene", "position", "checkpoint").order_by("index"))
     for slot in slots.filter(station=station):
-        if slot.newest is None or slot.newest in lifecycle.REPEATED:
+        if slot.newest is None or slot.newest in lifecycle.REPEATABLE_STATES:
             return slot, _newest_trial(slot)
     fresh = slots.filter(station=None).first()
     if fresh is not None:
         return fresh, _newest_trial(fresh)
-    elsewhere = [slot for slot in slots if slot.newest is None or slot.newest in lifecycle.REPEATED]
+    elsewhere = [slot for slot in slots if slot.newest is None or slot.newest in lifecycle.REPEATABLE_STATES]
     if elsewhere:
         names = ", ".join(sorted({slot.station.name for slot in elsewhere if slot.station}))
         raise Conflict(
@@ -197,7 +197,7 @@ def _newest_trial(slot: Slot) -> Trial | None:
     return handout.trial if handout else None
 
 
-def _why_again(before: Trial) -> str:
+def _repeat_reason(before: Trial) -> str:
     said = f": {before.reason}" if before.reason else ""
     return f"attempt {before.attempt} was {TrialStatus(before.status).label}{said}"
 

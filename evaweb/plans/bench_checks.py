@@ -14,21 +14,21 @@ from django.db import transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.journal import text
+from evaweb.journal import clean_text
 from evaweb.plans import pictures, regions
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.counting import fails_by
 from evaweb.plans.design import ended_at_an_ask
 from evaweb.plans.documents import require_checkpoints, require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from evaweb.stations.models import Station
-from evaweb.stations.robot_geometry import facts_of
+from evaweb.stations.robot_geometry import describe_robot
 from evaweb.trials.models import Position, Trial, TrialStatus
-from evaweb.trials.services import declare_check
+from evaweb.trials.services import register_check
 from evaweb.trials.verdicts import LONGEST_NOTE
-from evaweb.trials.voids import declare_by_two
+from evaweb.trials.voids import register_two_person_rule
 from runtime.core.sentences import Pattern, fixed
 
 _NO_REFERENCE_PICTURE_YET_LOOK = Pattern(
@@ -90,10 +90,10 @@ LOOK_HOLDS = timedelta(minutes=2)  # at the bench, before the run
 
 def cameras_of(station: Station) -> list[str]:
     """The cameras of the station's robot."""
-    return [str(camera) for camera in facts_of(station.robot)["cameras"]]
+    return [str(camera) for camera in describe_robot(station.robot)["cameras"]]
 
 
-def cameras_confirmed(*, user: User, station: Station) -> CameraCheck | None:
+def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
     """The look at the cameras that still holds for this user; None: they look at them before their next trial."""
     newest = CameraCheck.objects.filter(station=station, by=user).first()
     if newest is None or newest.boot != station.boot or timezone.now() - newest.at > HOLDS:
@@ -102,27 +102,27 @@ def cameras_confirmed(*, user: User, station: Station) -> CameraCheck | None:
 
 
 @transaction.atomic
-def cameras_confirm(*, user: User, station: Station, first: bool = False) -> CameraCheck:
+def confirm_cameras(*, user: User, station: Station, first: bool = False) -> CameraCheck:
     """Write down that each camera shows what its reference shows, with what it shows now.
 
     `first`: where a camera has no reference yet, what it shows becomes it; without that Conflict names the camera.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     cameras = cameras_of(station)
     known = references(station=station, position=None)
     missing = [camera for camera in cameras if camera not in known]
     if missing and not first:
         raise Conflict(_NO_REFERENCE_PICTURE_YET_LOOK(missing=", ".join(missing)))
     seen = {}
-    for camera, jpeg in pictures.now(station, cameras).items():
-        name = pictures.keep(jpeg)
+    for camera, jpeg in pictures.current_images(station, cameras).items():
+        name = pictures.store_image(jpeg)
         reference = known.get(camera) or Reference.objects.create(
             station=station, camera=camera, picture=name, by=user
         )
         seen[camera] = {
             "picture": name,
             "reference": reference.picture,
-            "match": pictures.match(pictures.kept(reference.picture), jpeg),
+            "match": pictures.image_match(pictures.load_image(reference.picture), jpeg),
         }
     return CameraCheck.objects.create(station=station, boot=station.boot, seen=seen, by=user)
 
@@ -137,13 +137,13 @@ def references(*, station: Station, position: Position | None) -> dict[str, Refe
 
 
 @transaction.atomic
-def references_take(*, user: User, station: Station, position: Position | None) -> list[Reference]:
+def take_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
     """Make what the cameras show now the references of a position, or of the cameras; others stay in the record.
 
     Regions that were drawn stay where they are on the picture. Conflict where a running plan judges by one of them.
     """
-    require(user, Role.OPERATOR)
-    found = pictures.now(station, cameras_of(station))
+    require_role(user, Role.OPERATOR)
+    found = pictures.current_images(station, cameras_of(station))
     Station.objects.select_for_update().get(pk=station.pk)  # regions are drawn on the newest alone
     before = references(station=station, position=position)
     for reference in before.values():
@@ -153,7 +153,7 @@ def references_take(*, user: User, station: Station, position: Position | None) 
             station=station,
             position=position,
             camera=camera,
-            picture=pictures.keep(jpeg),
+            picture=pictures.store_image(jpeg),
             regions=before[camera].regions if camera in before else [],
             by=user,
         )
@@ -162,13 +162,13 @@ def references_take(*, user: User, station: Station, position: Position | None) 
 
 
 @transaction.atomic
-def regions_draw(*, user: User, reference: Reference, drawn: Any) -> Reference:
+def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
     """Another reference with the same picture and these regions: [{"name", "x", "y", "width", "height"}, ...].
 
     Conflict where there is a newer one, or where a running plan with a least match has begun to judge by this camera's
     reference: its gate does not change under it.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     found = regions.regions_of(drawn)
     position = reference.position
     if position is None:
@@ -177,7 +177,7 @@ def regions_draw(*, user: User, reference: Reference, drawn: Any) -> Reference:
     newest = references(station=station, position=position)[reference.camera]
     if newest.pk != reference.pk:
         raise Conflict(_HAS_NEWER_REFERENCE_HERE_BY(camera=reference.camera, user=newest.by.get_username()))
-    regions.check_sizes(found, pictures.kept(reference.picture))
+    regions.check_sizes(found, pictures.load_image(reference.picture))
     _require_unjudged(reference)
     return Reference.objects.create(
         station=station,
@@ -206,16 +206,16 @@ def _require_unjudged(reference: Reference) -> None:
 # --- trials --------------------------------------------------------------------------------------------------
 
 
-def next_trial(*, user: User, station: Station, plan: Plan) -> Handout:
+def allocate_checked_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     """The next trial of a plan, for a user who has looked at the cameras; see evaweb.plans.allocation."""
-    require(user, Role.OPERATOR)
-    if cameras_confirmed(user=user, station=station) is None:
+    require_role(user, Role.OPERATOR)
+    if current_camera_check(user=user, station=station) is None:
         raise Conflict(_BEFORE_YOUR_FIRST_TRIAL_CONFIRM(name=station.name))
-    return hand_out(user=user, station=station, plan=plan)
+    return allocate_trial(user=user, station=station, plan=plan)
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class CameraMatch:
     """What a camera shows of a bench now; `match` and `regions` as in Achieved, None and [] without a reference."""
 
     camera: str
@@ -233,7 +233,7 @@ class Seen:
         return None if self.match is None else (self.match, f"{self.camera} {self.match:.2f}")
 
 
-def bench_now(*, trial: Trial) -> list[Seen]:
+def current_matches(*, trial: Trial) -> list[CameraMatch]:
     """What each camera with a reference of the trial's position shows now, before the run, and how well it matches.
 
     Nothing once it is not prepared any more: a page that asks again and again may be a moment late.
@@ -241,40 +241,40 @@ def bench_now(*, trial: Trial) -> list[Seen]:
     if trial.status != TrialStatus.PREPARED:
         return []
     known = references(station=trial.station, position=trial.position)
-    return _look(trial, [camera for camera in cameras_of(trial.station) if camera in known], 1.0)
+    return _compare_cameras(trial, [camera for camera in cameras_of(trial.station) if camera in known], 1.0)
 
 
-def _look(trial: Trial, cameras: Sequence[str], patience_s: float) -> list[Seen]:
+def _compare_cameras(trial: Trial, cameras: Sequence[str], patience_s: float) -> list[CameraMatch]:
     if trial.status != TrialStatus.PREPARED:
         raise Conflict(_TRIAL_BENCH_LOOKED_AT_BEFORE(trial=trial.pk, status=trial.get_status_display()))
     known = references(station=trial.station, position=trial.position)
-    found = pictures.now(trial.station, cameras, patience_s)
+    found = pictures.current_images(trial.station, cameras, patience_s)
     return [_seen(camera, jpeg, known.get(camera)) for camera, jpeg in found.items()]
 
 
-def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> Seen:
+def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> CameraMatch:
     if reference is None:
-        return Seen(camera, jpeg, None, None, [])
-    before = pictures.kept(reference.picture)
+        return CameraMatch(camera, jpeg, None, None, [])
+    before = pictures.load_image(reference.picture)
     drawn = regions.regions_of(reference.regions)
-    rows = regions.matched(drawn, before, jpeg) if drawn else []
-    return Seen(camera, jpeg, reference, pictures.match(before, jpeg), rows)
+    rows = regions.match_regions(drawn, before, jpeg) if drawn else []
+    return CameraMatch(camera, jpeg, reference, pictures.image_match(before, jpeg), rows)
 
 
-def achieve(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
+def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     """Keep what the cameras show now, before the run, with how well it matches the position's references.
 
     Conflict where a match is below the plan's least and there is no reason in `override`.
     """
-    require(user, Role.OPERATOR)
-    why = text("override", override, LONGEST_NOTE)
-    seen = _look(trial, cameras_of(trial.station), 3.0)
+    require_role(user, Role.OPERATOR)
+    why = clean_text("override", override, LONGEST_NOTE)
+    seen = _compare_cameras(trial, cameras_of(trial.station), 3.0)
     _require_match(trial, seen, why)
     return [
         Achieved.objects.create(
             trial=trial,
             camera=one.camera,
-            picture=pictures.keep(one.jpeg),
+            picture=pictures.store_image(one.jpeg),
             reference=one.reference,
             match=one.match,
             regions=one.regions,
@@ -285,7 +285,7 @@ def achieve(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
     ]
 
 
-def _require_match(trial: Trial, seen: Sequence[Seen], why: str) -> None:
+def _require_match(trial: Trial, seen: Sequence[CameraMatch], why: str) -> None:
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     least = handout.plan.match_gate if handout else None
     if least is None or why:
@@ -295,7 +295,7 @@ def _require_match(trial: Trial, seen: Sequence[Seen], why: str) -> None:
         raise Conflict(_BENCH_NOT_AS_REFERENCE_SHOWS(low="; ".join(low), least=least))
 
 
-def _before(what: str, trial: Trial, user: Any) -> None:
+def _check_before(what: str, trial: Trial, user: Any) -> None:
     """Check trials of plans before they run, or are taken out of the count.
 
     Within a transaction the plan is kept from others until its end: no reveal comes between the check and the act.
@@ -309,7 +309,7 @@ def _before(what: str, trial: Trial, user: Any) -> None:
     if what == "run":
         newest = Achieved.objects.filter(trial=trial).last()
         if newest is None or timezone.now() - newest.at > LOOK_HOLDS:
-            achieve(user=user, trial=trial, override=newest.override if newest else "")
+            record_layout(user=user, trial=trial, override=newest.override if newest else "")
     if what.startswith("void") and handout.plan.state == PlanState.REVEALED:
         raise EvaError(_REVEALED_WHAT_VOIDED_NOW_WOULD(plan=handout.plan))
     if what == "voided" and handout.trial.status == TrialStatus.SCORED:
@@ -340,5 +340,5 @@ def _of_two(trial: Trial) -> bool:
     return handout is not None and (handout.plan.blind or fails_by(handout.plan, trial))
 
 
-declare_check(_before)
-declare_by_two(_of_two)
+register_check(_check_before)
+register_two_person_rule(_of_two)

@@ -15,8 +15,8 @@ from typing import Any
 from django.db import transaction
 from django.db.models import Count, Q, QuerySet
 
-from evaweb.blinding import EVERYTHING, Sight, declare, masked
-from evaweb.episodes.reconcile import concludes
+from evaweb.blinding import FULL_VISIBILITY, Visibility, plan_titles, register_visibility_rule
+from evaweb.episodes.reconcile import register_conclusion
 from evaweb.errors import NotAllowed
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
 from evaweb.plans.selectors import plans_beside
@@ -25,13 +25,13 @@ from evaweb.trials.models import Checkpoint, Evaluation, Trial
 from evaweb.trials.selectors import UNFINISHED
 
 
-def sealed_for(plan: Plan, user: Any) -> bool:
+def is_sealed_for(plan: Plan, user: Any) -> bool:
     """True if the plan is sealed for this user; looking is not recorded by asking."""
-    return plan.sealed and not has_looked(plan, user)
+    return plan.sealed and not is_unblinded(plan, user)
 
 
 @transaction.atomic
-def look(plan: Plan, user: Any) -> None:
+def record_unblinding(plan: Plan, user: Any) -> None:
     """Record that this user sees what is sealed from now on; raise NotAllowed where they may not."""
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner").get(pk=plan.pk)
     if not held.sealed:
@@ -46,7 +46,7 @@ def look(plan: Plan, user: Any) -> None:
         )
 
 
-def has_looked(plan: Plan, user: Any) -> bool:
+def is_unblinded(plan: Plan, user: Any) -> bool:
     """True if this user has seen what is sealed."""
     return Look.objects.filter(plan=plan, user=user).exists()
 
@@ -60,21 +60,21 @@ def has_looked_at_the_same(plan: Plan, user: Any) -> bool:
     return looks.filter(Q(plan__name=plan.name) | Q(plan__in=beside)).exists()
 
 
-def may_look(plan: Plan, user: Any) -> bool:
+def can_unblind(plan: Plan, user: Any) -> bool:
     """True if `look` would be granted, or was."""
     return not plan.sealed or _why_not(plan, user) == ""
 
 
-def hidden_from(user: Any) -> Sight:
+def visibility_for(user: Any) -> Visibility:
     """Sight of this user under the plans of now; see evaweb.blinding."""
     plans = Plan.objects.filter(blind=True, state__in=(PlanState.FROZEN, PlanState.CLOSED))
     if user.pk is not None:
         plans = plans.exclude(looks__user=user)
     # Names as they were frozen too: recordings keep the name that a checkpoint had.
     found = list(plans.values_list("pk", "title", "version", "document__checkpoints"))
-    lost = list(_lost().values_list("pk", "name", "version"))
+    lost = list(_lost_plans().values_list("pk", "name", "version"))
     if not (found or lost):
-        return EVERYTHING
+        return FULL_VISIBILITY
     keys = [pk for pk, *_ in found]
     orphans = Trial.objects.filter(evaluation__in=[pk for pk, *_ in lost]).order_by()
     of_plans = Checkpoint.objects.filter(Q(plan__in=keys) | Q(pk__in=orphans.values("checkpoint")))
@@ -87,30 +87,30 @@ def hidden_from(user: Any) -> Sight:
         .values_list("trial__station__name", "trial__status")
         .distinct(),
     ]
-    return Sight(
+    return Visibility(
         checkpoints=frozenset(hidden),
         names=frozenset({*hidden.values(), *frozen}),
         stations=frozenset(station for station, _ in handed),
         keys=frozenset(keys),
-        at_work=frozenset(station for station, status in handed if status in UNFINISHED),
-        plans=f"{masked(f'{title} v{version}' for _, title, version, *_ in (*found, *lost))} is blind until it is "
+        busy_stations=frozenset(station for station, status in handed if status in UNFINISHED),
+        plans=f"{plan_titles(f'{title} v{version}' for _, title, version, *_ in (*found, *lost))} is blind until it is "
         "revealed",
         user=user.pk,
     )
 
 
-declare(hidden_from)
+register_visibility_rule(visibility_for)
 
 
-def _lost() -> QuerySet[Evaluation]:
+def _lost_plans() -> QuerySet[Evaluation]:
     """What plans made that are not in the database, and may have been blind: nobody can be asked who may know."""
     return Evaluation.objects.filter(kind=Evaluation.Kind.PLAN, plan=None).exclude(trials=None).order_by("pk")
 
 
-@concludes
-def told_lost() -> Iterator[str]:
+@register_conclusion
+def lost_plan_notes() -> Iterator[str]:
     """A sentence for each plan that is not in the database any more, though its trials are."""
-    for row in _lost().annotate(number=Count("trials")):
+    for row in _lost_plans().annotate(number=Count("trials")):
         yield (
             f"{row.number} trials are of plan {row}, which is not in the database: what tells which checkpoint they "
             "were of stays hidden from everybody. Put a backup of the database back, or import the plan (plans import; "

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from evaweb.canonical import digest
 from evaweb.errors import EvaError
 from evaweb.plans.schedule import Unit
-from evaweb.plans.seeded_draws import KEY_BYTES, Chance
+from evaweb.plans.seeded_draws import KEY_BYTES, SeededDraws
 from runtime.core.sentences import Pattern
 
 _CODES_ALLOWED = Pattern("plans.commitment.codes_allowed", "{count} codes; allowed: {count_2}")
@@ -26,17 +26,17 @@ _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"  # without 0 and O, 1 and I: they 
 _LENGTH = 5
 
 
-def codes(key: bytes, count: int) -> list[str]:
+def draw_codes(key: bytes, count: int) -> list[str]:
     """`count` different codes, in the order of the trials; they say nothing of what they stand for."""
     if count > len(_LETTERS) ** _LENGTH // 100:
         raise EvaError(_CODES_ALLOWED(count=count, count_2=len(_LETTERS) ** _LENGTH // 100))
-    chance, found = Chance(key, "codes"), dict[str, None]()
+    chance, found = SeededDraws(key, "codes"), dict[str, None]()
     while len(found) < count:
         found["".join(_LETTERS[chance.below(len(_LETTERS))] for _ in range(_LENGTH))] = None
     return list(found)
 
 
-def commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
+def make_commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
     """Commitment shown before: HMAC-SHA-256 by the key of the plan's and its schedule's digests, in hex.
 
     With a key of 256 bits it tells nothing of the schedule, and no second schedule has it.
@@ -51,6 +51,6 @@ def schedule_digest(units: Sequence[Unit]) -> str:
     return digest({"units": [unit.row for unit in units]})
 
 
-def verified(plan: str, units: Sequence[Unit], key: bytes, committed: str) -> bool:
+def verify_commitment(plan: str, units: Sequence[Unit], key: bytes, committed: str) -> bool:
     """True if plan, schedule and key are those that were committed to."""
-    return hmac.compare_digest(commitment(plan, units, key), committed)
+    return hmac.compare_digest(make_commitment(plan, units, key), committed)

@@ -10,7 +10,7 @@ from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
 from evaweb.trials.endings import ENDINGS, ending_of
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.services import declare_check, declare_failing
+from evaweb.trials.services import declare_failing, register_check
 from runtime.core.sentences import Pattern
 
 _REPEATED = Pattern(
@@ -105,5 +105,5 @@ def _failing(trial: Trial) -> str:
     return str(_A_FAILURE(what=ENDS[ended_by(trial)]))
 
 
-declare_check(_judged)
+register_check(_judged)
 declare_failing(_failing)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.episodes.models import Episode
 from evaweb.jobs.models import Job
 
@@ -18,9 +18,9 @@ class Cover(Enum):
     ALL = 2
 
 
-def cover_of(job: Job, sight: Sight) -> Cover:
+def cover_of(job: Job, sight: Visibility) -> Cover:
     """Of a recording that is not hidden nothing is covered, of a blind trial all, of other work its words."""
-    if sight.clear:
+    if sight.sees_everything:
         return Cover.NOTHING
     if "uuid" in job.args:
         found = _episode(job.args["uuid"])

@@ -26,13 +26,13 @@ from evaweb.statistics.designs import (
     Block,
     Design,
     Findings,
+    boundary_from_table,
     check_design,
     design,
     findings,
     in_blocks,
-    of_table,
 )
-from evaweb.trials.lifecycle import JUDGED
+from evaweb.trials.lifecycle import SCORED_STATES
 from evaweb.trials.models import Score, Trial, TrialStatus
 from runtime.core.sentences import Pattern
 
@@ -77,7 +77,7 @@ def arms_of(comparisons: Sequence[Names]) -> list[str]:
     return list(dict.fromkeys(name for pair in comparisons for name in pair))
 
 
-def drafted(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) -> Design | None:
+def draft_design(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) -> Design | None:
     """The design of a draft, computed now; None without a comparison. EvaError says what cannot be.
 
     `counts`: trials of both checkpoints after each block, where they are in random order.
@@ -123,7 +123,7 @@ def _by_number(comparisons: Sequence[Names]) -> tuple[tuple[int, int], ...]:
     return tuple((arms.index(first), arms.index(second)) for first, second in comparisons)
 
 
-def frozen(document: Mapping[str, Any]) -> Design | None:
+def frozen_design(document: Mapping[str, Any]) -> Design | None:
     """The design of a frozen plan, also of one from before there were boundaries; None without a comparison."""
     comparisons = compared(document)
     if not comparisons:
@@ -138,7 +138,7 @@ def frozen(document: Mapping[str, Any]) -> Design | None:
         alpha,
         margin,
         said["outcome"],
-        of_table(rows, alpha / len(comparisons), margin) if rows else None,
+        boundary_from_table(rows, alpha / len(comparisons), margin) if rows else None,
         _by_number(comparisons),
         said["drops"],
         tuple((first, second) for first, second in said["counts"]) if said["counts"] else None,
@@ -194,7 +194,7 @@ class Attempt:
 def attempts_of(plan: Plan) -> list[Attempt]:
     """Those of a frozen plan's comparisons, in the order in which they were handed out; one query."""
     document = plan.document or {}
-    found = frozen(document)
+    found = frozen_design(document)
     if found is None:
         return []
     value = "success" if found.outcome == SUCCESS else "score"
@@ -203,7 +203,7 @@ def attempts_of(plan: Plan) -> list[Attempt]:
         given = given.filter(scored_at__lte=plan.kept_at)
     first = given.order_by("pk").values(value)[:1]
     rows = plan.handouts.filter(
-        trial__status__in=(*JUDGED, TrialStatus.INTERRUPTED),
+        trial__status__in=(*SCORED_STATES, TrialStatus.INTERRUPTED),
         slot__checkpoint__name__in=arms_of(compared(document)),
     ).order_by("number")
     named = ("trial_id", "trial__attempt", "trial__operator__username", "trial__station__name")
@@ -230,10 +230,10 @@ def attempts_of(plan: Plan) -> list[Attempt]:
     ]
 
 
-def tried(plan: Plan) -> Tried:
+def current_pairs(plan: Plan) -> Tried:
     """The blocks of a frozen plan as they are now; none without a comparison. One query."""
     document = plan.document or {}
-    found = frozen(document) if document else None
+    found = frozen_design(document) if document else None
     if found is None:
         return Tried([], [], [])
     return blocks_of(found, arms_of(compared(document)), attempts_of(plan))
@@ -282,12 +282,12 @@ def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
 def blocks_that_count(plan: Plan) -> list[Block]:
     """Of a revealed plan those of its reveal, else those there are now."""
     kept = kept_blocks(plan)
-    return tried(plan).counted if kept is None else kept
+    return current_pairs(plan).counted if kept is None else kept
 
 
 def findings_of(plan: Plan) -> Findings | None:
     """What the frozen design says: of a revealed plan as it stood at the reveal, else of the trials there are now."""
-    found = frozen(plan.document) if plan.document else None
+    found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return None
     return findings(found, blocks_that_count(plan))
@@ -299,7 +299,7 @@ def dropped_of(plan: Plan) -> dict[str, int]:
     A trial that is repeated counts as it was scored until its repetition is: were it open, those that had been left out
     would come next, and the operator would know which checkpoint they are of.
     """
-    found = frozen(plan.document) if plan.document else None
+    found = frozen_design(plan.document) if plan.document else None
     if found is None or not found.drops:
         return {}
     arms = arms_of(compared(plan.document or {}))
@@ -312,9 +312,9 @@ def dropped_of(plan: Plan) -> dict[str, int]:
     return {arms[arm]: at for arm, at in said.dropped.items() if said.at is None or at < said.at}
 
 
-def ended_because(plan: Plan, found: Findings) -> str:
+def end_reason(plan: Plan, found: Findings) -> str:
     """Reason why a design has ended, which tells nothing of any checkpoint."""
-    planned = frozen(plan.document or {})
+    planned = frozen_design(plan.document or {})
     return f"{ENDED[found.ended]}, after {found.at} {planned.unit if planned else 'pairs'}"
 
 
@@ -330,7 +330,7 @@ def crossed_while_waiting(plan: Plan, since: datetime) -> str:
     return told or ""
 
 
-def told_reason(plan: Plan, sealed: bool) -> str:
+def visible_close_reason(plan: Plan, sealed: bool) -> str:
     """Why it was closed; of a plan that is `sealed` for the reader only what the server itself says.
 
     Since format 6 the server has noted that: a reason of the owner's that begins like it stays the owner's.
@@ -350,13 +350,13 @@ def declare_kept(told: Callable[[Plan], dict[str, Any]]) -> None:
     _told_of.append(told)
 
 
-def at_the_reveal(plan: Plan) -> dict[str, Any] | None:
+def reveal_record(plan: Plan) -> dict[str, Any] | None:
     """What is kept with its digest: the blocks that count, the sums of each checkpoint, and what was declared.
 
     What is corrected later makes no other headline.
     """
     document = plan.document or {}
-    if frozen(document) is None and document.get("format", 1) < _ALL_KEPT:
+    if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:
         return None
     kept = counted_now(plan)
     for told in _told_of:
@@ -374,8 +374,8 @@ def recorded_so_far(plan: Plan) -> Hashable:
 def counted_now(plan: Plan) -> dict[str, Any]:
     """The blocks that count, and the sums of each checkpoint."""
     return {
-        "blocks": [[list(trial) for trial in block] for block in tried(plan).counted]
-        if frozen(plan.document or {}) is not None
+        "blocks": [[list(trial) for trial in block] for block in current_pairs(plan).counted]
+        if frozen_design(plan.document or {}) is not None
         else [],
         "arms": _sums(plan),
     }

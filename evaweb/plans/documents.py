@@ -9,11 +9,11 @@ from typing import Any
 from evaweb.canonical import digest
 from evaweb.errors import Conflict, EvaError
 from evaweb.plans.counting import ENDS
-from evaweb.plans.design import drafted, planned
+from evaweb.plans.design import draft_design, planned
 from evaweb.plans.models import Allocation, Plan
 from evaweb.plans.schedule import PAIRED, Condition, Unit, counts_of, schedule
 from evaweb.statistics.boundaries import MOST, SHAPES
-from evaweb.statistics.designs import table
+from evaweb.statistics.designs import boundary_table
 from evaweb.trials.models import Checkpoint, Position, Scene
 from runtime.core.sentences import Pattern
 
@@ -85,7 +85,7 @@ def _design(plan: Plan, document: dict[str, Any], key: bytes) -> dict[str, Any]:
         names = next(iter(document["comparisons"]), [row["name"] for row in document["checkpoints"]])
         counts = counts_of(_units(document, key), names)
         _check_counts(counts[-1], bounded=plan.stopping in SHAPES or plan.margin is not None)
-    found = drafted(plan, counts)
+    found = draft_design(plan, counts)
     return {
         "rule": plan.stopping,
         "alpha": plan.alpha,
@@ -94,7 +94,7 @@ def _design(plan: Plan, document: dict[str, Any], key: bytes) -> dict[str, Any]:
         "margin": plan.margin,
         "pairs": found.blocks if found else None,
         "counts": [list(count) for count in counts] if counts is not None else None,
-        "boundary": table(found.boundary) if found and found.boundary else None,
+        "boundary": boundary_table(found.boundary) if found and found.boundary else None,
     }
 
 

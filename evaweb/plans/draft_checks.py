@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from django.core.exceptions import ValidationError
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.errors import EvaError
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import check_drafted, planned
@@ -57,7 +57,7 @@ def _served(plan: Plan) -> Iterator[Remark]:
         )
 
 
-def covered(plan: Plan, sight: Sight) -> Callable[[str], str]:
+def covered(plan: Plan, sight: Visibility) -> Callable[[str], str]:
     """Sentences about a draft as they are said to somebody, without the names of checkpoints hidden from them."""
     rows = [*plan.checkpoints.filter(pk__in=sight.checkpoints), *filter(None, (plan.first, plan.second))]
     names = sorted({row.name for row in rows if row.pk in sight.checkpoints}, key=len, reverse=True)

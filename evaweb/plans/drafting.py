@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.canonical import digest
 from evaweb.plans.models import Comparing, Plan
 from evaweb.trials.models import Checkpoint
@@ -35,7 +35,7 @@ class Changed:
     conflicts: tuple[str, ...]
 
 
-def values_of(plan: Plan, sight: Sight = EVERYTHING) -> Values:
+def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
     """Everything of the draft that the plan's pages edit, as far as it is not hidden.
 
     `control` is the checkpoint with which others are compared, `challenger` the one that is compared with it where that

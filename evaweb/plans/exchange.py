@@ -28,7 +28,7 @@ from evaweb.plans.documents import checkpoint_of, scene_of
 from evaweb.plans.file import CheckpointTable, File, PlaceTable, PlanTable, SceneTable
 from evaweb.plans.models import Comparing, Plan, PlanState, Reference
 from evaweb.plans.references import packed, reference_tables, take_references
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 from evaweb.trials.scene_reading import kept_positions
@@ -68,7 +68,7 @@ _Row = TypeVar("_Row", bound=models.Model)
 # --- out ---------------------------------------------------------------------------------------------------
 
 
-def exported(
+def export_toml(
     *,
     scenes: list[Scene] | None = None,
     checkpoints: list[Checkpoint] | None = None,
@@ -78,7 +78,7 @@ def exported(
     return _written(scenes, checkpoints, plans)[0]
 
 
-def exported_with_pictures(
+def export_archive(
     *,
     scenes: list[Scene] | None = None,
     checkpoints: list[Checkpoint] | None = None,
@@ -176,12 +176,12 @@ def _without_none(value: Any) -> Any:
 # --- in ----------------------------------------------------------------------------------------------------
 
 
-def imported(*, user: User, text: str, pictures: Mapping[str, bytes] | None = None) -> list[str]:
+def import_file(*, user: User, text: str, pictures: Mapping[str, bytes] | None = None) -> list[str]:
     """Take a file; what was done, a line each. EvaError or Conflict names what cannot be, and nothing is taken then.
 
     `pictures`: those of an archive, by the names that references have in the text.
     """
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     given = _read(text)
     with transaction.atomic():
         return [
@@ -223,11 +223,11 @@ def _take_scene(table: SceneTable) -> str:
     scene = made or Scene(name=table.name)
     for name, value in wanted.items():
         setattr(scene, name, value)
-    _kept(scene, f"scene {table.name}")
+    _unchanged_note(scene, f"scene {table.name}")
     for row in positions:
-        _kept(Position(scene=scene, **row), f"position {row['number']} of scene {table.name}")
+        _unchanged_note(Position(scene=scene, **row), f"position {row['number']} of scene {table.name}")
     for row in milestones:
-        _kept(Milestone(scene=scene, **row), f"milestone {row['order']} of scene {table.name}")
+        _unchanged_note(Milestone(scene=scene, **row), f"milestone {row['order']} of scene {table.name}")
     return f"scene {scene.name}: {'changed' if made else 'new'}"
 
 
@@ -247,7 +247,7 @@ def _take_checkpoint(table: CheckpointTable) -> str:
         raise EvaError(_CHECKPOINT_PARENT_DOES_NOT_EXIST(name=table.name, parent=parent))
     for name, value in wanted.items():
         setattr(checkpoint, name, value)
-    _kept(checkpoint, f"checkpoint {table.name}")
+    _unchanged_note(checkpoint, f"checkpoint {table.name}")
     return f"checkpoint {checkpoint.name}: {'changed' if made else 'new'}"
 
 
@@ -271,7 +271,7 @@ def _take_plan(table: PlanTable, user: User) -> str:
             )
         )
     plan.first, plan.second = (*compared, None, None)[:2]
-    _kept(plan, f"plan {table.name}")
+    _unchanged_note(plan, f"plan {table.name}")
     plan.positions.set([_position(place, table) for place in table.positions])
     plan.checkpoints.set(checkpoints)
     plan.stations.set(stations)
@@ -292,7 +292,7 @@ def _named(model: type[_Row], kind: str, name: str, table: PlanTable) -> _Row:
     return found
 
 
-def _kept(row: models.Model, what: str) -> None:
+def _unchanged_note(row: models.Model, what: str) -> None:
     try:
         row.full_clean()
     except Invalid as invalid:

@@ -245,8 +245,8 @@ class Plan(models.Model):
             *("second_rater_share", "match_gate", "evaluation", "document", "digest", "commitment", "key"),
             "frozen_at",
         ),
-        only="OLD.state <> 'draft'",
-        moves={"state": {"frozen": ("closed",), "closed": ("revealed",), "revealed": ()}},
+        condition="OLD.state <> 'draft'",
+        allowed_changes={"state": {"frozen": ("closed",), "closed": ("revealed",), "revealed": ()}},
         never=(
             "OLD.state = 'revealed' AND (NEW.owner_id <> OLD.owner_id OR NEW.closed_because <> OLD.closed_because "
             "OR NEW.closed_at <> OLD.closed_at OR NEW.revealed_at IS NULL OR NEW.revealed_at <> OLD.revealed_at "
@@ -301,7 +301,9 @@ class Slot(models.Model):
         help_text="Which has taken its block.",
     )
 
-    append_only = AppendOnly("the schedule of a frozen plan is never changed: amend it", but=("station",))
+    append_only = AppendOnly(
+        "the schedule of a frozen plan is never changed: amend it", except_columns=("station",)
+    )
 
     class Meta:
         ordering = ("plan", "index")
@@ -402,9 +404,9 @@ class Reference(models.Model):
 class Achieved(models.Model):
     """What a camera showed when a trial's run was asked for, and how well that matches the reference there was.
 
-    `match` is evaweb.plans.pictures.match, of the whole picture; `regions` what evaweb.plans.regions.matched found in
-    each of the reference's, which count in its place where there are any. `override`: why a lower one than the plan's
-    least was accepted.
+    `match` is evaweb.plans.pictures.image_match, of the whole picture; `regions` what
+    evaweb.plans.regions.match_regions found in each of the reference's, which count in its place where there are
+    any. `override`: why a lower one than the plan's least was accepted.
     """
 
     trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="achieved")

@@ -21,7 +21,7 @@ from django.conf import settings
 
 from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.core.picture_bounds import MOST_PIXELS, require_scans
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
@@ -51,12 +51,12 @@ WIDTH, HEIGHT = (
 _TURN_S = 0.1
 
 
-def now(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> dict[str, bytes]:
+def current_images(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> dict[str, bytes]:
     """A JPEG of each of `cameras` as it is published now; Conflict names those that show nothing."""
     wanted = set(cameras)
     found: dict[str, bytes] = {}
     until = time.monotonic() + patience_s
-    endpoint = wire_to(station.name).address("media", "cameras")
+    endpoint = connection_to(station.name).address("media", "cameras")
     with closing(Subscriber(zmq.Context.instance(), endpoint, "camera/")) as subscriber:
         while wanted - set(found) and time.monotonic() < until:
             try:
@@ -70,7 +70,7 @@ def now(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> di
     return found
 
 
-def match(one: bytes, other: bytes) -> float:
+def image_match(one: bytes, other: bytes) -> float:
     """Match of two JPEGs: correlation of their grey values at 64 x 48, from 1, the same, to 0, and below 0.
 
     Brightness and contrast as a whole do not count. 0 where one of them is of one grey.
@@ -80,7 +80,7 @@ def match(one: bytes, other: bytes) -> float:
     return round(float((a * b).sum()) / spread, 4) if spread > 1e-6 else 0.0
 
 
-def keep(jpeg: bytes) -> str:
+def store_image(jpeg: bytes) -> str:
     """Put the picture on the disk, and return its name."""
     name = hashlib.sha256(jpeg).hexdigest()
     path = _path(name)
@@ -95,7 +95,7 @@ def keep(jpeg: bytes) -> str:
     return name
 
 
-def kept(name: str) -> bytes:
+def load_image(name: str) -> bytes:
     """The picture of that name; NotFound where it is not on this disk."""
     try:
         return _path(name).read_bytes()
@@ -103,7 +103,7 @@ def kept(name: str) -> bytes:
         raise NotFound(_PICTURE_NOT_ON_THIS_DISK(name=name)) from None
 
 
-def is_kept(name: str) -> bool:
+def has_image(name: str) -> bool:
     """True if the picture of that name is on this disk."""
     return _path(name).is_file()
 

@@ -99,7 +99,7 @@ def packed(text: str, name: str, references: Iterable[Mapping[str, Any]]) -> byt
         archive.writestr(name, text)
         for picture in sorted({str(row["picture"]) for row in references}):
             try:
-                jpeg = pictures.kept(picture)
+                jpeg = pictures.load_image(picture)
             except NotFound:
                 continue  # whoever imports the archive is told which it has not
             archive.writestr(f"pictures/{picture}.jpg", jpeg, zipfile.ZIP_STORED)
@@ -151,7 +151,7 @@ def _of(archive: zipfile.ZipFile) -> tuple[str, dict[str, bytes]]:
         if hashlib.sha256(jpeg).hexdigest() != name:
             raise EvaError(_BYTES_HAVE_ANOTHER_SHA_256(filename=entry.filename))
         try:
-            pictures.match(jpeg, jpeg)
+            pictures.image_match(jpeg, jpeg)
         except EvaError as error:
             raise EvaError(f"{entry.filename}: {error}") from None
         found[name] = jpeg
@@ -200,11 +200,11 @@ def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> st
     jpeg = found.get(row["picture"])
     if ours is not None:
         if jpeg is not None:
-            pictures.keep(jpeg)  # its file may have been lost
+            pictures.store_image(jpeg)  # its file may have been lost
         return "the same"
-    if jpeg is None and not pictures.is_kept(row["picture"]):
+    if jpeg is None and not pictures.has_image(row["picture"]):
         return "left out, because the file lacks their pictures: import the archive"
-    drawing.check_sizes(drawing.regions_of(row["regions"]), jpeg or pictures.kept(row["picture"]))
-    name = pictures.keep(jpeg) if jpeg else row["picture"]
+    drawing.check_sizes(drawing.regions_of(row["regions"]), jpeg or pictures.load_image(row["picture"]))
+    name = pictures.store_image(jpeg) if jpeg else row["picture"]
     Reference.objects.create(**key, picture=name, regions=row["regions"], by=user)
     return "new"

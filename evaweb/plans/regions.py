@@ -87,7 +87,7 @@ def regions_of(given: Any) -> list[Region]:
 
 def check_sizes(found: list[Region], jpeg: bytes) -> None:
     """EvaError where a region is too small on this picture, or shows nothing that could be recognised."""
-    picture = _common([decoded(jpeg, "RGB")])[0]
+    picture = _to_common_size([decoded(jpeg, "RGB")])[0]
     for region in found:
         top, left, bottom, right = _box(region, picture)
         if bottom - top < _LEAST or right - left < _LEAST:
@@ -96,11 +96,11 @@ def check_sizes(found: list[Region], jpeg: bytes) -> None:
                     name=region.name, right=right - left, bottom=bottom - top, least=_LEAST
                 )
             )
-        if _spread(_details(picture, (top, left, bottom, right))) < _FLAT:
+        if _spread(_band_passed(picture, (top, left, bottom, right))) < _FLAT:
             raise EvaError(_REGION_ONE_COLOUR_PICTURE_DRAW(name=region.name))
 
 
-def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
+def match_regions(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
     """Of each region {"name", "at", "match", "dx", "dy", "words"}; dx and dy are None where its object is not seen.
 
     `at` is the region, [x, y, width, height] as shares; `match` goes from 1, the same, to 0; `dx` to the right and `dy`
@@ -108,7 +108,7 @@ def matched(found: list[Region], reference: bytes, now: bytes) -> list[dict[str,
     the live picture is so small that a region has no pixel.
     """
     live = decoded(now, "RGB")
-    before, after = _common([decoded(reference, "RGB"), live])
+    before, after = _to_common_size([decoded(reference, "RGB"), live])
     scale = (live.shape[1] / after.shape[1], live.shape[0] / after.shape[0])
     return [
         {
@@ -126,10 +126,10 @@ def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, 
         raise EvaError(
             _REGION_HAS_NO_PIXEL_PICTURE(name=region.name, shape=after.shape[1], shape_2=after.shape[0])
         )
-    wanted = _details(before, box)
+    wanted = _band_passed(before, box)
     around = (top - REACH, left - REACH, bottom + REACH, right + REACH)
     first_row, first_column, last_row, last_column = _inside(around, after)
-    places = _correlations(wanted, _details(after, (first_row, first_column, last_row, last_column)))
+    places = _correlations(wanted, _band_passed(after, (first_row, first_column, last_row, last_column)))
     down = np.arange(places.shape[0]) + first_row - top
     across = np.arange(places.shape[1]) + first_column - left
     near = places[np.ix_(np.abs(down) <= TOLERANCE, np.abs(across) <= TOLERANCE)]
@@ -195,7 +195,7 @@ def _box(region: Region, picture: _Pixels) -> tuple[int, int, int, int]:
     )
 
 
-def _common(pictures: list[_Pixels]) -> list[_Pixels]:
+def _to_common_size(pictures: list[_Pixels]) -> list[_Pixels]:
     """The pictures at the size of the smallest, no wider than WIDEST."""
     height = min(picture.shape[0] for picture in pictures)
     width = min(picture.shape[1] for picture in pictures)
@@ -207,7 +207,7 @@ def _common(pictures: list[_Pixels]) -> list[_Pixels]:
     ]
 
 
-def _details(picture: _Pixels, box: tuple[int, int, int, int]) -> _Pixels:
+def _band_passed(picture: _Pixels, box: tuple[int, int, int, int]) -> _Pixels:
     """What is between fine and coarse in the box of the picture, with what lies around it in view."""
     top, left, bottom, right = box
     wide = (top - _COARSE, left - _COARSE, bottom + _COARSE, right + _COARSE)

@@ -35,13 +35,13 @@ class RevealLine(Line):
 REVEALS: Journal[RevealLine] = Journal("reveals", RevealLine)
 
 
-def kept(plan: Plan) -> RevealLine | None:
+def first_reveal(plan: Plan) -> RevealLine | None:
     """The first reveal of a frozen plan, of whatever database; None before it."""
     lines = REVEALS.read(_file(plan), log.warning)
     return next((line for line in lines if line.digest == plan.digest), None)
 
 
-def keep(plan: Plan, user: User, at: datetime) -> None:
+def write_reveal(plan: Plan, user: User, at: datetime) -> None:
     """Write down a reveal, or the close of a plan that is not blind, that is about to be saved, and complete its
     `at_reveal`. Raises NotKept."""
     by = user.get_username()

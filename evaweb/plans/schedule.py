@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evaweb.errors import EvaError
-from evaweb.plans.seeded_draws import Chance
+from evaweb.plans.seeded_draws import SeededDraws
 from runtime.core.sentences import Pattern
 
 _NO_PLAN_NEEDS_AT_LEAST = Pattern(
@@ -92,10 +92,10 @@ def schedule(
     check_schedule(checkpoints, conditions, repetitions, allocation)
     units: list[Unit] = []
     block = 0
-    orders = (_latin if latin else _orders)(list(checkpoints), Chance(key, "orders"))
-    drawn = _Coins(list(checkpoints), Chance(key, "allocation"))
+    orders = (_latin if latin else _orders)(list(checkpoints), SeededDraws(key, "orders"))
+    drawn = _Coins(list(checkpoints), SeededDraws(key, "allocation"))
     for repetition in range(1, repetitions + 1):
-        for condition in Chance(key, f"conditions/{repetition}").shuffled(list(conditions)):
+        for condition in SeededDraws(key, f"conditions/{repetition}").shuffled(list(conditions)):
             there = next(orders) if allocation == PAIRED else [drawn.next(condition) for _ in range(2)]
             for place, checkpoint in enumerate(there):
                 # Where a block may have two of one checkpoint its number must not say so.
@@ -108,7 +108,7 @@ def schedule(
 class _Coins:
     """Draws one of two checkpoints, trial by trial."""
 
-    def __init__(self, checkpoints: list[str], chance: Chance) -> None:
+    def __init__(self, checkpoints: list[str], chance: SeededDraws) -> None:
         self._checkpoints, self._chance = checkpoints, chance
         self._ahead: dict[Condition, int] = {}
 
@@ -131,7 +131,7 @@ def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, in
     return found
 
 
-def _orders(checkpoints: list[str], chance: Chance) -> Iterator[list[str]]:
+def _orders(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
     """Orders of the checkpoints, block by block, each drawn by itself."""
     while True:
         yield chance.shuffled(checkpoints)
@@ -148,7 +148,7 @@ def foretold(checkpoints: int, allocation: str) -> str:
     return f"1 of {share} trials: {which}"
 
 
-def _latin(checkpoints: list[str], chance: Chance) -> Iterator[list[str]]:
+def _latin(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
     """Orders of the checkpoints, block by block: rows of Latin squares, each drawn anew."""
     k = len(checkpoints)
     while True:

@@ -21,7 +21,7 @@ def new_key() -> bytes:
     return secrets.token_bytes(KEY_BYTES)
 
 
-class Chance:
+class SeededDraws:
     """A sequence of draws by `key`, for what `name` says; the same for both, independent of all others."""
 
     def __init__(self, key: bytes, name: str) -> None:

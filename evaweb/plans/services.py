@@ -16,7 +16,7 @@ from django.db.models import QuerySet
 from django.utils import timezone
 from django.utils.text import slugify
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.canonical import difference, digest
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import commitment as blinding
@@ -25,12 +25,12 @@ from evaweb.plans.counting import fails_by
 from evaweb.plans.design import (
     CROSSED_EVENT,
     ENDED_EVENT,
-    at_the_reveal,
     dropped_of,
+    end_reason,
     ended_at_an_ask,
-    ended_because,
     findings_of,
     recorded_so_far,
+    reveal_record,
 )
 from evaweb.plans.documents import UnevenError, document_of, units_of
 from evaweb.plans.draft_checks import covered, problems
@@ -40,11 +40,11 @@ from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import new_key
 from evaweb.plans.selectors import handout_of, remaining
 from evaweb.races import once_more
-from evaweb.roles import Role, require, role_of
-from evaweb.trials.lifecycle import OPEN
+from evaweb.roles import Role, require_role, role_of
+from evaweb.trials.lifecycle import OPEN_STATES
 from evaweb.trials.models import Evaluation, Trial, TrialStatus
-from evaweb.trials.services import declare_settled
-from evaweb.trials.voids import voids_lapse, voids_waiting
+from evaweb.trials.services import register_settled
+from evaweb.trials.voids import lapse_void_requests, open_void_requests
 from runtime.core.sentences import Pattern, fixed
 
 _ADMINISTRATORS_MAKE_PLANS = fixed(
@@ -165,13 +165,13 @@ def plan_change(
 
     What somebody else changed meanwhile stays as it is and is named, unless it is among those to `keep`.
     """
-    held = _held(plan)
+    held = _lock_plan(plan)
     require_editor(held, user)
-    sight = sight_of(user)
+    sight = visibility_for_user(user)
     now = values_of(held, sight)
     written, conflicts = merged(now, was, wanted, keep)
     if "owner" in written:
-        require(user, Role.ADMIN)
+        require_role(user, Role.ADMIN)
     if written:
         apply(held, {**now, **written}, sight.checkpoints)
         _keep(held)
@@ -207,7 +207,7 @@ def _log(plan: Plan, user: User, what: int, text: str) -> None:
         LogEntry.objects.log_actions(user.pk, [plan], what, text, single_object=True)
 
 
-def plan_freeze(*, user: User, plan: Plan, seen: str = "") -> Plan:
+def freeze_plan(*, user: User, plan: Plan, seen: str = "") -> Plan:
     """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then.
 
     `seen`: the digest of the draft as the user has it before them; Conflict where it is another one by now.
@@ -239,27 +239,29 @@ def _drawn(plan: Plan) -> bytes:
 
 @transaction.atomic
 def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
-    held = _held(plan)
+    held = _lock_plan(plan)
     _require_owner(held, user)
     if held.state != PlanState.DRAFT:
         raise _no_draft(held)
-    if seen and seen != digest_of(values_of(held, sight_of(user))):
+    if seen and seen != digest_of(values_of(held, visibility_for_user(user))):
         raise Conflict(_CHANGED_SINCE_LOADED(held=held))
     _check(held, user)
     document = document_of(held, key)
     held.document, held.digest, held.key = document, digest(document), key
     units = units_of(held)
-    held.commitment = blinding.commitment(held.digest, units, bytes(held.key))
+    held.commitment = blinding.make_commitment(held.digest, units, bytes(held.key))
     held.evaluation, new = Evaluation.objects.get_or_create(
         name=held.name,
         version=held.version,
         defaults={"kind": Evaluation.Kind.PLAN, "description": held.title},
     )
     if not new:
-        require(user, Role.ADMIN)  # with it trials can be revealed of a plan that may have been another one's
+        require_role(
+            user, Role.ADMIN
+        )  # with it trials can be revealed of a plan that may have been another one's
     held.state, held.frozen_at = PlanState.FROZEN, timezone.now()
     held.save()
-    _lay_out(held, units)
+    _create_slots(held, units)
     changes = difference(held.amends.document or {}, document) if held.amends else []
     changes = [line for line in changes if not line.startswith(_DRAWN)]
     told = f"digest {held.digest}, {len(units)} trials, commitment {held.commitment}"
@@ -267,7 +269,7 @@ def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
     if held.amends and held.amends.state == PlanState.FROZEN:
         _close(held.amends, user, f"amended by version {held.version}: {held.amended_because}")
     if held.amends and held.amends.state == PlanState.CLOSED:
-        voids_lapse(_trials(held.amends), user=user, now=True)
+        lapse_void_requests(_trials(held.amends), user=user, now=True)
     if not new:
         _close(held, user, "its trials were made before the database was lost: amend it to make more")
     plan.refresh_from_db()
@@ -276,9 +278,9 @@ def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
 
 @once_more
 @transaction.atomic
-def plan_amend(*, user: User, plan: Plan, reason: str) -> Plan:
+def amend_plan(*, user: User, plan: Plan, reason: str) -> Plan:
     """A draft of the next version, as the frozen one is now; that one goes on until the new one is frozen."""
-    held = _held(plan)
+    held = _lock_plan(plan)
     _require_owner(held, user)
     why = _reason(reason, "a plan is amended")
     if held.state == PlanState.DRAFT:
@@ -303,9 +305,9 @@ def plan_amend(*, user: User, plan: Plan, reason: str) -> Plan:
 
 
 @transaction.atomic
-def plan_close(*, user: User, plan: Plan, reason: str) -> Plan:
+def close_plan(*, user: User, plan: Plan, reason: str) -> Plan:
     """Hand out no more trials. What is prepared, running or not yet scored is finished first."""
-    held = _held(plan)
+    held = _lock_plan(plan)
     _require_owner(held, user)
     why = _reason(reason, "a plan is closed")
     if held.state != PlanState.FROZEN:
@@ -315,40 +317,42 @@ def plan_close(*, user: User, plan: Plan, reason: str) -> Plan:
     return plan
 
 
-def plan_reveal(*, user: User, plan: Plan) -> Plan:
+def reveal_plan(*, user: User, plan: Plan) -> Plan:
     """Say which checkpoint was which, once and for all, and with it the key of the commitment."""
     fresh = Plan.objects.select_related("owner").get(pk=plan.pk)
     _require_owner(fresh, user)
     ready = None
-    if fresh.state == PlanState.CLOSED and fresh.at_reveal is None and reveals.kept(fresh) is None:
+    if fresh.state == PlanState.CLOSED and fresh.at_reveal is None and reveals.first_reveal(fresh) is None:
         ready = (
             recorded_so_far(fresh),
-            at_the_reveal(fresh),
+            reveal_record(fresh),
         )  # it may take seconds: before anything is locked
     return _revealed(user, plan, ready)
 
 
 @transaction.atomic
 def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | None] | None) -> Plan:
-    held = _held(plan)
+    held = _lock_plan(plan)
     _require_owner(held, user)
     if held.state != PlanState.CLOSED:
         raise Conflict(_NOT_CLOSED(held=held, state=held.get_state_display()))
     units = units_of(held)
-    if not blinding.verified(digest(held.document or {}), units, bytes(held.key or b""), held.commitment):
+    if not blinding.verify_commitment(
+        digest(held.document or {}), units, bytes(held.key or b""), held.commitment
+    ):
         raise EvaError(_COMMITMENT_BROKEN(held=held, commitment=held.commitment))
     if slots_of(held) != [unit.row for unit in units]:
         raise EvaError(_RENAMED_SINCE_FROZEN(held=held))
-    voids_lapse(_trials(held), user=user, now=True)
+    lapse_void_requests(_trials(held), user=user, now=True)
     held.state, held.revealed_at, held.revealed_by = PlanState.REVEALED, timezone.now(), user
-    before = reveals.kept(held)
+    before = reveals.first_reveal(held)
     if held.at_reveal is None:
         as_ready = ready is not None and ready[0] == recorded_so_far(held)
         held.at_reveal = (
-            before.at_reveal if before else ready[1] if ready and as_ready else at_the_reveal(held)
+            before.at_reveal if before else ready[1] if ready and as_ready else reveal_record(held)
         )
     if before is None:
-        reveals.keep(held, user, held.revealed_at)
+        reveals.write_reveal(held, user, held.revealed_at)
     what = "reveal" if held.blind else "close"
     again = (
         f"; what counts is that of the {what} of {before.at:%Y-%m-%d %H:%M} UTC by {before.by}"
@@ -362,7 +366,7 @@ def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | No
 
 
 @transaction.atomic
-def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
+def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
     """Close a running plan whose design has ended, as soon as none of its trials is unfinished and no void waits.
 
     With trials left, it ends where the next one is `asked` for: a score that was mistyped can be corrected until then,
@@ -370,32 +374,32 @@ def plan_end(*, user: User, plan: Plan, asked: bool = False) -> None:
     crossed is kept, whatever is corrected later: else each ask would tell what a correction moved.
     The reason says that a boundary was crossed or that all pairs are made: never for which checkpoint.
     """
-    held = _held(plan)
+    held = _lock_plan(plan)
     found = findings_of(held) if held.state == PlanState.FROZEN else None
     if found is None:
         return
-    ended, waits = ended_at_an_ask(held), voids_waiting(_trials(held)).exists()
+    ended, waits = ended_at_an_ask(held), open_void_requests(_trials(held)).exists()
     if asked and not ended and found.ended == "boundary":
         # A void that is refused puts its trial back: until it is answered, the answer stays what it was.
-        ended = "" if waits else ended_because(held, found)
-        _note(held, user, CROSSED_EVENT if waits else ENDED_EVENT, ended_because(held, found))
+        ended = "" if waits else end_reason(held, found)
+        _note(held, user, CROSSED_EVENT if waits else ENDED_EVENT, end_reason(held, found))
     if not (ended or found.ended) or waits or _unfinished(held):
         return
     over = bool(ended) or not remaining(held, dropped_of(held))
     if not remaining(held) or (asked and over) or ended:
-        why = ended or ended_because(held, found)
+        why = ended or end_reason(held, found)
         if not ended:
             _note(held, user, ENDED_EVENT, why)
         _close(held, user, why)
 
 
-def _looked_at(trial: Trial, user: User) -> None:
+def _on_trial_settled(trial: Trial, user: User) -> None:
     handout = handout_of(trial=trial)
     if handout is not None:
-        plan_end(user=user, plan=handout.plan)
+        end_plan_if_decided(user=user, plan=handout.plan)
 
 
-declare_settled(_looked_at)
+register_settled(_on_trial_settled)
 
 
 def _trials(plan: Plan) -> QuerySet[Trial]:
@@ -404,7 +408,7 @@ def _trials(plan: Plan) -> QuerySet[Trial]:
 
 def _unfinished(plan: Plan) -> list[Trial]:
     """Trials that are under way or yet to be scored: of those that were broken off, failures by the plan."""
-    states = (*OPEN, TrialStatus.ENDED, TrialStatus.INTERRUPTED)
+    states = (*OPEN_STATES, TrialStatus.ENDED, TrialStatus.INTERRUPTED)
     rows = Trial.objects.filter(handout__plan=plan, status__in=states, verdict=None)
     return [
         trial
@@ -437,19 +441,19 @@ def _keep_at_close(plan: Plan, user: User) -> None:
     """Keep what counts of a plan that is not blind; worked out before anything is locked, which may take seconds."""
     while True:
         fresh = Plan.objects.get(pk=plan.pk)
-        at, found = recorded_so_far(fresh), at_the_reveal(fresh)
+        at, found = recorded_so_far(fresh), reveal_record(fresh)
         if found is None:
             return
         with transaction.atomic():
-            held = _held(plan)
+            held = _lock_plan(plan)
             if held.at_reveal is not None or held.state != PlanState.CLOSED or held.closed_at is None:
                 return
             if recorded_so_far(held) != at:
                 continue  # somebody has corrected a score meanwhile
-            before = reveals.kept(held)
+            before = reveals.first_reveal(held)
             held.at_reveal = before.at_reveal if before else found
             if before is None:
-                reveals.keep(held, user, held.closed_at)
+                reveals.write_reveal(held, user, held.closed_at)
             held.save()
             return
 
@@ -458,7 +462,7 @@ def _check(plan: Plan, user: User) -> None:
     """Check a plan before this user freezes it; EvaError says what is missing."""
     found = next(problems(plan), None)
     if found is not None:
-        raise EvaError(covered(plan, sight_of(user))(found.text))
+        raise EvaError(covered(plan, visibility_for_user(user))(found.text))
 
 
 def slots_of(plan: Plan) -> list[list[Any]]:
@@ -467,7 +471,7 @@ def slots_of(plan: Plan) -> list[list[Any]]:
     return [list(row) for row in plan.slots.order_by("index").values_list(*named)]
 
 
-def _lay_out(plan: Plan, units: list[Unit]) -> None:
+def _create_slots(plan: Plan, units: list[Unit]) -> None:
     checkpoints = {row.name: row for row in plan.checkpoints.all()}
     positions = {(p.scene.name, p.number): p for p in plan.positions.select_related("scene")}
     Slot.objects.bulk_create(
@@ -487,12 +491,12 @@ def _lay_out(plan: Plan, units: list[Unit]) -> None:
     )
 
 
-def _held(plan: Plan) -> Plan:
+def _lock_plan(plan: Plan) -> Plan:
     return Plan.objects.select_for_update(of=("self",)).select_related("owner").get(pk=plan.pk)
 
 
 def _require_owner(plan: Plan, user: User) -> None:
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     if plan.owner_id != user.pk and role_of(user) is not Role.ADMIN:
         raise NotAllowed(_NOT_THE_OWNER(plan=plan, user=plan.owner.get_username()))
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evaweb.plans.models import Handout
-from evaweb.plans.seeded_draws import Chance
+from evaweb.plans.seeded_draws import SeededDraws
 from evaweb.trials.models import Trial
-from evaweb.trials.station_commands import declare_least
+from evaweb.trials.station_commands import register_min_stage_times
 
 NEWEST = 5  # set-ups of a checkpoint that count: the first of a server may have compiled for a minute
 LONGER = 1.25
@@ -20,7 +20,7 @@ _STAGES = ("connect_s", "warm_up_s")
 _FINE = 10_000  # different lengths
 
 
-def least_times(trial: Trial) -> Mapping[str, float] | None:
+def min_stage_times(trial: Trial) -> Mapping[str, float] | None:
     """Of each stage of the trial's set-up [s]; None where nothing is blind, or nothing is known yet."""
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     if handout is None or not handout.plan.sealed:
@@ -37,11 +37,11 @@ def least_times(trial: Trial) -> Mapping[str, float] | None:
     if not took:
         return None
     longest = {stage: max(float(row.get(stage, 0.0)) for row in took) for stage in _STAGES}
-    chance = Chance(bytes(handout.plan.key or b""), f"set-up/{handout.number}")
+    chance = SeededDraws(bytes(handout.plan.key or b""), f"set-up/{handout.number}")
     return {
         stage: min(MOST_S, seconds * (1 + (LONGER - 1) * chance.below(_FINE) / _FINE))
         for stage, seconds in longest.items()
     }
 
 
-declare_least(least_times)
+register_min_stage_times(min_stage_times)

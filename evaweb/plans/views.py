@@ -9,7 +9,7 @@ from django.views.decorators.http import require_safe
 
 from evaweb.plans import regions
 from evaweb.plans.bench_checks import references
-from evaweb.plans.pictures import kept
+from evaweb.plans.pictures import load_image
 from evaweb.plans.selectors import reference_get
 from evaweb.roles import Role, role_of
 
@@ -17,7 +17,7 @@ from evaweb.roles import Role, role_of
 @require_safe
 def picture(request: HttpRequest, name: str) -> HttpResponse:
     """One of them."""
-    return HttpResponse(kept(name), content_type="image/jpeg")
+    return HttpResponse(load_image(name), content_type="image/jpeg")
 
 
 @require_safe

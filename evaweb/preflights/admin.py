@@ -11,7 +11,7 @@ from django.urls import URLPattern, path, reverse
 from evaweb.errors import EvaError
 from evaweb.preflights.models import Preflight
 from evaweb.preflights.selectors import preflight_newest
-from evaweb.preflights.services import preflight_ask, preflight_settled
+from evaweb.preflights.services import refresh_preflight, start_preflight
 from evaweb.preflights.views import context
 from evaweb.stations.selectors import station_get, station_list
 from evaweb.trials.admin import CheckpointAdmin
@@ -38,7 +38,7 @@ class PreflightedCheckpointAdmin(CheckpointAdmin):
             return HttpResponseNotAllowed(["POST"])
         try:
             name = request.POST.get("station", "")
-            preflight_ask(
+            start_preflight(
                 user=request.user,
                 checkpoint=checkpoint_get(name=object_id),
                 station=station_get(name=name) if name else None,
@@ -54,7 +54,7 @@ class PreflightedCheckpointAdmin(CheckpointAdmin):
         checkpoint = Checkpoint.objects.filter(pk=object_id).first() if object_id.isdecimal() else None
         row = preflight_newest(checkpoint=checkpoint) if checkpoint else None
         if row is not None:
-            extra = {**extra, **context(preflight_settled(row=row), request.user)}
+            extra = {**extra, **context(refresh_preflight(row=row), request.user)}
         extra = {**extra, "stations": station_list(), "checkpoint": checkpoint}
         return super().change_view(request, object_id, *given, extra_context=extra, **named)
 

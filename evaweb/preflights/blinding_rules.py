@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.preflights.models import Preflight
 from evaweb.roles import Role, role_of
 from evaweb.trials.models import Checkpoint
@@ -18,7 +18,7 @@ _TOLD = ("verdict", "stage", "advice", "ok")  # of a report, to everybody
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class VisiblePreflight:
     """A preflight as one user sees it: `report` and `reason` without what `hidden` says is kept back and why."""
 
     row: Preflight
@@ -27,18 +27,18 @@ class Shown:
     hidden: str
 
 
-def shown(row: Preflight, user: Any) -> Shown:
+def visible_preflight(row: Preflight, user: Any) -> VisiblePreflight:
     """The preflight as this user may see it."""
-    why = hidden_from(row.checkpoint, user)
+    why = hidden_reason(row.checkpoint, user)
     if not why:
-        return Shown(row, row.report, row.reason, "")
+        return VisiblePreflight(row, row.report, row.reason, "")
     report = None if row.report is None else {key: row.report[key] for key in _TOLD if key in row.report}
-    return Shown(row, report, "it ended without a report" if row.reason else "", why)
+    return VisiblePreflight(row, report, "it ended without a report" if row.reason else "", why)
 
 
-def hidden_from(checkpoint: Checkpoint, user: Any) -> str:
+def hidden_reason(checkpoint: Checkpoint, user: Any) -> str:
     """Why a user is shown nothing but the verdict, "" where they are shown everything."""
     if role_of(user) is Role.VIEWER:
         return "addresses and times are shown to operators"
-    seen = sight_of(user)
+    seen = visibility_for_user(user)
     return f"addresses and times are hidden: {seen.plans}" if checkpoint.pk in seen.checkpoints else ""

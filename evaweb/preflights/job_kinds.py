@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from evaweb.jobs.kinds import Queue, Work, job_kind
+from evaweb.jobs.kinds import JobContext, Queue, job_kind
 from evaweb.preflights.models import Preflight, PreflightStatus
 from evaweb.preflights.selectors import preflight_get
-from evaweb.preflights.services import preflight_ended
+from evaweb.preflights.services import finish_preflight
 
 LONGEST_S = 3600.0
 
 
 @job_kind("preflight", queue=Queue.STATION, folder=False)
-def preflight(work: Work) -> Mapping[str, Any]:
+def preflight(work: JobContext) -> Mapping[str, Any]:
     """Ask the checkpoint's server by the deployment file of the station; args: preflight."""
     row: Preflight = preflight_get(id=work.args["preflight"])
     from runtime.station.preflight_child import (
@@ -23,6 +23,6 @@ def preflight(work: Work) -> Mapping[str, Any]:
 
     if row.status != PreflightStatus.RUNNING:
         return {"verdict": row.verdict}
-    work.tell(f"asking the server of {row.checkpoint}")
+    work.report_progress(f"asking the server of {row.checkpoint}")
     asked = {"deployment": row.station.deployment, "changes": row.changes}
-    return {"verdict": preflight_ended(row=row, report=run_preflight(asked, LONGEST_S)).verdict}
+    return {"verdict": finish_preflight(row=row, report=run_preflight(asked, LONGEST_S)).verdict}

@@ -21,7 +21,7 @@ class StageRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ReportView:
     """Texts of the page; empty texts and lists are left out there."""
 
     ok: bool
@@ -36,7 +36,7 @@ class Reading:
     notes: tuple[str, ...]
 
 
-def ago(moment: datetime, now: datetime) -> str:
+def time_since(moment: datetime, now: datetime) -> str:
     """Time since `moment`, in its largest unit."""
     seconds = max(0.0, (now - moment).total_seconds())
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
@@ -45,11 +45,11 @@ def ago(moment: datetime, now: datetime) -> str:
     return f"{int(seconds)} s ago"
 
 
-def read(report: Mapping[str, Any] | None) -> Reading | None:
+def view_report(report: Mapping[str, Any] | None) -> ReportView | None:
     """The report, also one of which a part is kept back; None for none."""
     if report is None:
         return None
-    return Reading(
+    return ReportView(
         ok=bool(report.get("ok")),
         stages=_stages(str(report.get("stage", "")), bool(report.get("ok"))),
         sentence=str(report.get("sentence", "")),

@@ -6,7 +6,7 @@ from uuid import UUID
 
 from django.db.models import QuerySet
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.errors import NotFound
 from evaweb.preflights.models import Preflight
 from evaweb.trials.models import Checkpoint
@@ -18,13 +18,17 @@ _PREFLIGHT_DOES_NOT_EXIST = Pattern(
 )
 
 
-def preflight_list(*, checkpoint: Checkpoint | None = None, sight: Sight = EVERYTHING) -> QuerySet[Preflight]:
+def preflight_list(
+    *, checkpoint: Checkpoint | None = None, sight: Visibility = FULL_VISIBILITY
+) -> QuerySet[Preflight]:
     """The newest first, of one checkpoint or of all; none of hidden ones, whose names they have."""
-    rows: QuerySet[Preflight] = sight.open(Preflight.objects.select_related("checkpoint", "station", "user"))
+    rows: QuerySet[Preflight] = sight.filter_visible(
+        Preflight.objects.select_related("checkpoint", "station", "user")
+    )
     return rows if checkpoint is None else rows.filter(checkpoint=checkpoint)
 
 
-def preflight_get(*, id: UUID | str, sight: Sight = EVERYTHING) -> Preflight:
+def preflight_get(*, id: UUID | str, sight: Visibility = FULL_VISIBILITY) -> Preflight:
     """That one; NotFound."""
     found = preflight_list(sight=sight).filter(pk=id).first()
     if found is None:

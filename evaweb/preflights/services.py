@@ -15,18 +15,18 @@ from uuid import uuid4
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.binary_frames import plain
-from evaweb.blinding import sight_of
+from evaweb.binary_frames import to_json_value
+from evaweb.blinding import visibility_for_user
 from evaweb.errors import Conflict, StationGone
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.services import enqueue
 from evaweb.jobs.workers import waiting_for
 from evaweb.preflights.models import Preflight, PreflightStatus
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require_role, role_of
 from evaweb.stations.commands import TABLES
 from evaweb.stations.models import Station
-from evaweb.stations.runtime_client import NoAnswer, wire_to
+from evaweb.stations.runtime_client import NoAnswer, connection_to
 from evaweb.stations.selectors import station_list
 from evaweb.trials.models import Checkpoint
 from runtime.config import loader as deployment
@@ -57,14 +57,16 @@ _LOOK_S = 0.5  # how long another station may take to say which server it uses
 _UNTOLD = timedelta(hours=1)  # after which one is over of which nobody said how long it may take
 
 
-def preflight_ask(*, user: Any, checkpoint: Checkpoint, station: Station | None = None) -> Preflight:
+def start_preflight(*, user: Any, checkpoint: Checkpoint, station: Station | None = None) -> Preflight:
     """Begin a preflight with the deployment of `station`, None: the first that can; its row, which is under way.
 
     Never within a transaction. Raises NotAllowed, Conflict where the station or the server is at work, StationGone
     where neither the station runs nor its deployment file is known.
     """
-    require(user, Role.OPERATOR)
-    if hidden := sorted(sight_of(user).at_work):  # whichever server it is: an answer would tell
+    require_role(user, Role.OPERATOR)
+    if hidden := sorted(
+        visibility_for_user(user).busy_stations
+    ):  # whichever server it is: an answer would tell
         raise Conflict(_BLIND_TRIAL_UNDER_WAY(stations=", ".join(hidden)))
     chosen = station or _first_station()
     row = Preflight(checkpoint=checkpoint, station=chosen, user=user, policy=checkpoint.policy)
@@ -73,41 +75,41 @@ def preflight_ask(*, user: Any, checkpoint: Checkpoint, station: Station | None 
     except NoAnswer:
         raise
     except StationGone as gone:
-        return _of_worker(row, gone)
+        return _start_by_worker(row, gone)
     _require_free(server, chosen)
-    return _of_station(row)
+    return _start_at_station(row)
 
 
-def preflight_settled(*, row: Preflight) -> Preflight:
+def refresh_preflight(*, row: Preflight) -> Preflight:
     """Find out how it went, if not yet known; leaves it as it is while it is under way, or cannot be known."""
     if row.status != PreflightStatus.RUNNING:
         return row
     if row.by == Preflight.By.WORKER:
         return _settled_by_job(row)
     try:
-        ack = wire_to(row.station.name).request(
+        ack = connection_to(row.station.name).request(
             Command(str(uuid4()), "preflight_report", {"id": str(row.pk)}), timeout=_LOOK_S
         )
     except NoAnswer:
         return _overdue(row, f"{row.station.name} has not answered since")
     except StationGone as gone:
-        return preflight_ended(row=row, reason=str(gone))
+        return finish_preflight(row=row, reason=str(gone))
     if ack.status != "done":
-        return preflight_ended(row=row, reason=f"{row.station.name} was restarted meanwhile: ask again")
-    told = plain(ack.data)
+        return finish_preflight(row=row, reason=f"{row.station.name} was restarted meanwhile: ask again")
+    told = to_json_value(ack.data)
     if told["running"]:
         return _overdue(row, "it did not end in time")
-    return preflight_ended(row=row, report=told["report"], reason=told["failure"])
+    return finish_preflight(row=row, report=told["report"], reason=told["failure"])
 
 
-def preflights_settled(*, station: Station) -> int:
+def refresh_preflights(*, station: Station) -> int:
     """Find out how those of a station went that were not looked at; how many are over now."""
     rows = Preflight.objects.filter(station=station, status=PreflightStatus.RUNNING)
-    settled = [preflight_settled(row=row) for row in rows.select_related("station", "checkpoint")]
+    settled = [refresh_preflight(row=row) for row in rows.select_related("station", "checkpoint")]
     return sum(row.status != PreflightStatus.RUNNING for row in settled)
 
 
-def preflight_ended(*, row: Preflight, report: dict[str, Any] | None = None, reason: str = "") -> Preflight:
+def finish_preflight(*, row: Preflight, report: dict[str, Any] | None = None, reason: str = "") -> Preflight:
     """Keep what was found, or why there is nothing; the first that says so has said it."""
     status = PreflightStatus.LOST if report is None else PreflightStatus.DONE
     facts = {
@@ -126,7 +128,7 @@ def _first_station() -> Station:
     stations = list(station_list())
     for station in stations:
         try:
-            if not wire_to(station.name).status(timeout=_LOOK_S)["state_is"]["at_work"]:
+            if not connection_to(station.name).status(timeout=_LOOK_S)["state_is"]["at_work"]:
                 return station
         except StationGone:
             continue
@@ -140,7 +142,7 @@ def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
     """The server that a preflight there would ask; "" where the table does not fit, which the report will say."""
     args = {"policy": checkpoint.policy}
     asked = Command(str(uuid4()), "policy_server", args, role=Role.OPERATOR, vouched=list(TABLES))
-    ack = wire_to(station.name).request(asked)
+    ack = connection_to(station.name).request(asked)
     return str(ack.data["server"]) if ack.status == "done" else ""
 
 
@@ -150,7 +152,7 @@ def _require_free(server: str, besides: Station) -> None:
         return
     for other in station_list(all_of_them=True).exclude(pk=besides.pk):
         try:
-            ack = wire_to(other.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
+            ack = connection_to(other.name).request(Command(str(uuid4()), "policy_server"), timeout=_LOOK_S)
         except StationGone:
             continue
         if ack.data.get("server") != server:
@@ -160,7 +162,7 @@ def _require_free(server: str, besides: Station) -> None:
             raise Conflict(_WITH_SAME_POLICY_SERVER_PREFLIGHT(other=other, label=state_is["label"]))
 
 
-def _of_station(row: Preflight) -> Preflight:
+def _start_at_station(row: Preflight) -> Preflight:
     """A row first, so that whatever the station begins is known."""
     row.by = Preflight.By.STATION
     row.save(force_insert=True)
@@ -170,7 +172,7 @@ def _of_station(row: Preflight) -> Preflight:
     said = {"user": username, "holder": username, "role": role_of(row.user) if row.user else ""}
     command = Command(str(uuid4()), "preflight", args, vouched=list(TABLES), **said)
     try:
-        ack = wire_to(row.station.name).request(command)
+        ack = connection_to(row.station.name).request(command)
     except NoAnswer:
         return row  # it may have begun: whoever looks next finds out
     except StationGone:
@@ -184,7 +186,7 @@ def _of_station(row: Preflight) -> Preflight:
     return row
 
 
-def _of_worker(row: Preflight, gone: StationGone) -> Preflight:
+def _start_by_worker(row: Preflight, gone: StationGone) -> Preflight:
     """By the worker, with the deployment file of the station that does not run."""
     file = row.station.deployment
     if not file:
@@ -204,9 +206,9 @@ def _of_worker(row: Preflight, gone: StationGone) -> Preflight:
 def _settled_by_job(row: Preflight) -> Preflight:
     job = job_newest(key=_key(row))
     if job is None:
-        return preflight_ended(row=row, reason="its job is gone: ask again")
+        return finish_preflight(row=row, reason="its job is gone: ask again")
     if job.status == JobStatus.FAILED:
-        return preflight_ended(row=row, reason=job.error)
+        return finish_preflight(row=row, reason=job.error)
     return _overdue(row, waiting_for(job) or "no worker has done it: does one hang?")
 
 
@@ -220,7 +222,7 @@ def lacks(*, row: Preflight) -> str:
 
 def _overdue(row: Preflight, reason: str) -> Preflight:
     over_by = row.over_by or row.asked_at + _UNTOLD
-    return preflight_ended(row=row, reason=reason) if timezone.now() > over_by else row
+    return finish_preflight(row=row, reason=reason) if timezone.now() > over_by else row
 
 
 def _key(row: Preflight) -> str:

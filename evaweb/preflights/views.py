@@ -10,11 +10,11 @@ from django.shortcuts import render
 from django.utils import timezone
 from django.views.decorators.http import require_GET
 
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.preflights import services
-from evaweb.preflights.blinding_rules import shown
+from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight, PreflightStatus
-from evaweb.preflights.reading import ago, read
+from evaweb.preflights.reading import time_since, view_report
 from evaweb.preflights.selectors import preflight_get, preflight_newest
 from evaweb.trials.selectors import checkpoint_get
 
@@ -22,7 +22,7 @@ from evaweb.trials.selectors import checkpoint_get
 @require_GET
 def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
     """A preflight: its progress, or its result."""
-    row = services.preflight_settled(row=preflight_get(id=id, sight=sight_for(request)))
+    row = services.refresh_preflight(row=preflight_get(id=id, sight=visibility_for_request(request)))
     fragment = request.headers.get("HX-Request")
     return render(request, f"preflights/{'result' if fragment else 'page'}.html", context(row, request.user))
 
@@ -30,22 +30,22 @@ def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
 @require_GET
 def newest(request: HttpRequest) -> HttpResponse:
     """Newest preflight of the checkpoint that the address names, or a page that says there is none."""
-    checkpoint = checkpoint_get(name=request.GET.get("checkpoint", ""), sight=sight_for(request))
+    checkpoint = checkpoint_get(name=request.GET.get("checkpoint", ""), sight=visibility_for_request(request))
     row = preflight_newest(checkpoint=checkpoint)
     if row is None:
         return render(request, "preflights/never.html", {"checkpoint": checkpoint})
-    settled = services.preflight_settled(row=row)
+    settled = services.refresh_preflight(row=row)
     return render(request, "preflights/result.html", context(settled, request.user))
 
 
 def context(row: Preflight, user: Any) -> dict[str, Any]:
     """Context of the template of a result."""
-    seen = shown(row, user)
+    seen = visible_preflight(row, user)
     return {
         "preflight": row,
         "seen": seen,
-        "read": read(seen.report),
+        "read": view_report(seen.report),
         "running": row.status == PreflightStatus.RUNNING,
         "lacks": services.lacks(row=row),
-        "age": ago(row.asked_at, timezone.now()),
+        "age": time_since(row.asked_at, timezone.now()),
     }

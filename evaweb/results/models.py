@@ -16,7 +16,7 @@ from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.results.judges import KINDS
 from evaweb.results.judges.base import PATIENCE_S, Setup
-from evaweb.results.judges.finding import built
+from evaweb.results.judges.finding import build_judge
 from evaweb.trials.models import Trial
 
 
@@ -137,7 +137,7 @@ class AutomaticJudge(models.Model):
     def clean(self) -> None:
         """A set-up of which its module can build a judge."""
         try:
-            built(self.name, self.kind, self.setup)
+            build_judge(self.name, self.kind, self.setup)
         except EvaError as fault:
             raise ValidationError(str(fault)) from None
 

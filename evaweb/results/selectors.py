@@ -77,7 +77,7 @@ class PlanRow:
 
 
 @dataclass(frozen=True, slots=True)
-class StationNow:
+class StationActivity:
     """A station and the trial that is not finished there."""
 
     station: Station
@@ -85,7 +85,7 @@ class StationNow:
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class TrialQuery:
     """Which trials of a plan are meant; "" where it does not matter.
 
     `success` is yes or no, `failure` and `failure_phase` may be "not specified",
@@ -165,7 +165,7 @@ def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
     ]
 
 
-def trials_of_plan(plan: Plan, question: Question) -> QuerySet[Trial]:
+def trials_of_plan(plan: Plan, question: TrialQuery) -> QuerySet[Trial]:
     """Those that fit, in the order in which they were handed out; EvaError says what is allowed."""
     named = ("checkpoint", "scene", "position", "station", "operator", "verdict", "episode", "handout")
     rows = (
@@ -209,17 +209,17 @@ def _whole(name: str, value: str) -> int:
     return int(value)
 
 
-def stations_now() -> list[StationNow]:
+def station_activity() -> list[StationActivity]:
     """Every active station with what goes on there."""
     stations = list(Station.objects.filter(active=True).order_by("name"))
     open_ones = Trial.objects.filter(station__in=stations, status__in=UNFINISHED).select_related(
         "scene", "position", "checkpoint", "evaluation", "operator", "handout__plan"
     )
     found = {trial.station_id: trial for trial in open_ones.order_by("pk")}
-    return [StationNow(station, found.get(station.pk)) for station in stations]
+    return [StationActivity(station, found.get(station.pk)) for station in stations]
 
 
-def trials_recent(limit: int = 12) -> QuerySet[Trial]:
+def recent_trials(limit: int = 12) -> QuerySet[Trial]:
     """The newest that were run."""
     named = (
         "scene",

@@ -33,7 +33,7 @@ urlpatterns = [
     ),
     path(_PLAN + "trials/", views.trials, name="result-plan-trials"),
     *(
-        path(f"{_PLAN}{what}", views.act, {"what": what}, name=f"result-{what}")
+        path(f"{_PLAN}{what}", views.plan_action, {"what": what}, name=f"result-{what}")
         for what in ("freeze", "amend", "close", "reveal", "look", "judge")
     ),
 ]

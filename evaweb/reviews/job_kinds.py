@@ -13,10 +13,10 @@ from django.db import transaction
 
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.models import Episode
-from evaweb.jobs.kinds import Work, chore, job_kind
+from evaweb.jobs.kinds import JobContext, job_kind, periodic_task
 from evaweb.jobs.services import enqueue
 from evaweb.reviews import selectors, services
-from evaweb.reviews.dataset_sidecars import said_of, written
+from evaweb.reviews.dataset_sidecars import review_lines, write_review_sidecars
 from evaweb.reviews.folders import bounds_file, report_file
 from evaweb.reviews.models import Standing
 from runtime.datasets.sides import attach_sidecar
@@ -30,7 +30,7 @@ AT_ONCE = 20  # asked for in one look
 
 
 @job_kind("quality")
-def quality(work: Work) -> Mapping[str, Any]:
+def quality(work: JobContext) -> Mapping[str, Any]:
     """Look the episode through and keep the report; args: uuid."""
     # Web processes know this kind too, and never do it.
     from runtime.quality.settings import QualitySettings, read_settings
@@ -38,12 +38,12 @@ def quality(work: Work) -> Mapping[str, Any]:
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     bounds = bounds_file()
     settings = read_settings(bounds) if bounds.exists() else QualitySettings()
-    work.tell("every frame and picture is looked at")
+    work.report_progress("every frame and picture is looked at")
     found = _inspected(episode, settings).to_dict()
     path = report_file(episode.uuid)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, to_json(found, "the report"))
-    services.quality_found(
+    services.record_quality(
         episode=episode, document=found, at=datetime.fromtimestamp(path.stat().st_mtime, UTC)
     )
     return {"clean": found["clean"], "worst": found["worst"], "counts": found["counts"]}
@@ -67,7 +67,7 @@ def _inspected(episode: Episode, settings: QualitySettings) -> Report:
 
 
 @job_kind("sides")
-def sides(work: Work) -> Mapping[str, Any]:
+def write_sidecars_job(work: JobContext) -> Mapping[str, Any]:
     """Put verdicts and annotations beside the published episode; args: uuid."""
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     if episode.dataset_index is None:
@@ -75,26 +75,26 @@ def sides(work: Work) -> Mapping[str, Any]:
     dataset = data_dir() / episode.dataset
     work.hold([episode.dataset])
     with TemporaryDirectory() as folder:
-        said = written(episode.uuid, Path(folder))
+        said = write_review_sidecars(episode.uuid, Path(folder))
         for kind in ("reviews", "annotations"):
             attach_sidecar(dataset, str(episode.uuid), kind, said.get(kind))
-    counts = {kind: len(kept) for kind, kept in said_of(episode.uuid).items()}
+    counts = {kind: len(kept) for kind, kept in review_lines(episode.uuid).items()}
     return {"attached": True, **counts}
 
 
-@chore("episodes to be checked")
-def look_for_unchecked() -> int:
+@periodic_task("episodes to be checked")
+def find_unchecked_episodes() -> int:
     """Episodes that were closed, here or elsewhere, since the last look."""
-    found = list(selectors.unchecked()[:AT_ONCE])
+    found = list(selectors.unchecked_episodes()[:AT_ONCE])
     for episode in found:
-        services.quality_asked(episode=episode)
+        services.request_quality_check(episode=episode)
     return len(found)
 
 
-@chore("reviews to be published")
-def look_for_outdated() -> int:
+@periodic_task("reviews to be published")
+def find_outdated_sidecars() -> int:
     """Published episodes of which something was said since, or that were published after it was said."""
-    found = list(selectors.outdated()[:AT_ONCE])
+    found = list(selectors.outdated_episodes()[:AT_ONCE])
     for standing in found:
         with transaction.atomic():
             # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.

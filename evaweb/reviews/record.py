@@ -8,7 +8,7 @@ from uuid import UUID
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from evaweb.journal import From, Journal, Line, Moment, Person
+from evaweb.journal import Journal, Line, Moment, Person, RowPath
 
 _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
@@ -21,7 +21,7 @@ class ReviewLine(Line):
     verdict: Literal["pass", "fail", "note"]
     note: str = ""
     frame: _Frame | None = None
-    by: Annotated[Person, From("reviewer__username")]
+    by: Annotated[Person, RowPath("reviewer__username")]
     at: Moment
 
 
@@ -34,7 +34,7 @@ class SegmentLine(Line):
     last: _Frame
     label: Annotated[str, Field(min_length=1, max_length=120)]
     milestone: Annotated[str, Field(max_length=200)] = ""
-    by: Annotated[Person, From("annotator__username")]
+    by: Annotated[Person, RowPath("annotator__username")]
     at: Moment
 
     @field_validator("last")
@@ -60,7 +60,7 @@ class TagLine(Line):
     kind: Literal["tag"] = "tag"
     uuid: UUID
     words: Annotated[str, Field(min_length=1, max_length=60)]
-    by: Annotated[Person, From("by__username")]
+    by: Annotated[Person, RowPath("by__username")]
     at: Moment
 
 

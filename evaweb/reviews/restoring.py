@@ -9,8 +9,8 @@ from uuid import UUID
 from django.db import transaction
 
 from evaweb.episodes.models import Episode, Tag
-from evaweb.episodes.reconcile import Kept, restores
-from evaweb.journal import absent
+from evaweb.episodes.reconcile import RestorableRun, register_restorer
+from evaweb.journal import missing_rows
 from evaweb.reviews import selectors, services
 from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing
@@ -18,8 +18,8 @@ from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, segments_of, t
 from runtime.recording.files import RecordingError
 
 
-@restores
-def restore(kept: Kept) -> int:
+@register_restorer
+def restore(kept: RestorableRun) -> int:
     """Make the rows of an episode's reviews and segments, and of its report, that are not there; how many."""
     episode = Episode.objects.filter(uuid=kept.uuid).first()
     if episode is None:
@@ -28,7 +28,7 @@ def restore(kept: Kept) -> int:
     left_out: list[str] = []
     lines = REVIEWS.read(kept.uuid, left_out.append)
     for problem in left_out:
-        kept.say(problem)
+        kept.report_problem(problem)
     if not lines:
         return 0
     with transaction.atomic():
@@ -44,7 +44,7 @@ def _checked(episode: Episode) -> None:
         return
     document = selectors.report_of(uuid=episode.uuid) or {}
     try:
-        services.quality_found(
+        services.record_quality(
             episode=episode, document=document, at=datetime.fromtimestamp(path.stat().st_mtime, UTC)
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -52,12 +52,12 @@ def _checked(episode: Episode) -> None:
 
 
 def _reviews(episode: Episode, lines: Sequence[ReviewLine]) -> int:
-    lost = absent(Review, lines, episode=episode)
+    lost = missing_rows(Review, lines, episode=episode)
     for line in lost:
-        Review.objects.create(episode=episode, **line.values())
+        Review.objects.create(episode=episode, **line.to_row_values())
     if lost:
         decided = Review.objects.filter(episode=episode, verdict__in=DECIDES).order_by("-at").first()
-        services.standing_changed(episode=episode, review=decided)
+        services.touch_standing(episode=episode, review=decided)
     return len(lost)
 
 
@@ -68,8 +68,8 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
     """
     wanted = {line.uuid: line for line in segments_of(lines)}
     changed = 0
-    for line in absent(Segment, list(wanted.values()), episode=episode):
-        Segment.objects.create(episode=episode, **line.values())
+    for line in missing_rows(Segment, list(wanted.values()), episode=episode):
+        Segment.objects.create(episode=episode, **line.to_row_values())
         changed += 1
     gone: list[UUID] = []
     if whole:
@@ -82,7 +82,7 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
         gone = [uuid for uuid in rows if uuid not in wanted]
         Segment.objects.filter(pk__in=gone).delete()
     if changed or gone:
-        services.standing_changed(episode=episode)
+        services.touch_standing(episode=episode)
     return changed + len(gone)
 
 
@@ -92,7 +92,7 @@ def _tags(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
     gone = Tag.objects.filter(episode=episode).exclude(pk__in=[line.uuid for line in wanted])
     changed = gone.delete()[0] if whole else 0
     there = set(Tag.objects.filter(episode=episode).values_list("words", flat=True))
-    for line in absent(Tag, [line for line in wanted if line.words not in there], episode=episode):
-        Tag.objects.create(episode=episode, **line.values())
+    for line in missing_rows(Tag, [line for line in wanted if line.words not in there], episode=episode):
+        Tag.objects.create(episode=episode, **line.to_row_values())
         changed += 1
     return changed

@@ -8,7 +8,7 @@ from uuid import UUID
 
 from django.db.models import F, Q, QuerySet
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, NotFound
@@ -30,7 +30,7 @@ Judges = Callable[[Any, Episode], bool]
 _judges: list[Judges] = []
 
 
-def standing_of(*, episode: Episode) -> Standing:
+def get_standing(*, episode: Episode) -> Standing:
     """Standing of the episode; one of which nothing is known stands at the beginning."""
     return Standing.objects.filter(episode=episode).select_related("review__reviewer").first() or Standing(
         episode=episode
@@ -54,7 +54,7 @@ def report_get(*, uuid: UUID) -> Mapping[str, Any]:
     return found
 
 
-def opinions_of(*, user: Any, episode: Episode, sight: Sight) -> tuple[list[Review], list[Segment], int]:
+def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list[Review], list[Segment], int]:
     """What people said of it and its annotated parts, and how much of both is kept from this user.
 
     What others say is kept from whoever may still have to judge its trial.
@@ -88,7 +88,7 @@ def labels_offered() -> QuerySet[SegmentLabel]:
     return SegmentLabel.objects.filter(active=True)
 
 
-def unreviewed() -> QuerySet[Episode]:
+def unreviewed_episodes() -> QuerySet[Episode]:
     """Closed episodes with pictures or rows to look at and without a pass or fail, the newest first."""
     newest = (F("started_at").desc(nulls_last=True), "-created_at", "uuid")
     closed = Episode.objects.filter(status__in=CLOSED, frames__gt=0)
@@ -100,7 +100,7 @@ def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
 
     Without `after` the first. The episode itself is never the next.
     """
-    waiting = unreviewed()
+    waiting = unreviewed_episodes()
     count = waiting.count()
     here = Episode.objects.filter(uuid=after).first() if after else None
     if here is None:
@@ -113,13 +113,13 @@ def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
     return below.first() or others.first(), count
 
 
-def unchecked() -> QuerySet[Episode]:
+def unchecked_episodes() -> QuerySet[Episode]:
     """Closed episodes that are here and of which no checks were ever asked for, the oldest first."""
     here = Episode.objects.filter(status__in=CLOSED, away_since=None)
     return here.filter(standing__asked_at=None).order_by("created_at")
 
 
-def outdated() -> QuerySet[Standing]:
+def outdated_episodes() -> QuerySet[Standing]:
     """Those whose published episode has not the newest of what is said of it."""
     published = Standing.objects.exclude(episode__published_at=None).exclude(changed_at=None)
     older = (

@@ -17,11 +17,11 @@ from evaweb.episodes.models import LONGEST_TAG, Episode, EpisodeStatus, Tag
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
-from evaweb.journal import text
+from evaweb.journal import clean_text
 from evaweb.names import check_name
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing, Verdict
 from evaweb.reviews.record import REVIEWS, RemovalLine, ReviewLine, SegmentLine, TagLine, UntagLine
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require_role, role_of
 from runtime.core.sentences import Pattern, fixed
 
 _VERDICT_ALLOWED = Pattern("reviews.services.verdict_allowed", "verdict = {verdict!r:.40}; allowed: {values}")
@@ -65,20 +65,20 @@ MOST_TAGS = 30  # of an episode
 
 
 @transaction.atomic
-def review_add(
+def add_review(
     *, user: Any, episode: Episode, verdict: str, note: str = "", frame: int | None = None
 ) -> Review:
     """Say pass, fail or a note of an episode that is closed, or of one moment of it; operators.
 
     The newest pass or fail counts.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     if verdict not in Verdict.values:
         raise EvaError(_VERDICT_ALLOWED(verdict=verdict, values=", ".join(Verdict.values)))
-    note = text("note", note, LONGEST_NOTE)
+    note = clean_text("note", note, LONGEST_NOTE)
     if verdict == Verdict.NOTE and not note:
         raise EvaError(_NOTE_EMPTY_NOTE_NEEDS_WORDS)
-    _held(episode)
+    _locked_episode(episode)
     if frame is not None and not 0 <= frame < episode.frames:
         raise EvaError(_FRAME_ALLOWED(frame=frame, last=episode.frames - 1))
     said = {"verdict": verdict, "note": note, "frame": frame, "reviewer": user}
@@ -88,7 +88,7 @@ def review_add(
     review = Review(episode=episode, at=timezone.now(), **said)
     REVIEWS.append(episode.uuid, ReviewLine.written(review))
     review.save(force_insert=True)
-    standing_changed(episode=episode, review=review if verdict in DECIDES else None)
+    touch_standing(episode=episode, review=review if verdict in DECIDES else None)
     return review
 
 
@@ -96,7 +96,7 @@ def review_add(
 
 
 @transaction.atomic
-def segment_put(
+def save_segment(
     *,
     user: Any,
     episode: Episode,
@@ -107,11 +107,14 @@ def segment_put(
     segment: UUID | None = None,
 ) -> Segment:
     """Mark the frames `first` to `last`, both included; with `segment`, change that one of one's own. Operators."""
-    require(user, Role.OPERATOR)
-    label, milestone = text("label", label, LONGEST_LABEL), text("milestone", milestone, LONGEST_MILESTONE)
+    require_role(user, Role.OPERATOR)
+    label, milestone = (
+        clean_text("label", label, LONGEST_LABEL),
+        clean_text("milestone", milestone, LONGEST_MILESTONE),
+    )
     if not label:
         raise EvaError(_LABEL_EMPTY_SAY_WHAT_DONE)
-    _held(episode)
+    _locked_episode(episode)
     if not 0 <= first <= last < episode.frames:
         raise EvaError(_FIRST_LAST_ALLOWED_FRAMES_0(first=first, last=last, frames=episode.frames - 1))
     said = {"first": first, "last": last, "label": label, "milestone": milestone}
@@ -122,20 +125,20 @@ def segment_put(
     row.first, row.last, row.label, row.milestone, row.at = first, last, label, milestone, timezone.now()
     REVIEWS.append(episode.uuid, SegmentLine.written(row))
     row.save()
-    standing_changed(episode=episode)
+    touch_standing(episode=episode)
     return row
 
 
 @transaction.atomic
-def segment_remove(*, user: Any, episode: Episode, segment: UUID) -> None:
+def remove_segment(*, user: Any, episode: Episode, segment: UUID) -> None:
     """Take a part of one's own away again; an administrator any. Its lines stay on the disk."""
-    require(user, Role.OPERATOR)
-    _held(episode)
+    require_role(user, Role.OPERATOR)
+    _locked_episode(episode)
     row = _own(user, episode, segment)
     said = {"by": user.get_username(), "at": timezone.now().isoformat()}
     REVIEWS.append(episode.uuid, RemovalLine.written(row, **said))
     row.delete()
-    standing_changed(episode=episode)
+    touch_standing(episode=episode)
 
 
 def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
@@ -163,11 +166,11 @@ def tags_change(
     *, user: Any, episode: Episode, add: Sequence[str] = (), remove: Sequence[str] = ()
 ) -> Tagged:
     """Put tags on an episode that is closed, and take others off, whoever put them there; operators."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     wanted, unwanted = [tag_of(words) for words in add], {tag_of(words) for words in remove}
     if both := unwanted & set(wanted):
         raise EvaError(f"add and remove both say {', '.join(sorted(both))}: say it in one of them")
-    _held(episode)
+    _locked_episode(episode)
     there = {row.words: row for row in Tag.objects.filter(episode=episode)}
     gone = [there.pop(words) for words in sorted(unwanted) if words in there]
     new = [words for words in dict.fromkeys(wanted) if words not in there]
@@ -188,7 +191,7 @@ def tags_change(
 
 def tag_of(given: str) -> str:
     """The tag that is meant; EvaError where it cannot be one."""
-    words = " ".join(text("tag", given, LONGEST_TAG).casefold().split())
+    words = " ".join(clean_text("tag", given, LONGEST_TAG).casefold().split())
     try:
         check_name(words)
     except ValidationError as fault:
@@ -202,7 +205,7 @@ def tag_of(given: str) -> str:
 
 
 @transaction.atomic
-def quality_asked(*, episode: Episode) -> Job:
+def request_quality_check(*, episode: Episode) -> Job:
     """Have the worker look the episode through, again where it has."""
     if episode.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_CHECKED(uuid=episode.uuid))
@@ -211,7 +214,7 @@ def quality_asked(*, episode: Episode) -> Job:
 
 
 @transaction.atomic
-def quality_found(*, episode: Episode, document: Mapping[str, Any], at: datetime) -> Standing:
+def record_quality(*, episode: Episode, document: Mapping[str, Any], at: datetime) -> Standing:
     """Keep what the checks found; the report itself lies on the disk."""
     counts = document.get("counts", {})
     facts = {
@@ -227,7 +230,7 @@ def quality_found(*, episode: Episode, document: Mapping[str, Any], at: datetime
 # --- what both have in common --------------------------------------------------------------------------------
 
 
-def standing_changed(*, episode: Episode, review: Review | None = None) -> None:
+def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
     """Something was said of it; `review` counts from now on, None leaves the one that does.
 
     By the database's time, as publications are: they are compared, and workers have clocks of their own.
@@ -238,7 +241,7 @@ def standing_changed(*, episode: Episode, review: Review | None = None) -> None:
     Standing.objects.update_or_create(episode=episode, defaults=facts)
 
 
-def _held(episode: Episode) -> None:
+def _locked_episode(episode: Episode) -> None:
     """Make this the one writer of the episode's file; Conflict while it is being recorded."""
     row = Episode.objects.select_for_update().get(pk=episode.pk)
     if row.status == EpisodeStatus.RECORDING:

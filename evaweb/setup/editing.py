@@ -14,7 +14,7 @@ from evaweb.plans.models import Reference
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import station_list
 from evaweb.stations.surroundings import AREA, BENCH
-from evaweb.trials.failures import offered
+from evaweb.trials.failures import failure_choices
 from evaweb.trials.models import Milestone, Position, Scene
 from evaweb.trials.scene_reading import (
     MilestoneTable,
@@ -136,7 +136,7 @@ def operators_view(request: HttpRequest, given: Any, position: Any) -> str:
     panel = {
         "milestones": milestones,
         "implied": any(row.required for row in milestones),
-        "failures": offered(),
+        "failures": failure_choices(),
         "layout": scene.layout,
         "hidden": True,
     }

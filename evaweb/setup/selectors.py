@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.db.models import Count, QuerySet
 from django.urls import reverse
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.plans.models import PlanState
 from evaweb.plans.selectors import plan_list
 from evaweb.preflights.models import PreflightStatus, Verdict
@@ -43,7 +43,7 @@ class Card:
     missing: tuple[Missing, ...]
 
 
-def cards(*, user: Any, sight: Sight) -> list[Card]:
+def cards(*, user: Any, sight: Visibility) -> list[Card]:
     """Scenes, checkpoints, plans, people and stations; without drafts and checkpoints that are hidden from the user."""
     return [_scenes(), _checkpoints(sight), _plans(user), _people(), _stations()]
 
@@ -71,7 +71,7 @@ def _missing_of(scene: Any) -> Iterator[Missing]:
         yield Missing(f"{scene} does not say what counts as success.", f"{address}#words")
 
 
-def _checkpoints(sight: Sight) -> Card:
+def _checkpoints(sight: Visibility) -> Card:
     rows = checkpoint_list(all_of_them=True, sight=sight)
     usable = preflight_list(sight=sight).filter(status=PreflightStatus.DONE, report__verdict=Verdict.OK)
     untried = rows.filter(active=True).exclude(pk__in=usable.values("checkpoint"))

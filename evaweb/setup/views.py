@@ -9,10 +9,10 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_http_methods, require_POST
 
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.errors import EvaError, NotFound
 from evaweb.plans import pictures
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require_role, role_of
 from evaweb.setup import editing, selectors
 from evaweb.stations.selectors import station_get
 from evaweb.trials.scene_writing import ChangedMeanwhile, SceneRefused, scene_write
@@ -36,8 +36,8 @@ _PATIENCE_S = 1.5  # for a picture of a camera
 @require_GET
 def hub(request: HttpRequest) -> HttpResponse:
     """What is there, and what is missing next."""
-    require(request.user, Role.OPERATOR)
-    cards = selectors.cards(user=request.user, sight=sight_for(request))
+    require_role(request.user, Role.OPERATOR)
+    cards = selectors.cards(user=request.user, sight=visibility_for_request(request))
     return render(request, "setup/hub.html", {"cards": cards, "may_write": _may_write(request)})
 
 
@@ -51,7 +51,7 @@ def scenes(request: HttpRequest) -> HttpResponse:
 @require_http_methods(["GET", "POST"])
 def new_scene(request: HttpRequest) -> HttpResponse:
     """The editor with a scene that is not there yet, or with a copy of the one that ?from= names."""
-    require(request.user, Role.ADMIN)
+    require_role(request.user, Role.ADMIN)
     if request.method == "POST":
         return _written(request, None)
     source = request.GET.get("from", "")
@@ -86,7 +86,7 @@ def preview(request: HttpRequest) -> JsonResponse:
 @require_GET
 def live(request: HttpRequest, name: str, camera: str) -> HttpResponse:
     """What a camera of a station shows now."""
-    found = pictures.now(station_get(name=name), [camera], _PATIENCE_S)
+    found = pictures.current_images(station_get(name=name), [camera], _PATIENCE_S)
     return HttpResponse(found[camera], content_type="image/jpeg")
 
 

@@ -18,16 +18,16 @@ from django.contrib.auth import get_user_model
 from django.db import Error, IntegrityError, transaction
 from django.utils import timezone
 
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 from evaweb.errors import Conflict, EvaError, NotAllowed, StationGone
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require_role, role_of
 from evaweb.stations.holders import holder_of
 from evaweb.stations.models import CARRIED_OUT, Command, CommandStatus, Station
-from evaweb.stations.notes import Notes
-from evaweb.stations.runtime_client import NoAnswer, wire_to
+from evaweb.stations.notes import StopRecorder
+from evaweb.stations.runtime_client import NoAnswer, connection_to
 from evaweb.stations.selectors import station_get
-from evaweb.stations.stops import Answer, answer_of, ask, press, spoken
-from evaweb.stations.unwritten import Unwritten
+from evaweb.stations.stops import Answer, answer_of, clean_reason, press_estop, request_stop
+from evaweb.stations.unwritten import UnwrittenCommands
 from runtime.core.sentences import Pattern
 from runtime.ipc import messages
 from runtime.ipc.bus import CodecError
@@ -81,7 +81,7 @@ class NotSent(EvaError):
     status = 503
 
 
-def identity_of(given: UUID | str | None) -> UUID:
+def parse_command_uuid(given: UUID | str | None) -> UUID:
     """The uuid of a command, a new one where none is given; EvaError where it is none."""
     if given is None:
         return uuid4()
@@ -91,7 +91,7 @@ def identity_of(given: UUID | str | None) -> UUID:
         raise EvaError(_NO_UUID(given=given, example=uuid4())) from None
 
 
-def issue(
+def issue_command(
     *,
     user: Any,
     station: Station,
@@ -112,11 +112,11 @@ def issue(
     another command's, NotSent where the database does not take the row.
     """
     row = Command(
-        uuid=identity_of(uuid),
+        uuid=parse_command_uuid(uuid),
         station=station,
         user=user,
         kind=kind,
-        args=plain(dict(args or {})),
+        args=to_json_value(dict(args or {})),
         holder=holder_of(user.get_username(), page),
         epoch=epoch,
         boot=boot,
@@ -126,11 +126,11 @@ def issue(
         raise EvaError(_UNKNOWN(kind=kind, kinds=", ".join(KINDS)))
     if kind == "estop":
         return _stop(row)
-    role = require(user, Role.OPERATOR)
+    role = require_role(user, Role.OPERATOR)
     if kind in STOPPING:
         return _stop(row)
     _require_no_table(row, role, vouched)
-    return _give(row, _message(row, role, vouched))
+    return _send(row, _message(row, role, vouched))
 
 
 def _require_no_table(row: Command, role: Role, vouched: Sequence[str]) -> None:
@@ -138,11 +138,13 @@ def _require_no_table(row: Command, role: Role, vouched: Sequence[str]) -> None:
     given = [key for key in TABLES if row.args.get(key) is not None and key not in vouched]
     if given and role is not Role.ADMIN:
         raise NotAllowed(
-            _TABLES_FOR_ADMINISTRATORS(kind=row.kind, given=" and ".join(given), user=row.user, role=role.a)
+            _TABLES_FOR_ADMINISTRATORS(
+                kind=row.kind, given=" and ".join(given), user=row.user, role=role.with_article
+            )
         )
 
 
-def estop_noted(
+def record_estop(
     *,
     user: Any,
     station: Station,
@@ -156,14 +158,16 @@ def estop_noted(
 
     Of `station` and `user` the names are enough. `unverified` is why the user is not known.
     """
-    args = {"why": spoken(why)} | ({"unverified": unverified} if unverified else {})
-    row = Command(uuid=identity_of(uuid), station=station, user=user, kind="estop", args=args, issued_at=at)
+    args = {"why": clean_reason(why)} | ({"unverified": unverified} if unverified else {})
+    row = Command(
+        uuid=parse_command_uuid(uuid), station=station, user=user, kind="estop", args=args, issued_at=at
+    )
     if str(row.uuid) != answer.uuid and answer.data.get("latched") == "anew":  # which another press did
         answer = replace(answer, data={**answer.data, "latched": "already"})
-    return _noted(row, answer)
+    return _queue_record(row, answer)
 
 
-def stop_noted(
+def record_stop(
     *,
     user: Any,
     station: Station,
@@ -176,11 +180,11 @@ def stop_noted(
 ) -> Command:
     """The row of a stop or halt that was given `at` a time, written down soon, whenever the database takes it."""
     given = {"station": station, "user": user, "kind": kind, "epoch": epoch, "issued_at": at}
-    row = Command(uuid=identity_of(uuid), holder=holder_of(user.get_username(), page), **given)
-    return _noted(row, answer)
+    row = Command(uuid=parse_command_uuid(uuid), holder=holder_of(user.get_username(), page), **given)
+    return _queue_record(row, answer)
 
 
-def settle(*, row: Command) -> Command:
+def resolve_unknown_outcome(*, row: Command) -> Command:
     """Find out what became of a command whose answer was lost; leaves it as it is where that cannot be known yet.
 
     The runtime answers a uuid that it knows as it did the first time. One that it does not know comes too
@@ -192,7 +196,7 @@ def settle(*, row: Command) -> Command:
         return row
     try:
         late = _message(row, role_of(row.user) if row.user else "", TABLES, valid_until=_LONG_AGO)
-        answer = answer_of(wire_to(row.station.name).request(late))
+        answer = answer_of(connection_to(row.station.name).request(late))
     except StationGone:
         return row
     _put(row, answer)
@@ -200,12 +204,12 @@ def settle(*, row: Command) -> Command:
     return row
 
 
-def run_unopened(*, station: Station, uuid: UUID | str, reason: str) -> None:
+def record_run_not_opened(*, station: Station, uuid: UUID | str, reason: str) -> None:
     """Keep of an accepted run that its recording could not be opened: its answer may be heard of later still."""
-    Command.objects.filter(pk=identity_of(uuid), station=station, kind="run").update(unopened=reason)
+    Command.objects.filter(pk=parse_command_uuid(uuid), station=station, kind="run").update(unopened=reason)
 
 
-def unsettled(*, station: Station) -> list[Command]:
+def unresolved_commands(*, station: Station) -> list[Command]:
     """The commands of the last hour whose answers were lost."""
     now = timezone.now()
     return list(
@@ -219,10 +223,10 @@ def unsettled(*, station: Station) -> list[Command]:
     )
 
 
-def _give(row: Command, command: messages.Command) -> Command:
-    first = _first(row)
+def _send(row: Command, command: messages.Command) -> Command:
+    first = _find_first(row)
     if first is not None:
-        return settle(row=first)
+        return resolve_unknown_outcome(row=first)
     _require_sendable(command)
     pressed = time.monotonic()
     try:
@@ -230,13 +234,13 @@ def _give(row: Command, command: messages.Command) -> Command:
             row.issued_at = timezone.now()
             row.save(force_insert=True)
     except IntegrityError:  # pressed twice in the same moment
-        first = _first(row)
+        first = _find_first(row)
         if first is None:
             raise
         return first
     except Error as error:
         raise NotSent(_NOT_WRITTEN_DOWN(kind=row.kind, error=error)) from error
-    _put(row, _asked(row, command, waited=time.monotonic() - pressed))
+    _put(row, _send_and_wait(row, command, waited=time.monotonic() - pressed))
     _update(row)
     return row
 
@@ -249,12 +253,12 @@ def _require_sendable(command: messages.Command) -> None:
         raise EvaError(_NOT_SENDABLE(kind=command.kind, error=error)) from None
 
 
-def _asked(row: Command, command: messages.Command, waited: float) -> Answer:
+def _send_and_wait(row: Command, command: messages.Command, waited: float) -> Answer:
     """The runtime's answer to a command whose row took `waited` seconds to be written."""
     if waited > settings.EVA_COMMAND_TIMEOUT_S:
         return Answer(CommandStatus.FAILED, _DATABASE_SLOW(seconds=waited))
     try:
-        return answer_of(wire_to(row.station.name).request(command, expires=True))
+        return answer_of(connection_to(row.station.name).request(command, expires=True))
     except NoAnswer as fault:
         return Answer(CommandStatus.UNKNOWN, str(fault))
     except StationGone as fault:
@@ -263,19 +267,21 @@ def _asked(row: Command, command: messages.Command, waited: float) -> Answer:
 
 def _stop(row: Command) -> Command:
     if row.kind != "estop":
-        return _noted(row, ask(_message(row), row.station.name).result())
+        return _queue_record(row, request_stop(_message(row), row.station.name).result())
     why, username = str(row.args.get("why", "pressed")), row.user.get_username()
-    return _noted(row, press(station=row.station.name, username=username, why=why, uuid=row.uuid).result())
+    return _queue_record(
+        row, press_estop(station=row.station.name, username=username, why=why, uuid=row.uuid).result()
+    )
 
 
-def _noted(row: Command, answer: Answer) -> Command:
+def _queue_record(row: Command, answer: Answer) -> Command:
     """Have written down what has been done already."""
     _put(row, answer)
-    notes.note(row)
+    notes.record(row)
     return row
 
 
-def _written(row: Command) -> Command:
+def _stored_row(row: Command) -> Command:
     """The row as it is in the database: this one, or the first of that uuid with what this one knows better.
 
     A press whose uuid is that of something else has a row of its own.
@@ -293,15 +299,15 @@ def _merged(row: Command) -> Command:
         with transaction.atomic():
             row.save(force_insert=True)
         return row
-    better = _better(row, first)
+    better = _merged_fields(row, first)
     if better:
         row.save(
             update_fields=better, force_update=True
         )  # not the object that was read: it would be inserted
-    return _first(row) or row
+    return _find_first(row) or row
 
 
-def _better(row: Command, first: Command) -> list[str]:
+def _merged_fields(row: Command, first: Command) -> list[str]:
     """The fields of a stop that came another way as well, where its answer was heard or its user was known there."""
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"
@@ -316,7 +322,7 @@ def _first_or_own(row: Command) -> Command | None:
     That follows from what was pressed: by any writer, and however often, it is one row.
     """
     try:
-        first = _first(row)
+        first = _find_first(row)
     except Conflict as conflict:
         if row.kind != "estop":
             raise
@@ -328,7 +334,7 @@ def _first_or_own(row: Command) -> Command | None:
     user = row.user.get_username() if row.user else ""
     row.data = {**row.data, "sent_uuid": str(row.uuid), "repeat": repeat}
     row.uuid = uuid5(row.uuid, f"{row.station.name} {user} {row.data.get('carried_out_at', '')}")
-    return _first(row)
+    return _find_first(row)
 
 
 def _latched_again(row: Command, first: Command) -> bool:
@@ -345,11 +351,11 @@ def _resolve(row: Command) -> None:
         row.user = get_user_model().objects.filter(username=row.user.get_username()).first()
 
 
-unwritten = Unwritten(_written)
-notes = Notes(lambda row: unwritten.keep(row), journal=unwritten.foresee)
+unwritten = UnwrittenCommands(_stored_row)
+notes = StopRecorder(lambda row: unwritten.store(row), journal=unwritten.prepare)
 
 
-def _first(row: Command) -> Command | None:
+def _find_first(row: Command) -> Command | None:
     """The row that has this uuid already; raises Conflict where it is another command."""
     first = Command.objects.select_related("station", "user").filter(uuid=row.uuid).first()
     if first is None:

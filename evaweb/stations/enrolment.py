@@ -13,7 +13,7 @@ from django.db import transaction
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from evaweb.stations.models import EnrolmentCode, Station, StationKey
 from runtime.link import codes, key_files
 from runtime.link.admission import Allowed
@@ -41,7 +41,7 @@ class Shown(NamedTuple):
 @transaction.atomic
 def code_make(*, user: Any, station: Station) -> Shown:
     """A new code for this station; those of before are good no more. Raises NotAllowed, EvaError without a gate."""
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     if settings.EVA_GATE is None:
         raise EvaError(
             "this lab has no gate: start it with EVA_GATE=HOST:PORT, where stations are to connect"
@@ -77,7 +77,7 @@ def key_enrol(*, digest: str, key: str, computer: str) -> Station:
 
 def key_withdraw(*, user: Any, key: StationKey) -> StationKey:
     """The computer is no station any more: its connections are cut within a second."""
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     if key.withdrawn_at is None:
         key.withdrawn_at, key.withdrawn = timezone.now(), f"withdrawn by {user.get_username()}"
         key.save(update_fields=["withdrawn_at", "withdrawn"])

@@ -24,18 +24,18 @@ _REQUESTS_UNDER_WAY = Pattern(
 T = TypeVar("T")
 
 
-class TooMany(Exception):
+class TooManyRequests(Exception):
     """More requests to one station are under way than it may have."""
 
 
 @dataclass(slots=True)
-class _Flight(Generic[T]):
+class _PendingRequest(Generic[T]):
     identity: Hashable
     work: Callable[[], T]
     answer: Future[T] = field(default_factory=Future)
 
 
-class Flights(Generic[T]):
+class RequestCoalescer(Generic[T]):
     """Requests to stations under way; from any thread, and none of its callers waits.
 
     `most` is how many keys of one station may be under way at once, None for any number.
@@ -44,10 +44,12 @@ class Flights(Generic[T]):
     def __init__(self, name: str, most: int | None = None) -> None:
         self._name, self._most = name, most
         self._lock = Lock()
-        self._under_way: dict[tuple[str, Hashable], list[_Flight[T]]] = {}  # the one that flies, the next
+        self._under_way: dict[
+            tuple[str, Hashable], list[_PendingRequest[T]]
+        ] = {}  # the one that flies, the next
         self._keys: Counter[str] = Counter()  # by station
 
-    def ask(
+    def submit(
         self,
         station: str,
         work: Callable[[], T],
@@ -62,14 +64,14 @@ class Flights(Generic[T]):
         which is sent after it came; where it is `shared`, that of the one under way, and that request is made all
         the same. Raises TooMany.
         """
-        place, flight = (station, key), _Flight(identity, work)
+        place, flight = (station, key), _PendingRequest(identity, work)
         flight.answer.set_running_or_notify_cancel()  # who stops waiting for it ends nobody else's
         with self._lock:
             flights = self._under_way.get(place)
             if flights is not None:
                 return _joined(flights, flight, shared)
             if self._most is not None and self._keys[station] >= self._most:
-                raise TooMany(_REQUESTS_UNDER_WAY(most=self._most, station=station))
+                raise TooManyRequests(_REQUESTS_UNDER_WAY(most=self._most, station=station))
             self._under_way[place] = [flight]
             self._keys[station] += 1
         self._start(place)
@@ -83,7 +85,7 @@ class Flights(Generic[T]):
             self._fly(place)
 
     def _fly(self, place: tuple[str, Hashable]) -> None:
-        flight: _Flight[T] | None = self._under_way[place][0]
+        flight: _PendingRequest[T] | None = self._under_way[place][0]
         while flight is not None:
             try:
                 answer = flight.work()
@@ -94,7 +96,7 @@ class Flights(Generic[T]):
                 done, flight = flight, self._next(place)
                 done.answer.set_result(answer)
 
-    def _next(self, place: tuple[str, Hashable]) -> _Flight[T] | None:
+    def _next(self, place: tuple[str, Hashable]) -> _PendingRequest[T] | None:
         """The one that waited, which flies now; no caller joins the one that is over."""
         with self._lock:
             flights = self._under_way[place]
@@ -108,7 +110,7 @@ class Flights(Generic[T]):
             return None
 
 
-def _joined(flights: list[_Flight[T]], flight: _Flight[T], shared: bool) -> Future[T]:
+def _joined(flights: list[_PendingRequest[T]], flight: _PendingRequest[T], shared: bool) -> Future[T]:
     for one in flights:
         if one.identity == flight.identity:
             return one.answer

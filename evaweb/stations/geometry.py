@@ -10,8 +10,8 @@ from django.urls import reverse
 from numpy.typing import NDArray
 
 from evaweb.stations.meshes import mesh_in
-from evaweb.stations.robot_geometry import Looks, looks_of, tip_of
-from evaweb.stations.surroundings import BENCH, surroundings
+from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot, tip_of
+from evaweb.stations.surroundings import BENCH, scene_surroundings
 from robots import Group
 from robots.capsules import capsules
 from robots.rotations import transform_of
@@ -21,12 +21,12 @@ from robots.visuals import Visual
 Float64 = NDArray[np.float64]
 
 
-def geometry(robot: str, groups: Sequence[str] | None = None, *, simulated: bool) -> dict[str, Any]:
+def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, simulated: bool) -> dict[str, Any]:
     """Parts, shapes, frames and surroundings of a robot with these groups; NotFound where there is none such.
 
     Matrices go column by column. A frame's `part` is None where it stands still in the scene.
     """
-    looks = looks_of(robot, groups)
+    looks = drawn_robot(robot, groups)
     return {
         "robot": robot,
         "groups": [group.name for group in looks.robot.groups],
@@ -34,12 +34,12 @@ def geometry(robot: str, groups: Sequence[str] | None = None, *, simulated: bool
         "visuals": [_visual(robot, visual) for visual in looks.scene.visuals],
         "home": looks.poses(np.asarray(looks.robot.poses["home"])).tolist(),
         "tips": [
-            {"group": arm.name, "part": looks.carrier(arm), "pose": _numbers(tip_of(arm))}
+            {"group": arm.name, "part": looks.tip_part(arm), "pose": _numbers(tip_of(arm))}
             for arm in looks.robot.arms
         ],
         "frames": _frames(looks),
         "capsules": _capsules(looks),
-        **surroundings(looks),
+        **scene_surroundings(looks),
         "bench": BENCH if simulated else None,
     }
 
@@ -63,7 +63,7 @@ def _shape(visual: Visual) -> dict[str, Any]:
     return {"kind": visual.kind, "size": list(visual.size), "origin": _numbers(visual.origin)}
 
 
-def _frames(looks: Looks) -> list[dict[str, Any]]:
+def _frames(looks: DrawnRobot) -> list[dict[str, Any]]:
     """Every arm's end effector, and once each frame in which such poses may be given."""
     robot = looks.robot
     found: dict[int | None, dict[str, Any]] = {}
@@ -73,16 +73,16 @@ def _frames(looks: Looks) -> list[dict[str, Any]]:
         found.setdefault(part, _frame(_link(looks, arm, arm.frame), "reference", part))
     if robot.mount_frame not in ("world", *(frame["name"] for frame in found.values())):
         found[None] = _frame(robot.mount_frame, "reference", None, transform_of(robot.stand))
-    ends = [_frame(_link(looks, arm, str(arm.eef_link)), "end", looks.carrier(arm)) for arm in robot.arms]
+    ends = [_frame(_link(looks, arm, str(arm.eef_link)), "end", looks.tip_part(arm)) for arm in robot.arms]
     return [*ends, *found.values()]
 
 
-def _link(looks: Looks, arm: Group, link: str) -> str:
+def _link(looks: DrawnRobot, arm: Group, link: str) -> str:
     """A link's name, behind its arm's where there are several of that name."""
     return link if len(looks.scene.parts_showing(link)) == 1 else f"{arm.name}/{link}"
 
 
-def _capsules(looks: Looks) -> list[dict[str, Any]]:
+def _capsules(looks: DrawnRobot) -> list[dict[str, Any]]:
     """Capsules that stand for the links in checks of collision with each other or with the table."""
     return [
         {"part": part, "start": one.start.tolist(), "end": one.end.tolist(), "radius": one.radius}

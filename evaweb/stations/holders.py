@@ -14,11 +14,11 @@ def holder_of(username: str, page: str) -> str:
     return f"web:{username}:{page}"
 
 
-def who(holder: str) -> str:
+def holder_display_name(holder: str) -> str:
     """A holder's name as people know it."""
     return holder.split(":")[1] if holder.startswith("web:") else holder
 
 
-def readable(reason: str) -> str:
+def with_display_names(reason: str) -> str:
     """A sentence of the runtime with people's names where it names their pages."""
     return rewritten(reason, lambda text: _PAGE.sub(r"\1", text))

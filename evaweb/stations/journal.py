@@ -18,7 +18,7 @@ _SUFFIX = ".lines"
 _NO_FILE = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENXIO)  # of this process, and never will be
 
 
-class Journal:
+class ProcessJournal:
     """One file at a time, locked as long as this process lives; there is none while nothing is in mind.
 
     Nothing is synced: what the system has taken outlives the process, if not the machine.
@@ -59,7 +59,7 @@ class Journal:
         return path, file
 
 
-def take_up(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> bool:
+def recover_journals(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> bool:
     """Hand `take` the lines of each process that has died; whether a file has to wait for the disk.
 
     A file is removed when `take` says that all of it was good; else it stays as .refused, as does what is no file.

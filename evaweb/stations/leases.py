@@ -17,10 +17,10 @@ from django.db.models import Max
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.roles import Role, require, role_of
-from evaweb.stations.holders import holder_of, readable, who
+from evaweb.roles import Role, require_role, role_of
+from evaweb.stations.holders import holder_display_name, holder_of, with_display_names
 from evaweb.stations.models import Lease, LeaseRequest, Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc import messages
 
@@ -70,12 +70,12 @@ _ECHO = timedelta(seconds=3)  # for which an old snapshot may still be under way
 
 def claim(*, user: Any, station: Station, page: str) -> Lease:
     """Take a free station, or keep one's own; raises Conflict that names the holder."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _require_active(station)
     holder = holder_of(user.get_username(), page)
     held = _held(station)
     if held["holder"] not in ("", holder):
-        raise Conflict(_HELD_BY(who=who(held["holder"]), station=station))
+        raise Conflict(_HELD_BY(who=holder_display_name(held["holder"]), station=station))
     epoch = held["epoch"] if held["holder"] else _next_epoch(station, held)
     return _grant(user, station, holder, epoch, end_reason="expired")
 
@@ -86,22 +86,22 @@ def renew(*, username: str, page: str, station: str, epoch: int, hidden: bool = 
     That of a `hidden` page counts while nothing moves.
     """
     args = {"hidden": True} if hidden else {}
-    return _tell(station, "lease_renew", holder_of(username, page), epoch, args=args)
+    return _send_lease_command(station, "lease_renew", holder_of(username, page), epoch, args=args)
 
 
-def give_up(*, user: Any, station: Station, page: str) -> Lease:
+def release(*, user: Any, station: Station, page: str) -> Lease:
     """End one's own lease; a run that is going on is held then."""
     lease = _own(user, station, page)
-    ack = _tell(station.name, "lease_give_up", lease.holder, lease.epoch)
+    ack = _send_lease_command(station.name, "lease_give_up", lease.holder, lease.epoch)
     if ack.status == "refused":
-        raise Conflict(readable(ack.reason))
+        raise Conflict(with_display_names(ack.reason))
     _end(lease, "given up")
     return lease
 
 
-def request(*, user: Any, station: Station, page: str) -> LeaseRequest:
+def request_handover(*, user: Any, station: Station, page: str) -> LeaseRequest:
     """Ask the holder to hand the station over; asking again moves the request to the page that asks."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _require_active(station)
     holder, held = holder_of(user.get_username(), page), _held(station)["holder"]
     if not held:
@@ -114,7 +114,7 @@ def request(*, user: Any, station: Station, page: str) -> LeaseRequest:
     return asked
 
 
-def withdraw(*, user: Any, station: Station) -> LeaseRequest:
+def withdraw_request(*, user: Any, station: Station) -> LeaseRequest:
     """Take one's request back."""
     asked = LeaseRequest.objects.filter(station=station, user=user, answer=LeaseRequest.Answer.OPEN).first()
     if asked is None:
@@ -122,7 +122,7 @@ def withdraw(*, user: Any, station: Station) -> LeaseRequest:
     return _answered(asked, LeaseRequest.Answer.WITHDRAWN)
 
 
-def decline(*, user: Any, station: Station, page: str, request: int) -> LeaseRequest:
+def decline_request(*, user: Any, station: Station, page: str, request: int) -> LeaseRequest:
     """The holder says no to a request."""
     _own(user, station, page)
     return _answered(_open_request(station, request), LeaseRequest.Answer.DECLINED)
@@ -135,7 +135,7 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     _require_commander(asked.user)
     held = _held(station)
     if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
-        raise Conflict(_ENDED_MEANWHILE(who=who(held["holder"]) or "nobody", station=station))
+        raise Conflict(_ENDED_MEANWHILE(who=holder_display_name(held["holder"]) or "nobody", station=station))
     epoch = _next_epoch(station, held)
     return _grant(asked.user, station, asked.holder, epoch, f"handed over to {asked.user}")
 
@@ -145,19 +145,21 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
 
     Raises Conflict where the station is free or another user's.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _require_active(station)
     holder, held = holder_of(user.get_username(), page), _held(station)
     if held["holder"] == holder:
         return _grant(user, station, holder, held["epoch"], end_reason="expired")
     if not held["holder"].startswith(holder_of(user.get_username(), "")):
-        raise Conflict(_NO_PAGE_OF_YOURS(who=who(held["holder"]) or "nobody", station=station))
+        raise Conflict(
+            _NO_PAGE_OF_YOURS(who=holder_display_name(held["holder"]) or "nobody", station=station)
+        )
     return _grant(user, station, holder, _next_epoch(station, held), "moved to another page")
 
 
-def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
+def take_over(*, user: Any, station: Station, page: str, reason: str) -> Lease:
     """An administrator takes the station from its holder, and says why."""
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     if not reason.strip():
         raise EvaError(_TAKE_WITHOUT_REASON)
     holder = holder_of(user.get_username(), page)
@@ -165,7 +167,7 @@ def take(*, user: Any, station: Station, page: str, reason: str) -> Lease:
     return _grant(user, station, holder, epoch, f"taken by {user.get_username()}: {reason.strip()}"[:240])
 
 
-def notice(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
+def record_snapshot_lease(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
     """Write down what the runtime says of its lease (a snapshot's "lease"); True where rows had to change.
 
     This is how a lease ends that expired, and how one comes into the records that a terminal or a script took.
@@ -178,11 +180,11 @@ def notice(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
         if last and last.boot == boot and last.epoch > epoch:
             return False
         if not holder:
-            return last is not None and _end(last, _why_over(last, boot))
-        return _record(station, holder, epoch, boot, _why_over(last, boot) if last else "")[1]
+            return last is not None and _end(last, _end_reason(last, boot))
+        return _record(station, holder, epoch, boot, _end_reason(last, boot) if last else "")[1]
 
 
-def _why_over(lease: Lease, boot: str) -> str:
+def _end_reason(lease: Lease, boot: str) -> str:
     return "expired: it was not renewed" if lease.boot == boot else "the station was restarted"
 
 
@@ -190,7 +192,7 @@ def _require_commander(user: Any) -> None:
     """A user who was switched off, or became a viewer, after asking gets no station any more."""
     if not user.is_active:
         raise NotAllowed(_USER_SWITCHED_OFF(user=user.get_username()))
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
 
 
 def _require_active(station: Station) -> None:
@@ -200,7 +202,7 @@ def _require_active(station: Station) -> None:
 
 def _held(station: Station) -> dict[str, Any]:
     """The lease as the runtime has it now: holder, epoch."""
-    held: dict[str, Any] = wire_to(station.name).status()["lease"]
+    held: dict[str, Any] = connection_to(station.name).status()["lease"]
     return held
 
 
@@ -209,7 +211,7 @@ def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
     return 1 + max(int(held["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
 
 
-def _tell(
+def _send_lease_command(
     station: str,
     kind: str,
     holder: str,
@@ -218,11 +220,11 @@ def _tell(
     args: Mapping[str, Any] | None = None,
 ) -> messages.Ack:
     """A lease command to the runtime; to keep or end a lease needs no role."""
-    user = who(holder)
+    user = holder_display_name(holder)
     command = messages.Command(
         str(uuid4()), kind, args or {}, user=user, holder=holder, epoch=epoch, role=role
     )
-    return wire_to(station).request(command)
+    return connection_to(station).request(command)
 
 
 def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
@@ -230,9 +232,9 @@ def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str
 
     The request of the new holder is answered with it.
     """
-    ack = _tell(station.name, "lease_claim", holder, epoch, role_of(user))
+    ack = _send_lease_command(station.name, "lease_claim", holder, epoch, role_of(user))
     if ack.status == "refused":
-        raise Conflict(_NOT_GIVEN(station=station, why=readable(ack.reason)))
+        raise Conflict(_NOT_GIVEN(station=station, why=with_display_names(ack.reason)))
     with transaction.atomic():
         _lock(station)
         lease = _record(station, holder, epoch, ack.boot, end_reason)[0]
@@ -270,7 +272,7 @@ def _lock(station: Station) -> None:
 
 def _user_of(holder: str) -> Any:
     users = get_user_model().objects
-    return users.filter(username=who(holder)).first() if holder.startswith("web:") else None
+    return users.filter(username=holder_display_name(holder)).first() if holder.startswith("web:") else None
 
 
 def _own(user: Any, station: Station, page: str) -> Lease:

@@ -8,7 +8,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from evaweb.errors import NotFound
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.stations.robot_geometry import drawn_robot
 from runtime.core.sentences import Pattern
 
 _SHOWS_NO_MESH_LOAD_PAGE = Pattern(
@@ -33,7 +33,7 @@ def mesh_in(file: Path) -> Mesh:
 
 def mesh_content(*, robot: str, digest: str) -> bytes:
     """The content of that digest; NotFound unless one of the robot's visuals shows a file that has it."""
-    files = {visual.file for visual in looks_of(robot).scene.visuals if visual.file is not None}
+    files = {visual.file for visual in drawn_robot(robot).scene.visuals if visual.file is not None}
     for file in sorted(files):
         if _digest(file) == digest:
             content = file.read_bytes()

@@ -16,7 +16,7 @@ from threading import Condition, Thread
 
 from django.conf import settings
 
-from evaweb.rarely import Rarely
+from evaweb.rarely import LogThrottle
 from evaweb.stations.models import Command, CommandStatus
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ _Key = tuple[str, ...]
 _Journal = Callable[[Sequence[Command]], object]
 
 
-class Notes:
+class StopRecorder:
     """Rows that are handed to `keep`, one after the other, in a thread that may wait for the disk.
 
     `journal` is told of those that have to wait meanwhile, and with none when they have all been handed on.
@@ -46,36 +46,36 @@ class Notes:
         self._waiting: dict[_Key, tuple[Command, int]] = {}
         self._written: dict[_Key, float] = {}
         self._thread: Thread | None = None
-        self._nowhere = Rarely(_EVERY_S, _MOST_NAMES, clock)
-        self._lost = Rarely(_EVERY_S, _MOST_NAMES, clock)
-        self._failed = Rarely(_EVERY_S, _MOST_NAMES, clock)
+        self._nowhere = LogThrottle(_EVERY_S, _MOST_NAMES, clock)
+        self._lost = LogThrottle(_EVERY_S, _MOST_NAMES, clock)
+        self._failed = LogThrottle(_EVERY_S, _MOST_NAMES, clock)
 
-    def note(self, row: Command) -> None:
+    def record(self, row: Command) -> None:
         """Have it written down; of a second's with one station, kind, user and outcome the newest, and how many.
 
         A press that latched the e-stop anew is never one of many.
         """
-        key = key_of(row)
+        key = merge_key(row)
         with self._news:
             self._fresh.append((key, row))
             _, times = self._waiting.pop(key, (row, 0))
             if len(self._waiting) >= _MOST:
-                self._give_up()
+                self._drop_one()
             self._waiting[key] = (row, times + 1)
             self._run_soon()
 
-    def _give_up(self) -> None:
+    def _drop_one(self) -> None:
         """The oldest that came to nothing, as at a station that there is not; else the oldest."""
         failed = (key for key, (row, _) in self._waiting.items() if row.status == CommandStatus.FAILED)
         key = next(failed, None)
         lost = self._waiting.pop(key or next(iter(self._waiting)))
-        before = "" if key is None else self._lost.due(CommandStatus.FAILED)
+        before = "" if key is None else self._lost.suffix_if_due(CommandStatus.FAILED)
         if before is not None:
             log.error(
                 "more than %d stops wait to be written down, this is given up: %r%s", _MOST, lost, before
             )
 
-    def write(self, *, all_of_them: bool = False) -> float | None:
+    def write_due(self, *, all_of_them: bool = False) -> float | None:
         """Hand on what is due; in how many seconds the next one is, None where nothing waits [s]."""
         now = self._clock()
         with self._news:
@@ -87,7 +87,7 @@ class Notes:
             waiting = [row for key, row in self._fresh if key in self._waiting]
             self._fresh.clear()
         self._write_ahead(waiting)
-        again = [one for one in taken if not self._is_handed_on(*one[1:])]
+        again = [one for one in taken if not self._try_hand_on(*one[1:])]
         if again:
             self._take_back(again)
             return wait or _APART_S
@@ -101,7 +101,7 @@ class Notes:
                 newer, since = self._waiting.get(key, (row, 0))
                 self._waiting[key] = (newer, since + times)
             while len(self._waiting) > _MOST:
-                self._give_up()
+                self._drop_one()
 
     def _write_ahead(self, rows: Sequence[Command]) -> None:
         try:
@@ -109,12 +109,12 @@ class Notes:
         except Exception as error:  # it is written down all the same
             log.error("a kill would lose %d stops that wait to be written down: %r", len(rows), error)
 
-    def _is_handed_on(self, row: Command, times: int) -> bool:
+    def _try_hand_on(self, row: Command, times: int) -> bool:
         """Whatever is wrong with one, the next one is written all the same; that one is tried again."""
         try:
             self._hand_on(row, times)
         except Exception:
-            before = self._failed.due(row.station.name)
+            before = self._failed.suffix_if_due(row.station.name)
             if before is not None:
                 log.exception("%s (%s) is not written down yet%s", row, row.uuid, before)
             return False
@@ -126,7 +126,7 @@ class Notes:
         if _has_station(row):
             self._keep(row)
             return
-        before = self._nowhere.due(row.station.name, times)
+        before = self._nowhere.suffix_if_due(row.station.name, times)
         if before is not None:
             log.warning("%s (%s) is not written down: there is no such station%s", row, row.uuid, before)
 
@@ -134,7 +134,7 @@ class Notes:
         if self._thread is None:
             self._thread = Thread(target=self._run, name="notes", daemon=True)
             self._thread.start()
-            atexit.register(self.write, all_of_them=True)
+            atexit.register(self.write_due, all_of_them=True)
         self._news.notify()
 
     def _run(self) -> None:
@@ -143,10 +143,10 @@ class Notes:
             with self._news:
                 if wait is not None or not self._waiting:
                     self._news.wait(wait)
-            wait = self.write()
+            wait = self.write_due()
 
 
-def key_of(row: Command) -> _Key:
+def merge_key(row: Command) -> _Key:
     """Key of the presses of one second that are one row."""
     user = row.user.get_username() if row.user else ""
     latched_at = str(row.data["carried_out_at"]) if row.data.get("latched") == "anew" else ""

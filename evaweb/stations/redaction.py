@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from evaweb.blinding import COVERED, COVERED_AT_REST, Sight
+from evaweb.blinding import COVERED, COVERED_AT_REST, Visibility
 from runtime.core.sentences import Sentence, heard, identity, shows, texts
 from runtime.ipc.session_state import SessionState
 
@@ -62,7 +62,7 @@ _EVENTS = ("camera_back", "camera_lost", "drives", "estopped", "labelled", "rele
 _JUDGED = ("milestones", "success")  # of the bench's truth: people score before they hear it
 
 
-def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
+def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, Any]:
     """A snapshot, in the same shape: what would tell is empty, and "veiled" says that it is."""
     shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
     covered = COVERED_AT_REST if snapshot.get("state") == SessionState.IDLE else COVERED
@@ -89,9 +89,9 @@ def state(snapshot: Mapping[str, Any], sight: Sight) -> dict[str, Any]:
     return shown | {"veiled": True}
 
 
-def _reason(text: object, said: object, sight: Sight, covered: str) -> str:
+def _reason(text: object, said: object, sight: Visibility, covered: str) -> str:
     """Why the station is where it is, as it may be read, else `covered`; `said` has its id and arguments."""
-    return sight.told(
+    return sight.redact_text(
         _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), covered
     )
 
@@ -124,7 +124,9 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
     return {"id": row["id"], "arguments": arguments}
 
 
-def events(rows: Iterable[Mapping[str, Any]], sight: Sight, last: int = 0) -> list[dict[str, Any]]:
+def redact_events(
+    rows: Iterable[Mapping[str, Any]], sight: Visibility, last: int = 0
+) -> list[dict[str, Any]]:
     """Events that name no policy; the others are left out, and with them when they were, and how many.
 
     Numbers are made of their times [us], rising from the one before them, `last`: gaps would count what is left out.
@@ -137,26 +139,26 @@ def events(rows: Iterable[Mapping[str, Any]], sight: Sight, last: int = 0) -> li
     return found
 
 
-def joints(content: Mapping[str, Any]) -> dict[str, Any]:
+def redact_joints(content: Mapping[str, Any]) -> dict[str, Any]:
     """The robot's joints without what the policy wanted, and without which chunk made a step."""
     return {key: content[key] for key in _JOINTS if key in content}
 
 
-def answer(data: Mapping[str, Any]) -> dict[str, Any]:
+def redact_answer(data: Mapping[str, Any]) -> dict[str, Any]:
     """Data of the answer to a command."""
     return {key: data[key] for key in ("episode", "bench") if key in data}
 
 
-def _event(row: Mapping[str, Any], sight: Sight) -> dict[str, Any] | None:
+def _event(row: Mapping[str, Any], sight: Visibility) -> dict[str, Any] | None:
     kind, text = row.get("kind"), str(row.get("text") or "")
     kept = {key: row[key] for key in ("time", "wall") if key in row}
     reason = _sentence((row.get("arguments") or {}).get("reason"))
     if kind == "command":  # "stop by ann: accepted", "setup by ann: refused, the reason"
         said, _, rest = text.partition(", ")
-        text = f"{said}, {sight.told(reason if reason == rest else rest, COVERED)}" if rest else said
+        text = f"{said}, {sight.redact_text(reason if reason == rest else rest, COVERED)}" if rest else said
     elif kind == "state":  # "running -> holding: the reason"
         moved, _, rest = text.partition(": ")
-        text = f"{moved}: {sight.told(reason if reason == rest else rest, COVERED)}" if rest else moved
+        text = f"{moved}: {sight.redact_text(reason if reason == rest else rest, COVERED)}" if rest else moved
     elif kind in ("episode_opened", "episode_closed"):
         text = str(kind).replace("_", " ")
     elif kind not in _EVENTS:

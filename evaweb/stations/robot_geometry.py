@@ -26,7 +26,7 @@ _KEPT = 64  # robots in the groups of some station or episode
 _kernels = ThreadPoolExecutor(1, "links")
 
 
-class Looks:
+class DrawnRobot:
     """A robot as it is drawn: its description and its scene.
 
     Kernels are compiled, or loaded from disk, in a thread of their own: no caller waits for them, and one before they
@@ -58,15 +58,15 @@ class Looks:
         """True if the kernels are there."""
         return self._links.done() and self._links.exception() is None
 
-    def tips(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
+    def fingertip_positions(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
         """Fingertips for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
         found = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
         for index, arm in enumerate(self.robot.arms):
-            part = links[..., self.carrier(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows
+            part = links[..., self.tip_part(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows
             found[..., index, :] = (tip_of(arm)[:, 3] @ part)[..., :3]
         return found
 
-    def carrier(self, arm: robots.Group) -> int:
+    def tip_part(self, arm: robots.Group) -> int:
         """The part that is an arm's end effector, and carries its fingertips."""
         assert arm.eef_link is not None
         return self.scene.link_of(arm.name, arm.eef_link)
@@ -100,7 +100,7 @@ def tip_of(arm: robots.Group) -> NDArray[np.float64]:
     return np.eye(4) if arm.tip is None else arm.tip
 
 
-def looks_of(robot: str, groups: Sequence[str] | None = None) -> Looks:
+def drawn_robot(robot: str, groups: Sequence[str] | None = None) -> DrawnRobot:
     """The looks of a known robot with these groups, None for all that are not optional.
 
     NotFound lists what there is, or says what its description lacks.
@@ -109,12 +109,12 @@ def looks_of(robot: str, groups: Sequence[str] | None = None) -> Looks:
 
 
 @lru_cache(_KEPT)
-def _looks(robot: str, groups: tuple[str, ...] | None) -> Looks:
+def _looks(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot:
     if robot not in robots.robot_names():  # a name, never a path: it may come from an address
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     try:
         described = robots.load_robot(robot, groups)
-        return Looks(described, robots.scene_of(described))
+        return DrawnRobot(described, robots.scene_of(described))
     except robots.RobotError as error:
         raise NotFound(str(error)) from error
 
@@ -124,10 +124,10 @@ def groups_of(joint_names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.partition(".")[0] for name in joint_names))
 
 
-def facts_of(robot: str) -> dict[str, Any]:
+def describe_robot(robot: str) -> dict[str, Any]:
     """The facts of a robot; where its description cannot be read, none but why: stopping must work all the same."""
     try:
-        return looks_of(robot).facts()
+        return drawn_robot(robot).facts()
     except NotFound as error:
         nothing: dict[str, Any] = {
             key: [] for key in ("groups", "joint_names", "units", "gripper_dims", "cameras")

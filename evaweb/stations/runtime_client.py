@@ -19,7 +19,7 @@ import zmq
 from django.conf import settings
 from django.utils.timezone import localtime
 
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 from evaweb.errors import NotFound, StationGone
 from evaweb.stations.models import STATION_NAME
 from runtime.core.sentences import Pattern, checked_row
@@ -63,7 +63,7 @@ class NoAnswer(StationGone):
     status = 504
 
 
-class StationWire:
+class StationConnection:
     """One station; its sockets are found anew where its runtime was restarted."""
 
     def __init__(self, name: str) -> None:
@@ -94,11 +94,11 @@ class StationWire:
             if expires:
                 self._learn_clock(client, command.kind, deadline)
                 command = replace(command, valid_until=deadline + self._ahead)
-            return self._ask(client, command, deadline)
+            return self._request(client, command, deadline)
         finally:
             self._lock.release()
 
-    def urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
+    def request_urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
         """The answer over a connection of its own: nothing that hangs stands before it.
 
         `process` and `key` name the socket: the coordinator's "commands", the guard's "estop".
@@ -118,13 +118,13 @@ class StationWire:
     def status(self, timeout: float | None = None) -> dict[str, Any]:
         """The newest snapshot, as JSON may carry it; raises StationGone."""
         return complete_state_meaning(
-            plain(self.request(Command(str(uuid4()), "status"), timeout=timeout).data)
+            to_json_value(self.request(Command(str(uuid4()), "status"), timeout=timeout).data)
         )
 
     def events_since(self, number: int, timeout: float | None = None) -> tuple[str, list[dict[str, Any]]]:
         """The runtime's boot id and its events after `number`, as JSON may carry them; raises StationGone."""
         ack = self.request(Command(str(uuid4()), "events_since", {"number": number}), timeout=timeout)
-        return ack.boot, [checked_row(row) for row in plain(ack.data.get("events", []))]
+        return ack.boot, [checked_row(row) for row in to_json_value(ack.data.get("events", []))]
 
     def address(self, process: str, key: str) -> str:
         """Address of a socket, as its process last wrote it; raises StationGone where there is none."""
@@ -160,14 +160,14 @@ class StationWire:
         if time.monotonic() - self._ahead_known < _CLOCK_KNOWN_S:
             return
         try:
-            ack = self._ask(client, Command(str(uuid4()), "status"), deadline)
+            ack = self._request(client, Command(str(uuid4()), "status"), deadline)
             clock = float(ack.data["clock"])
         except (NoAnswer, KeyError):
             raise StationGone(_NOT_SENT(name=self.name, kind=kind)) from None
         self._ahead_known = time.monotonic()
         self._ahead = clock - self._ahead_known
 
-    def _ask(self, client: CommandClient, command: Command, deadline: float) -> Ack:
+    def _request(self, client: CommandClient, command: Command, deadline: float) -> Ack:
         try:
             return client.request(command, max(0.0, deadline - time.monotonic()))
         except TransportError:
@@ -186,12 +186,12 @@ class StationWire:
         return NoAnswer(_UNREADABLE(name=self.name, kind=command.kind, error=error))
 
 
-def wire_to(name: str) -> StationWire:
+def connection_to(name: str) -> StationConnection:
     """This process's wire to the station; raises NotFound for what cannot be a station's name."""
-    wire = StationWire(name)
+    wire = StationConnection(name)
     return _kept(name) if (settings.DATA_DIR / "stations" / name).is_dir() else wire
 
 
 @cache
-def _kept(name: str) -> StationWire:
-    return StationWire(name)
+def _kept(name: str) -> StationConnection:
+    return StationConnection(name)

@@ -14,12 +14,12 @@ from uuid import UUID
 
 from django.conf import settings
 
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 from evaweb.errors import StationGone
-from evaweb.stations.flights import Flights, TooMany
-from evaweb.stations.holders import holder_of, readable
+from evaweb.stations.flights import RequestCoalescer, TooManyRequests
+from evaweb.stations.holders import holder_of, with_display_names
 from evaweb.stations.models import CommandStatus
-from evaweb.stations.runtime_client import NoAnswer, wire_to
+from evaweb.stations.runtime_client import NoAnswer, connection_to
 from runtime.core.sentences import Pattern
 from runtime.ipc import estop_requests as pressing
 from runtime.ipc import messages
@@ -63,30 +63,32 @@ class Answer:
 
 def answer_of(ack: messages.Ack) -> Answer:
     """The runtime's answer with people's names, as JSON may carry it."""
-    return Answer(CommandStatus(ack.status), readable(ack.reason), list(ack.allowed), plain(ack.data))
+    return Answer(
+        CommandStatus(ack.status), with_display_names(ack.reason), list(ack.allowed), to_json_value(ack.data)
+    )
 
 
-def spoken(why: str) -> str:
+def clean_reason(why: str) -> str:
     """The beginning of it, with nothing in it that cannot be sent or kept: no press is lost for its words."""
     return pressing.sanitize_text(why)
 
 
-_presses: Flights[Answer] = Flights("e-stop")
-_stops: Flights[Answer] = Flights("stop", _MOST_STOPS)
+_presses: RequestCoalescer[Answer] = RequestCoalescer("e-stop")
+_stops: RequestCoalescer[Answer] = RequestCoalescer("stop", _MOST_STOPS)
 
 
-def press(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
+def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
     """Answer to a press of the e-stop: that of a press under way, and one more is made all the same."""
-    work = partial(estop, station=station, username=username, why=why, uuid=uuid)
-    return _presses.ask(station, work, identity=str(uuid), shared=True)
+    work = partial(send_estop, station=station, username=username, why=why, uuid=uuid)
+    return _presses.submit(station, work, identity=str(uuid), shared=True)
 
 
-def ask(command: messages.Command, station: str) -> Future[Answer]:
+def request_stop(command: messages.Command, station: str) -> Future[Answer]:
     """Answer to a stop or halt; those of one lease that come while one is under way are one more."""
     key = (command.kind, command.holder, command.epoch)
     try:
-        return _stops.ask(station, partial(stopped, command, station), key=key, identity=command.uuid)
-    except TooMany as fault:
+        return _stops.submit(station, partial(send_stop, command, station), key=key, identity=command.uuid)
+    except TooManyRequests as fault:
         answer: Future[Answer] = Future()
         answer.set_result(Answer(CommandStatus.FAILED, _E_STOP_GOES_ANOTHER_WAY(fault=fault)))
         return answer
@@ -97,11 +99,11 @@ def refused_to_a_viewer(username: str) -> str:
     return _VIEWER(user=username)
 
 
-def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
+def send_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
     """Press the e-stop of the station of that name; for any user, and without the database."""
-    command = messages.Command(str(uuid), "estop", {"why": spoken(why)}, user=username, holder=username)
+    command = messages.Command(str(uuid), "estop", {"why": clean_reason(why)}, user=username, holder=username)
     try:
-        ack = wire_to(station).urgent(command, "guard", "estop", _estop_s())
+        ack = connection_to(station).request_urgent(command, "guard", "estop", _estop_s())
         answer = replace(answer_of(ack), uuid=str(uuid))
         said = answer.data.get("station", station)
         if said != station:  # its socket is where another station's was before that one was killed
@@ -117,17 +119,17 @@ def estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
     return answer
 
 
-def order(*, kind: str, username: str, page: str, epoch: int, uuid: UUID | str) -> messages.Command:
+def stop_command(*, kind: str, username: str, page: str, epoch: int, uuid: UUID | str) -> messages.Command:
     """A stop or halt as it is sent: the runtime itself knows the lease's holder."""
     holder = holder_of(username, page)
     return messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
 
 
-def stopped(command: messages.Command, station: str) -> Answer:
+def send_stop(command: messages.Command, station: str) -> Answer:
     """The station's answer to a stop or halt; nothing that hangs stands before it."""
     try:
         timeout = settings.EVA_COMMAND_TIMEOUT_S
-        return answer_of(wire_to(station).urgent(command, "coordinator", "commands", timeout))
+        return answer_of(connection_to(station).request_urgent(command, "coordinator", "commands", timeout))
     except NoAnswer as fault:
         return Answer(CommandStatus.UNKNOWN, _E_STOP_GOES_ANOTHER_WAY(fault=fault))
     except StationGone as fault:

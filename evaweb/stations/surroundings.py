@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.stations.robot_geometry import Looks
+from evaweb.stations.robot_geometry import DrawnRobot
 from robots import urdf
 from robots.visuals import Visual
 
@@ -55,7 +55,7 @@ class Box(NamedTuple):
     high: Float64
 
 
-def surroundings(looks: Looks) -> dict[str, Any]:
+def scene_surroundings(looks: DrawnRobot) -> dict[str, Any]:
     """For drawing: `table`, `mounts`, `floor` (its height or None), `ahead` [2] and `view`, what has to be seen."""
     boxes = _at_poses(looks)
     home = boxes[0]
@@ -79,7 +79,7 @@ def bounds(visual: Visual, part: Float64) -> Box:
     return Box(middle - reach, middle + reach)
 
 
-def _at_poses(looks: Looks) -> list[list[Box]]:
+def _at_poses(looks: DrawnRobot) -> list[list[Box]]:
     """Boxes that the robot's shapes fill in each of its named poses, home first."""
     named = looks.robot.poses
     found = []
@@ -89,20 +89,20 @@ def _at_poses(looks: Looks) -> list[list[Box]]:
     return found
 
 
-def _roots(looks: Looks) -> list[Float64]:
+def _roots(looks: DrawnRobot) -> list[Float64]:
     """Positions of the copies of the robot's tree, [3] each."""
     root = urdf.read(looks.robot.urdf).root
     poses = looks.scene.poses(looks.robot.poses["home"])
     return [poses[part, :3, 3] for part in looks.scene.parts_showing(root)]
 
 
-def _floor(looks: Looks, home: Sequence[Box]) -> float | None:
+def _floor(looks: DrawnRobot, home: Sequence[Box]) -> float | None:
     """Height of the floor that it stands on; None for a robot on a table."""
     lowest = min([*(box.low[2] for box in home), *(root[2] for root in _roots(looks))], default=0.0)
     return float(lowest) if lowest < _BELOW else None
 
 
-def _table(looks: Looks, home: Sequence[Box]) -> Rectangle:
+def _table(looks: DrawnRobot, home: Sequence[Box]) -> Rectangle:
     """x from, to, y from, to: with room for the bases that stand on it, clear of a body that stands beside it."""
     x_from, x_to, y_from, y_to = _LEAST_TABLE
     for x, y, z in _roots(looks):
@@ -112,11 +112,11 @@ def _table(looks: Looks, home: Sequence[Box]) -> Rectangle:
     table = (float(x_from), float(x_to), float(y_from), float(y_to))
     for box in home:
         if box.low[2] < _BELOW:
-            table = _cut(table, box)
+            table = _clear_of(table, box)
     return table
 
 
-def _cut(table: Rectangle, box: Box) -> Rectangle:
+def _clear_of(table: Rectangle, box: Box) -> Rectangle:
     """The largest part of the table that is clear of a box and keeps the area; as it is where there is none."""
     x_from, x_to, y_from, y_to = table
     (x_low, y_low), (x_high, y_high) = box.low[:2] - _CLEAR, box.high[:2] + _CLEAR
@@ -128,11 +128,11 @@ def _cut(table: Rectangle, box: Box) -> Rectangle:
         (x_from, x_to, float(y_high), y_to),
         (x_from, x_to, y_from, float(y_low)),
     ]
-    kept = [cut for cut in cuts if _holds(cut, AREA)]
+    kept = [cut for cut in cuts if _contains(cut, AREA)]
     return max(kept, key=lambda cut: (cut[1] - cut[0]) * (cut[3] - cut[2]), default=table)
 
 
-def _holds(table: Rectangle, area: Rectangle) -> bool:
+def _contains(table: Rectangle, area: Rectangle) -> bool:
     x_from, x_to, y_from, y_to = table
     return x_from <= area[0] and x_to >= area[1] and y_from <= area[2] and y_to >= area[3]
 
@@ -148,7 +148,7 @@ def _drawn(table: Rectangle, floor: float | None) -> dict[str, Any]:
     }
 
 
-def _mounts(looks: Looks, table: Rectangle, floor: float | None) -> list[dict[str, Any]]:
+def _mounts(looks: DrawnRobot, table: Rectangle, floor: float | None) -> list[dict[str, Any]]:
     """A column under the bases that stand above the table, one for those close to each other."""
     near: list[list[Float64]] = []
     for root in _roots(looks):
@@ -169,7 +169,7 @@ def _mount(roots: Float64, table: Rectangle, floor: float | None) -> dict[str, A
     return {"at": [x, y], "from": 0.0 if on_table else floor, "to": top, "radius": _RADIUS, "colour": _STEEL}
 
 
-def _ahead(looks: Looks) -> list[float]:
+def _ahead(looks: DrawnRobot) -> list[float]:
     """The way from the bases to where things lie, a unit vector in x and y."""
     x_from, x_to, y_from, y_to = AREA
     way = np.array([x_from + x_to, y_from + y_to]) / 2 - np.mean(_roots(looks), axis=0)[:2]

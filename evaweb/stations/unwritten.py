@@ -23,10 +23,10 @@ from django.conf import settings
 from django.contrib.auth import get_user_model
 from django.db import DataError, Error, IntegrityError, connection
 
-from evaweb.rarely import Rarely
-from evaweb.stations.journal import Journal, take_up
+from evaweb.rarely import LogThrottle
+from evaweb.stations.journal import ProcessJournal, recover_journals
 from evaweb.stations.models import Command, Station
-from evaweb.stations.notes import key_of
+from evaweb.stations.notes import merge_key
 from runtime.recording.files import RecordingError, write_atomic
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ _TIMES = ("issued_at", "answered_at")
 _PLAIN = ("kind", "args", "holder", "epoch", "boot", "sequence", "status", "reason", "allowed", "data")
 
 
-class Unwritten:
+class UnwrittenCommands:
     """Those that wait, and the thread that goes on trying to have them written by `write`.
 
     `write` raises a database's Error where it has to be tried again; IntegrityError, DataError or any other where
@@ -51,10 +51,10 @@ class Unwritten:
         self._news = threading.Event()
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
-        self._journal = Journal(lambda: _folder())
-        self._failed = Rarely(_EVERY_S, 1)
+        self._journal = ProcessJournal(lambda: _folder())
+        self._failed = LogThrottle(_EVERY_S, 1)
 
-    def foresee(self, rows: Sequence[Command]) -> None:
+    def prepare(self, rows: Sequence[Command]) -> None:
         """Those that will be kept soon: the next reader finds them where this process is killed before; OSError.
 
         With none, all that were foreseen have been kept.
@@ -64,7 +64,7 @@ class Unwritten:
         else:
             self._journal.clear()
 
-    def keep(self, row: Command) -> None:
+    def store(self, row: Command) -> None:
         """Have it written when the database takes it; its station and user may be known by name alone."""
         name, content = f"{row.uuid}.{os.getpid()}", json.dumps(_document(row)).encode()
         try:
@@ -78,9 +78,9 @@ class Unwritten:
                     "more than %d commands wait for the database, this one is given up: %r", _MOST, lost
                 )
             self._kept[name] = content
-        self.look()
+        self.start_writing()
 
-    def look(self) -> None:
+    def start_writing(self) -> None:
         """Have what waits written, by a thread; also what a process left that has ended since."""
         with self._starting:
             if self._thread is None:
@@ -88,9 +88,9 @@ class Unwritten:
                 self._thread.start()
         self._news.set()
 
-    def attempt(self) -> bool:
+    def write_all(self) -> bool:
         """Write what waits; whether some has to wait on. A file that the disk does not give keeps no other waiting."""
-        waits = take_up(_folder(), self._inherit)
+        waits = recover_journals(_folder(), self._adopt)
         for name in self._waiting():
             try:
                 self._attempt(name)
@@ -104,7 +104,7 @@ class Unwritten:
                 return True
         return waits
 
-    def _inherit(self, lines: Sequence[bytes]) -> bool:
+    def _adopt(self, lines: Sequence[bytes]) -> bool:
         """Keep what a killed process had foreseen, as it would have: one of each kind, and how often.
 
         Whether all lines were commands; the log has the others.
@@ -114,13 +114,13 @@ class Unwritten:
         for line in lines:
             try:
                 row = _row(json.loads(line))
-                counted.setdefault(key_of(row), []).append(row)
+                counted.setdefault(merge_key(row), []).append(row)
             except Exception as fault:  # a file may hold anything
                 log.error("a command is not in the database: %r; it was %.9999r", fault, line)
                 whole = False
         for rows in counted.values():
             rows[-1].data |= {"times": len(rows)} if len(rows) > 1 else {}
-            self.keep(rows[-1])
+            self.store(rows[-1])
         return whole
 
     def _run(self) -> None:
@@ -136,10 +136,10 @@ class Unwritten:
     def _turn(self) -> bool:
         """As `attempt`; without this thread nothing of this process would be written any more."""
         try:
-            waits = self.attempt()
+            waits = self.write_all()
             connection.close()
         except Exception:
-            before = self._failed.due("")
+            before = self._failed.suffix_if_due("")
             if before is not None:
                 log.exception("what was commanded is not written yet, and is tried again%s", before)
             return True

@@ -17,7 +17,7 @@ def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
     """The scene of a station, whose robot has the groups ?groups=a,b where its runtime says so."""
     try:
         station = station_get(name=name)
-        found = geometry.geometry(station.robot, _groups(request), simulated=station.simulated)
+        found = geometry.scene_geometry(station.robot, _groups(request), simulated=station.simulated)
     except NotFound as error:
         raise Http404(str(error)) from None
     return JsonResponse(found)
@@ -27,7 +27,7 @@ def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
 def robot_geometry(request: HttpRequest, robot: str) -> JsonResponse:
     """The scene of a robot by itself, with ?groups=a,b or all that are not optional."""
     try:
-        return JsonResponse(geometry.geometry(robot, _groups(request), simulated=False))
+        return JsonResponse(geometry.scene_geometry(robot, _groups(request), simulated=False))
     except NotFound as error:
         raise Http404(str(error)) from None
 

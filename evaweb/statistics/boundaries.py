@@ -47,7 +47,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class OperatingCharacteristics:
     """How a design ends at given success rates: probabilities of stopping for each arm, and after how many trials.
 
     `median` is of the trials of both arms, over all runs, those that never stop counted with all their trials; `mean`
@@ -87,7 +87,7 @@ class Boundary:
         ahead = self.margin is None and first * at.second > second * at.first
         return "first" if ahead else "second"
 
-    def course(self, p_first: float, p_second: float) -> Course:
+    def operating_characteristics(self, p_first: float, p_second: float) -> OperatingCharacteristics:
         """How it ends where the arms succeed at these rates."""
         import numpy as np
 
@@ -96,7 +96,7 @@ class Boundary:
         if not self.looks:
             raise StatisticsError("a design needs at least one look")
         better, worse = [], []
-        for look, mass in self._walk((p_first, p_second)):
+        for look, mass in self._stopping_mass((p_first, p_second)):
             first, second = np.indices(mass.shape)
             ahead = (first * look.second > second * look.first) & (self.margin is None)
             better.append(float(mass[ahead].sum()))
@@ -111,7 +111,7 @@ class Boundary:
                 median = count
                 break
         mean = math.fsum(c * s for c, s in zip(trials, stops, strict=True)) + rest * trials[-1]
-        return Course(math.fsum(better), math.fsum(worse), median, mean, tuple(stops))
+        return OperatingCharacteristics(math.fsum(better), math.fsum(worse), median, mean, tuple(stops))
 
     def error(self) -> tuple[float, float]:
         """The largest probability of a wrong stop over all rates of the null hypothesis, and a bound of it.
@@ -122,7 +122,7 @@ class Boundary:
         """
         import numpy as np
 
-        wrong, turn = self._wrong(), math.sqrt(self.looks[-1].first + self.looks[-1].second)
+        wrong, turn = self._false_stop_mass(), math.sqrt(self.looks[-1].first + self.looks[-1].second)
 
         def turned(angles: NDArray[np.float64]) -> NDArray[np.float64]:
             null = _Null(self.margin, angles)
@@ -146,7 +146,7 @@ class Boundary:
             cells = np.hstack([[left, middle, low, at], [middle, right, at, high]])
         return math.sin(highest) ** 2, math.sin(min(bound, math.pi / 2)) ** 2
 
-    def _wrong(self) -> list[tuple[tuple[NDArray[Any], ...], NDArray[np.float64], tuple[int, int]]]:
+    def _false_stop_mass(self) -> list[tuple[tuple[NDArray[Any], ...], NDArray[np.float64], tuple[int, int]]]:
         """The tables at which it stops, by their successes, with their probabilities at rates of a half, and trials.
 
         While both rates are equal, only the successes of both arms together count.
@@ -156,10 +156,10 @@ class Boundary:
         if self.margin is not None:
             return [
                 (np.nonzero(mass), mass[np.nonzero(mass)], (look.first, look.second))
-                for look, mass in self._walk((0.5, 0.5))
+                for look, mass in self._stopping_mass((0.5, 0.5))
             ]
         gone, trials = np.zeros(1), 0
-        for look, mass in self._walk((0.5, 0.5)):
+        for look, mass in self._stopping_mass((0.5, 0.5)):
             for _ in range(look.first + look.second - trials):
                 gone = 0.5 * (np.append(gone, 0.0) + np.append(0.0, gone))
             trials = look.first + look.second
@@ -168,13 +168,13 @@ class Boundary:
             )
         return [((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))]
 
-    def _walk(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
+    def _stopping_mass(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
         """Each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
         import numpy as np
 
         alive, before = np.ones((1, 1)), (0, 0)
         for look, region in zip(self.looks, self.regions, strict=True):
-            alive = _grown(alive, look.first - before[0], look.second - before[1], rates)
+            alive = _add_trials(alive, look.first - before[0], look.second - before[1], rates)
             before = (look.first, look.second)
             yield look, np.where(region, alive, 0.0)
             alive = np.where(region, 0.0, alive)
@@ -215,23 +215,23 @@ def _boundary(
     spent, total = np.zeros(_RATES), sum(counts[-1])
     alive, before, found = np.ones((1, 1)), (0, 0), []
     for first, second in counts:
-        alive = _grown(alive, first - before[0], second - before[1], (0.5, 0.5))
+        alive = _add_trials(alive, first - before[0], second - before[1], (0.5, 0.5))
         before = (first, second)
         most = _SAFETY * alpha * ((first + second) / total) ** SHAPES[shape]
-        least, spent = _taken(alive, (first, second), null, spent, most)
+        least, spent = _least_extreme(alive, (first, second), null, spent, most)
         look = Look(first, second, least)
         alive = np.where(_region(look, margin), 0.0, alive)
         found.append(look)
     return Boundary(tuple(found), alpha, margin)
 
 
-def in_pairs(pairs: int, at: Sequence[int] | None = None) -> list[tuple[int, int]]:
+def pair_counts(pairs: int, at: Sequence[int] | None = None) -> list[tuple[int, int]]:
     """The looks of a design in pairs: after each one, or after those of `at` and the last."""
     chosen = range(1, pairs + 1) if at is None else sorted({*at, pairs})
     return [(pair, pair) for pair in chosen]
 
 
-def extremeness(first: int, n: int, second: int, m: int, margin: float | None) -> tuple[int, int]:
+def extremeness_of(first: int, n: int, second: int, m: int, margin: float | None) -> tuple[int, int]:
     """How extreme a table is, as a fraction (numerator, denominator > 0) in whole numbers.
 
     Without a margin: the squared pooled statistic, less what is the same for all tables of a look. With one: the
@@ -316,7 +316,7 @@ def _checked(looks: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     return [(first, second) for first, second in looks]
 
 
-def _grown(
+def _add_trials(
     alive: NDArray[np.float64], first: int, second: int, rates: tuple[float, float]
 ) -> NDArray[np.float64]:
     """Probabilities after so many more trials of each arm."""
@@ -333,7 +333,7 @@ def _grown(
     return alive
 
 
-def _taken(
+def _least_extreme(
     alive: NDArray[np.float64],
     look: tuple[int, int],
     null: _Null,
@@ -417,7 +417,7 @@ def _least(
     tables = [tuple(int(at) for at in np.unravel_index(index, shape)) for index in alike]
 
     def degree(table: tuple[int, ...]) -> Fraction:
-        return Fraction(*extremeness(table[0], look[0], table[1], look[1], margin))
+        return Fraction(*extremeness_of(table[0], look[0], table[1], look[1], margin))
 
     first, second = min(sorted(tables), key=degree)
     return first, second
@@ -425,8 +425,8 @@ def _least(
 
 def _at_least(first: int, second: int, look: Look, margin: float | None) -> bool:
     assert look.least is not None
-    over, under = extremeness(first, look.first, second, look.second, margin)
-    least_over, least_under = extremeness(look.least[0], look.first, look.least[1], look.second, margin)
+    over, under = extremeness_of(first, look.first, second, look.second, margin)
+    least_over, least_under = extremeness_of(look.least[0], look.first, look.least[1], look.second, margin)
     return over * least_under >= least_over * under
 
 

@@ -16,7 +16,7 @@ DRAWS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Mean:
+class BoundedMean:
     """A mean with its interval."""
 
     value: float
@@ -30,7 +30,7 @@ def bounded_mean(
     bounds: tuple[float, float] = (0.0, 1.0),
     level: float = LEVEL,
     draws: int = DRAWS,
-) -> Mean:
+) -> BoundedMean:
     """The mean over strata, each equally heavy, of each one's mean outcome, which lies within `bounds`.
 
     StatisticsError where there is no stratum, one without an outcome, or an outcome outside.
@@ -60,4 +60,4 @@ def bounded_mean(
         for side, share in ((lower, (1 - level) / 2), (upper, (1 + level) / 2))
     )
     least, most = (min(high, max(low, low + (high - low) * end)) for end in ends)
-    return Mean(value, Interval(least, most, level))
+    return BoundedMean(value, Interval(least, most, level))

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from evaweb.statistics.base import Interval, StatisticsError, check_alpha
-from evaweb.statistics.sequential import ALPHA, STAKES
+from evaweb.statistics.sequential import ALPHA, BET_FRACTIONS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,11 +32,11 @@ def confidence_sequence(differences: Sequence[float], alpha: float = ALPHA) -> I
     wrong = [d for d in differences if not abs(d) <= 1]
     if wrong:
         raise StatisticsError(f"a difference of {wrong[0]}; allowed: -1 to 1")
-    low, high = _least(differences, alpha), -_least([-d for d in differences], alpha)
+    low, high = _lower_bound(differences, alpha), -_lower_bound([-d for d in differences], alpha)
     return Interval(low, high, 1 - alpha) if low <= high else None
 
 
-def _least(differences: Sequence[float], alpha: float) -> float:
+def _lower_bound(differences: Sequence[float], alpha: float) -> float:
     """The largest mean that a bet on more than it has refuted, -1 where there is none."""
     import numpy as np
     from scipy.optimize import brentq
@@ -48,19 +48,19 @@ def _least(differences: Sequence[float], alpha: float) -> float:
     wanted = math.log(2 / alpha)
 
     def beyond(mean: float) -> float:
-        return _most(levels / (1 + mean), seen) - wanted
+        return _max_log_wealth(levels / (1 + mean), seen) - wanted
 
     # Each worth falls as the mean rises, and is at most 1 at a mean of 1.
     nearest = -1 + _ENOUGH
     return float(brentq(beyond, nearest, 1.0, xtol=_ENOUGH)) if beyond(nearest) > 0 else -1.0
 
 
-def _most(shares: NDArray[np.float64], seen: NDArray[np.float64]) -> float:
+def _max_log_wealth(shares: NDArray[np.float64], seen: NDArray[np.float64]) -> float:
     """The largest log worth that the gamblers together ever had: each level's outcome is `shares` [levels] of the
     mean, both counted from -1, and had been `seen` [pairs, levels] so often.
     """
     import numpy as np
 
-    worths = seen @ np.log1p(np.array(STAKES) * (shares[:, None] - 1))
+    worths = seen @ np.log1p(np.array(BET_FRACTIONS) * (shares[:, None] - 1))
     most = float(worths.max())
-    return most + math.log(float(np.exp(worths - most).sum(axis=1).max()) / len(STAKES))
+    return most + math.log(float(np.exp(worths - most).sum(axis=1).max()) / len(BET_FRACTIONS))

@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from evaweb.statistics.base import StatisticsError, check_alpha, check_share
-from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, boundary, in_pairs
+from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, boundary, pair_counts
 from evaweb.statistics.designs import ANYTIME, FIXED, RULES
 from evaweb.statistics.planning import exact_power, trials_needed
 
@@ -21,7 +21,7 @@ _SEED = 20_260
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class DesignPower:
     """Power of a design of `pairs` at most; the pairs that it takes on average, and at most in half of all runs."""
 
     rule: str
@@ -32,7 +32,7 @@ class Course:
 
 
 @lru_cache(maxsize=512)
-def course(
+def design_power(
     rule: str,
     pairs: int,
     p_first: float,
@@ -40,7 +40,7 @@ def course(
     alpha: float,
     margin: float | None = None,
     looks: tuple[int, ...] = (),
-) -> Course:
+) -> DesignPower:
     """That of a design of so many pairs, exact but for "evidence", which is simulated 4,000 times.
 
     With a `margin` its power is the probability of finding that the first's rate is not lower than the second's by that
@@ -54,15 +54,17 @@ def course(
             raise StatisticsError(f"margin = {margin:g} with the design {rule!r}; allowed: none")
         return _simulated(pairs, p_first, p_second, alpha)
     if rule == FIXED and margin is None:
-        return Course(rule, pairs, exact_power(pairs, p_first, p_second, alpha), float(pairs), pairs)
+        return DesignPower(rule, pairs, exact_power(pairs, p_first, p_second, alpha), float(pairs), pairs)
     shape, at = ("late", (pairs,)) if rule == FIXED else (rule, looks)  # of one look there is no shape
     # With a margin a boundary asks about its second arm.
     rates = (p_first, p_second) if margin is None else (p_second, p_first)
-    found = _boundary(shape, pairs, alpha, margin, at).course(*rates)
-    return Course(rule, pairs, found.power, found.mean / 2, found.median // 2)
+    found = _boundary(shape, pairs, alpha, margin, at).operating_characteristics(*rates)
+    return DesignPower(rule, pairs, found.power, found.mean / 2, found.median // 2)
 
 
-def pairs_needed(rule: str, p_first: float, p_second: float, power: float, alpha: float) -> Course | None:
+def pairs_needed(
+    rule: str, p_first: float, p_second: float, power: float, alpha: float
+) -> DesignPower | None:
     """The design of the fewest pairs that has this power; None where 250 pairs have it not."""
     _check(rule, alpha, p_first, p_second)
     check_share("power", power)
@@ -70,14 +72,14 @@ def pairs_needed(rule: str, p_first: float, p_second: float, power: float, alpha
         raise StatisticsError(f"p_first = p_second = {p_first}: there is no difference to be found")
     low, reached = 0, 0.0
     high = min(MOST, trials_needed(p_first, p_second, power, alpha))
-    while (found := course(rule, high, p_first, p_second, alpha)).power < power:
+    while (found := design_power(rule, high, p_first, p_second, alpha)).power < power:
         if high == MOST:
             return None
         low, reached, high = high, found.power, min(MOST, math.ceil(1.15 * high))
     while high - low > 1:
         share = (power - reached) / (found.power - reached)  # power grows almost evenly with the pairs
         middle = min(max(round(low + share * (high - low)), low + 1), high - 1)
-        tried = course(rule, middle, p_first, p_second, alpha)
+        tried = design_power(rule, middle, p_first, p_second, alpha)
         if tried.power >= power:
             high, found = middle, tried
         else:
@@ -89,8 +91,8 @@ def pairs_needed(rule: str, p_first: float, p_second: float, power: float, alpha
 class Outlook:
     """Of each design in the order of RULES: what a power needs, its course of so many pairs, its power by gain."""
 
-    needs: tuple[Course | None, ...]
-    chances: tuple[Course, ...]
+    needs: tuple[DesignPower | None, ...]
+    chances: tuple[DesignPower, ...]
     powers: tuple[tuple[float, ...], ...]
 
 
@@ -101,20 +103,20 @@ def outlook(
     needs = tuple(pairs_needed(rule, p_first, p_second, power, alpha) for rule in RULES)
     if not pairs:
         return Outlook(needs, (), ())
-    chances = tuple(course(rule, pairs, p_first, p_second, alpha) for rule in RULES)
+    chances = tuple(design_power(rule, pairs, p_first, p_second, alpha) for rule in RULES)
     better = [round(p_first + gain, 9) for gain in gains]
     powers = tuple(
-        tuple(course(rule, pairs, p_first, rate, alpha).power for rule in RULES) for rate in better
+        tuple(design_power(rule, pairs, p_first, rate, alpha).power for rule in RULES) for rate in better
     )
     return Outlook(needs, chances, powers)
 
 
 @lru_cache(maxsize=128)
 def _boundary(shape: str, pairs: int, alpha: float, margin: float | None, at: tuple[int, ...]) -> Boundary:
-    return boundary(in_pairs(pairs, at or None), alpha=alpha, shape=shape, margin=margin)
+    return boundary(pair_counts(pairs, at or None), alpha=alpha, shape=shape, margin=margin)
 
 
-def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> Course:
+def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> DesignPower:
     """By the e-process of `sequential.success_evidence`, all runs at once."""
     import numpy as np
 
@@ -134,7 +136,7 @@ def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> Cou
     reached = np.maximum(gains(other, one), gains(one, other)) >= math.log(2 / alpha)
     ended = reached.any(axis=1)
     taken = np.where(ended, reached.argmax(axis=1) + 1, pairs)
-    return Course(ANYTIME, pairs, float(ended.mean()), float(taken.mean()), int(np.median(taken)))
+    return DesignPower(ANYTIME, pairs, float(ended.mean()), float(taken.mean()), int(np.median(taken)))
 
 
 def _check(rule: str, alpha: float, *rates: float) -> None:

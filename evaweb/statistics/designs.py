@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from evaweb.statistics.base import StatisticsError, check_alpha
-from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, Look, boundary, in_pairs
+from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, Look, boundary, pair_counts
 from evaweb.statistics.difference import Difference, barnard
-from evaweb.statistics.permutation import sign_flips
+from evaweb.statistics.permutation import sign_flip_test
 from evaweb.statistics.sequential import score_evidence, success_evidence
 from evaweb.statistics.stagewise import stagewise
 
@@ -73,7 +73,7 @@ class Conclusion:
     """
 
     blocks: int
-    at: int | None
+    ended_at_pair: int | None
     winner: str | None
     p: float | None
     foreseen: int
@@ -82,7 +82,13 @@ class Conclusion:
     @property
     def ended(self) -> str:
         """Empty while it goes on, "full" where all blocks are made, whatever is found then, "boundary" before that."""
-        return "" if self.at is None else "full" if self.at == self.foreseen else "boundary"
+        return (
+            ""
+            if self.ended_at_pair is None
+            else "full"
+            if self.ended_at_pair == self.foreseen
+            else "boundary"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +101,13 @@ class Findings:
     @property
     def at(self) -> int | None:
         """Number of blocks after which the last comparison ended; None while one goes on."""
-        ends = [one.at for one in self.each if one.at is not None]
+        ends = [one.ended_at_pair for one in self.each if one.ended_at_pair is not None]
         return max(ends) if len(ends) == len(self.each) else None
 
     @property
     def ended(self) -> str:
         """As that of the last comparison to end."""
-        return "" if self.at is None else next(one.ended for one in self.each if one.at == self.at)
+        return "" if self.at is None else next(one.ended for one in self.each if one.ended_at_pair == self.at)
 
 
 def design(
@@ -201,7 +207,7 @@ def _bounded(found: Design, looks: Sequence[int]) -> Boundary:
     at = [found.blocks] if found.rule == FIXED else list(looks) or None
     shape = found.rule if found.rule in SHAPES else "late"  # of one look there is no shape
     if found.counts is None:
-        made = in_pairs(found.blocks, at)
+        made = pair_counts(found.blocks, at)
     else:
         chosen = range(found.blocks) if at is None else [one - 1 for one in sorted({*at, found.blocks})]
         # With a margin a boundary asks about its second arm: the comparison's first.
@@ -220,7 +226,7 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
     """
     given = blocks[: found.blocks]
     if not found.drops:
-        each = [conclude(found, given, pair) for pair in found.comparisons]
+        each = [evaluate_design(found, given, pair) for pair in found.comparisons]
         return Findings(tuple(_stepped(found, given, each) if found.holm else each), {})
     decided: dict[int, Conclusion] = {}
     dropped: dict[int, int] = {}
@@ -229,14 +235,20 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
     while len(decided) < len(found.comparisons):
         made = _whole(given, arms, dropped)
         open_ = {
-            n: conclude(found, made, pair) for n, pair in enumerate(found.comparisons) if n not in decided
+            n: evaluate_design(found, made, pair)
+            for n, pair in enumerate(found.comparisons)
+            if n not in decided
         }
-        first = min((one.at for one in open_.values() if one.at and one.winner), default=None)
+        first = min(
+            (one.ended_at_pair for one in open_.values() if one.ended_at_pair and one.winner), default=None
+        )
         if first is None:
             decided |= open_
             break
         crossed = {
-            n: replace(one, blocks=first) for n, one in open_.items() if one.at == first and one.winner
+            n: replace(one, blocks=first)
+            for n, one in open_.items()
+            if one.ended_at_pair == first and one.winner
         }
         decided |= crossed
         worse = {found.comparisons[n][one.winner == "first"] for n, one in crossed.items()} - spared
@@ -263,7 +275,7 @@ def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> 
     decided = list(each)
     for done, number in enumerate(sorted(tests, key=lambda number: tests[number])):
         left = replace(found, alpha=found.alpha * len(each) / (len(each) - done))
-        decided[number] = conclude(left, blocks, found.comparisons[number])
+        decided[number] = evaluate_design(left, blocks, found.comparisons[number])
         if decided[number].winner is None:
             break
     return decided
@@ -280,14 +292,14 @@ def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]
     return made
 
 
-def conclude(found: Design, blocks: Sequence[Block], pair: tuple[int, int] = (0, 1)) -> Conclusion:
+def evaluate_design(found: Design, blocks: Sequence[Block], pair: tuple[int, int] = (0, 1)) -> Conclusion:
     """What `found` says of one comparison; the first block that lacks a trial of it ends the list. More blocks than
     the design foresees are not looked at.
     """
     given = list(_made(found, blocks[: found.blocks], pair))
     full = len(given) if len(given) == found.blocks else None
     if found.boundary is not None:
-        at, winner = _crossed(found.boundary, given)
+        at, winner = _first_crossing(found.boundary, given)
         return Conclusion(len(given), at or full, winner, None, found.blocks)
     if found.rule == ANYTIME:
         of = score_evidence if found.outcome == SCORE else _of_successes
@@ -306,9 +318,9 @@ def estimated(
     """The difference of rates that a comparison ended with, whatever stopped it; None where its rule does not stop it
     early, or it asks about a margin, was dropped, or goes on.
     """
-    if found.boundary is None or found.margin is not None or one.at is None or one.dropped:
+    if found.boundary is None or found.margin is not None or one.ended_at_pair is None or one.dropped:
         return None
-    given = list(_made(found, blocks[: one.at], pair))
+    given = list(_made(found, blocks[: one.ended_at_pair], pair))
     (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
     if (n, m) not in [(look.first, look.second) for look in found.boundary.looks]:
         return None
@@ -344,7 +356,7 @@ def _sum(given: Sequence[Sides], side: int) -> tuple[int, int]:
 
 
 def _scored(given: Sequence[Sides]) -> tuple[float, float]:
-    flips = sign_flips([first[0] - second[0] for first, second in given])
+    flips = sign_flip_test([first[0] - second[0] for first, second in given])
     return flips.p, flips.value
 
 
@@ -352,7 +364,7 @@ def _of_successes(values: Sequence[Values], alpha: float):  # type: ignore[no-un
     return success_evidence([(bool(one), bool(other)) for one, other in values], alpha)
 
 
-def _crossed(found: Boundary, given: Sequence[Sides]) -> tuple[int | None, str | None]:
+def _first_crossing(found: Boundary, given: Sequence[Sides]) -> tuple[int | None, str | None]:
     """The block after which a boundary was crossed, and for which side."""
     # With a margin a boundary asks about its second arm: the comparison's first.
     sides = (0, 1) if found.margin is None else (1, 0)
@@ -408,12 +420,12 @@ def looks_at(found: Design) -> list[int]:
     return [(look.first + look.second) // 2 for look in looks]  # a block of a comparison has two trials
 
 
-def table(found: Boundary) -> list[list[int]]:
+def boundary_table(found: Boundary) -> list[list[int]]:
     """The boundary in plain JSON: per look the trials of each arm, then the least extreme table that stops, if any."""
     return [[look.first, look.second, *(look.least or ())] for look in found.looks]
 
 
-def of_table(rows: Sequence[Sequence[int]], alpha: float, margin: float | None) -> Boundary:
+def boundary_from_table(rows: Sequence[Sequence[int]], alpha: float, margin: float | None) -> Boundary:
     """The boundary that `table` was made of."""
     looks = (Look(n, m, (least[0], least[1]) if least else None) for n, m, *least in rows)
     return Boundary(tuple(looks), alpha, margin)

@@ -34,7 +34,7 @@ class Difference:
     interval: Interval
 
     @property
-    def reversed(self) -> Difference:
+    def swapped(self) -> Difference:
         """The second arm's less the first's."""
         ends = self.interval
         return Difference(-self.value, Interval(-ends.high, -ends.low, ends.level))

@@ -20,7 +20,7 @@ _MOST = 10_000_000  # sums times differences
 
 
 @dataclass(frozen=True, slots=True)
-class Flips:
+class SignFlipTest:
     """Mean of the differences of `pairs`, and the two-sided probability of one as far from 0 by chance."""
 
     pairs: int
@@ -28,7 +28,7 @@ class Flips:
     p: float
 
 
-def sign_flips(differences: Sequence[float], widest: float = 1.0) -> Flips:
+def sign_flip_test(differences: Sequence[float], widest: float = 1.0) -> SignFlipTest:
     """The test of `differences` from -widest to widest, of pairs whose number was fixed beforehand.
 
     Exact: every one of the 2^n ways in which the signs may fall is counted. StatisticsError where there is none, or
@@ -40,7 +40,7 @@ def sign_flips(differences: Sequence[float], widest: float = 1.0) -> Flips:
     if wrong:
         raise StatisticsError(f"a difference of {wrong[0]}; allowed: {-widest:g} to {widest:g}")
     value = math.fsum(differences) / len(differences)
-    return Flips(len(differences), value, _p(_in_parts([d / widest for d in differences])))
+    return SignFlipTest(len(differences), value, _p(_in_parts([d / widest for d in differences])))
 
 
 def _in_parts(shares: Sequence[float]) -> list[int]:

@@ -10,14 +10,14 @@ from evaweb.statistics.proportions import Proportion, proportion
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class FunnelStep:
     """One milestone: how many of all trials reached it, and of those that reached the one before."""
 
     of_all: Proportion
     of_previous: Proportion
 
 
-def funnel(reached: Sequence[Sequence[bool]]) -> list[Step]:
+def funnel(reached: Sequence[Sequence[bool]]) -> list[FunnelStep]:
     """For each milestone, of trials that say of each whether it was reached.
 
     `of_previous` counts trials that reached the milestone before, whether or not those are ordered.
@@ -31,7 +31,7 @@ def funnel(reached: Sequence[Sequence[bool]]) -> list[Step]:
     for i in range(widths.pop()):
         before = [trial for trial in reached if i == 0 or trial[i - 1]]
         steps.append(
-            Step(
+            FunnelStep(
                 proportion(sum(bool(trial[i]) for trial in reached), len(reached)),
                 proportion(sum(bool(trial[i]) for trial in before), len(before)),
             )

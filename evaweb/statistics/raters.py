@@ -22,18 +22,18 @@ def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
 
     StatisticsError where both always said the same word: chance alone would agree as often.
     """
-    _some(pairs)
+    _require_pairs(pairs)
     n = len(pairs)
     observed = sum(one == other for one, other in pairs) / n
     first, second = Counter(one for one, _ in pairs), Counter(other for _, other in pairs)
     chance = sum(first[name] * second[name] for name in first) / (n * n)
     _varied({*first, *second})
-    return _beyond(observed, chance)
+    return _chance_corrected(observed, chance)
 
 
 def weighted_kappa(pairs: Sequence[tuple[int, int]], levels: int, weights: Weights = "linear") -> float:
     """Agreement on levels 0 to `levels` - 1, where being one level apart is less wrong than being two."""
-    _some(pairs)
+    _require_pairs(pairs)
     if levels < 2:
         raise StatisticsError(f"{levels} levels; allowed: 2 or more")
     for pair in pairs:
@@ -56,7 +56,7 @@ def _distance(i: int, j: int, levels: int, weights: Weights) -> float:
 
 def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) -> float:
     """Agreement of two raters that stays readable where one category is rare; 1 where both always said the same."""
-    _some(pairs)
+    _require_pairs(pairs)
     used = Counter(name for pair in pairs for name in pair)
     if len(used) > categories or categories < 2:
         raise StatisticsError(
@@ -66,7 +66,7 @@ def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) ->
     observed = sum(one == other for one, other in pairs) / n
     shares = [count / (2 * n) for count in used.values()]
     chance = sum(share * (1 - share) for share in shares) / (categories - 1)
-    return _beyond(observed, chance)
+    return _chance_corrected(observed, chance)
 
 
 def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric = "nominal") -> float:
@@ -98,7 +98,7 @@ def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric =
     return 1.0 if observed == 0 else 1 - observed / expected
 
 
-def _some(pairs: Sequence[object]) -> None:
+def _require_pairs(pairs: Sequence[object]) -> None:
     if not pairs:
         raise StatisticsError("no trial was rated by both")
 
@@ -108,5 +108,5 @@ def _varied(used: Collection[object]) -> None:
         raise StatisticsError(f"all ratings say {next(iter(used))!r}: how often chance agrees is not defined")
 
 
-def _beyond(observed: float, chance: float) -> float:
+def _chance_corrected(observed: float, chance: float) -> float:
     return 1.0 if observed == 1 else (observed - chance) / (1 - chance)

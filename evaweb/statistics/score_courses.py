@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from evaweb.statistics.base import StatisticsError, check_alpha, check_share
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import Course
+from evaweb.statistics.courses import DesignPower
 from evaweb.statistics.designs import ANYTIME, FIXED
-from evaweb.statistics.sequential import STAKES
+from evaweb.statistics.sequential import BET_FRACTIONS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,7 +80,7 @@ def _log_beta(a: float, b: float) -> float:
 
 
 @lru_cache(maxsize=512)
-def score_course(rule: str, pairs: int, scores: Scores, alpha: float) -> Course:
+def score_course(rule: str, pairs: int, scores: Scores, alpha: float) -> DesignPower:
     """That of a design of so many pairs at most, among 4,000 simulated evaluations."""
     import numpy as np
 
@@ -91,13 +91,15 @@ def score_course(rule: str, pairs: int, scores: Scores, alpha: float) -> Course:
         raise StatisticsError(f"{pairs} pairs; allowed: 1 to {MOST}")
     if rule == FIXED:
         power = float((_flipped(_differences(scores)[:, :pairs], scores.points) <= alpha * (1 + _TIE)).mean())
-        return Course(rule, pairs, power, float(pairs), pairs)
+        return DesignPower(rule, pairs, power, float(pairs), pairs)
     stops = _stops(scores, alpha)
     taken = np.minimum(stops, pairs)
-    return Course(rule, pairs, float((stops <= pairs).mean()), float(taken.mean()), int(np.median(taken)))
+    return DesignPower(
+        rule, pairs, float((stops <= pairs).mean()), float(taken.mean()), int(np.median(taken))
+    )
 
 
-def score_pairs_needed(rule: str, scores: Scores, power: float, alpha: float) -> Course | None:
+def score_pairs_needed(rule: str, scores: Scores, power: float, alpha: float) -> DesignPower | None:
     """The design of the fewest pairs that has this power; None where 250 pairs have it not."""
     check_share("power", power)
     low, high = 0, MOST
@@ -156,8 +158,8 @@ def _stops(scores: Scores, alpha: float) -> NDArray[Any]:
     stops = np.full(RUNS, MOST + 1)
     for ahead in (shares, -shares):
         worth = np.zeros(differences.shape)
-        for stake in STAKES:
-            worth += np.exp(np.cumsum(np.log1p(stake * ahead)[differences], axis=1)) / len(STAKES)
+        for stake in BET_FRACTIONS:
+            worth += np.exp(np.cumsum(np.log1p(stake * ahead)[differences], axis=1)) / len(BET_FRACTIONS)
         reached = worth >= 2 / alpha
         stops = np.minimum(stops, np.where(reached.any(axis=1), reached.argmax(axis=1) + 1, MOST + 1))
     return stops

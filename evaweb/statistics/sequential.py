@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from evaweb.statistics.base import check_alpha, check_share
 
 ALPHA = 0.05
-STAKES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of all that a gambler has, on each pair
+BET_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)  # of all that a gambler has, on each pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,16 +85,16 @@ def score_evidence(pairs: Iterable[tuple[float, float]], alpha: float = ALPHA) -
     for one, other in given:
         check_share("score", one)
         check_share("score", other)
-    return _evidence(_bets([a - b for a, b in given]), _bets([b - a for a, b in given]), alpha)
+    return _evidence(_log_wealth([a - b for a, b in given]), _log_wealth([b - a for a, b in given]), alpha)
 
 
-def _bets(differences: Sequence[float]) -> list[float]:
+def _log_wealth(differences: Sequence[float]) -> list[float]:
     """Log worth after each of `differences` (-1 to 1) of gamblers who bet that their mean is above 0, each a stake of
     its own, with equal shares of the money: which stake is good need not be guessed from what came before.
     """
-    worths, path = [0.0] * len(STAKES), []
+    worths, path = [0.0] * len(BET_FRACTIONS), []
     for d in differences:
-        worths = [worth + math.log1p(stake * d) for worth, stake in zip(worths, STAKES, strict=True)]
+        worths = [worth + math.log1p(stake * d) for worth, stake in zip(worths, BET_FRACTIONS, strict=True)]
         most = max(worths)
         path.append(most + math.log(math.fsum(math.exp(worth - most) for worth in worths) / len(worths)))
     return path
@@ -117,6 +117,6 @@ def _anytime(path: Sequence[float]) -> list[float]:
     return found
 
 
-def in_pairs(first: Sequence[bool], second: Sequence[bool]) -> list[tuple[bool, bool]]:
+def pair_by_order(first: Sequence[bool], second: Sequence[bool]) -> list[tuple[bool, bool]]:
     """The k-th trial of one arm beside the k-th of the other; those one arm is ahead by wait for the other."""
     return list(zip(first, second, strict=False))

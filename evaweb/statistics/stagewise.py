@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
-from evaweb.statistics.boundaries import Boundary, _grown
+from evaweb.statistics.boundaries import Boundary, _add_trials
 from evaweb.statistics.difference import Difference
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def _ordered(found: Boundary, look: int, first: int, second: int) -> _Order:
     alive, before = np.ones((1, 1)), (0, 0)
     beyond: list[NDArray[np.float64]] = []
     for number, (at, region) in enumerate(zip(found.looks, found.regions, strict=True)):
-        alive = _grown(alive, at.first - before[0], at.second - before[1], (0.5, 0.5))
+        alive = _add_trials(alive, at.first - before[0], at.second - before[1], (0.5, 0.5))
         before = (at.first, at.second)
         a, b = np.indices(alive.shape)
         lead = a * at.second - b * at.first

@@ -16,7 +16,7 @@ _MOST = 20_000  # ways to fill the tables that are looked at one by one
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class StratumTable:
     """Successes and trials of both arms in one stratum."""
 
     x1: int
@@ -59,7 +59,7 @@ class Stratified:
     reversed: bool
 
 
-def mantel_haenszel(tables: Sequence[Table]) -> Stratified:
+def mantel_haenszel(tables: Sequence[StratumTable]) -> Stratified:
     """Both arms over the scenes in which both were tried."""
     if not tables:
         raise StatisticsError("no scene in which both arms were tried")
@@ -90,7 +90,7 @@ def mantel_haenszel(tables: Sequence[Table]) -> Stratified:
     )
 
 
-def exact_within(tables: Sequence[Table], least: int = 2) -> float | None:
+def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None:
     """Two-sided probability, within strata, of the first's successes or any as improbable, were both arms equal in
     each; None where fewer than `least` strata tell anything.
     """
@@ -108,7 +108,7 @@ def exact_within(tables: Sequence[Table], least: int = 2) -> float | None:
     return sum(ways for ways in total.values() if ways <= seen) / sum(total.values())
 
 
-def interaction(tables: Sequence[Table]) -> float | None:
+def interaction(tables: Sequence[StratumTable]) -> float | None:
     """Probability of these tables or any as improbable, were the odds ratio the same in all strata; None where fewer
     than two tell anything, or there are too many ways to count.
     """

@@ -48,9 +48,9 @@ class RestrictedMean:
     until: float
 
 
-def incidence(times: Times, until: float, level: float = LEVEL) -> Curve:
+def cumulative_incidence(times: Times, until: float, level: float = LEVEL) -> Curve:
     """The curve of trials that succeeded at `times` [s], up to `until` [s]."""
-    known = [t for t in within(times, until) if t is not None]
+    known = [t for t in censor_at_horizon(times, until) if t is not None]
     n, steps = len(times), sorted(set(known))
     counts = [sum(t <= step for t in known) for step in steps]
     ends = [wilson(count, n, level) for count in counts]
@@ -67,12 +67,12 @@ def incidence(times: Times, until: float, level: float = LEVEL) -> Curve:
 
 def restricted_mean(times: Times, until: float, *, seed: int, level: float = LEVEL) -> RestrictedMean:
     """The mean of `times` [s] up to `until` [s]."""
-    lasted = {"all": [until if t is None else t for t in within(times, until)]}
+    lasted = {"all": [until if t is None else t for t in censor_at_horizon(times, until)]}
     found = bounded_mean(lasted, seed=seed, bounds=(0.0, until), level=level)
     return RestrictedMean(found.value, found.interval, until)
 
 
-def within(times: Times, until: float) -> list[float | None]:
+def censor_at_horizon(times: Times, until: float) -> list[float | None]:
     """`times` [s] with None for each beyond `until` [s]; StatisticsError for what can be no time, or none at all."""
     if not (math.isfinite(until) and until > 0):
         raise StatisticsError(f"until = {until} s; allowed: above 0")

@@ -18,7 +18,7 @@ from django.urls import reverse
 from django.utils.html import format_html
 
 from evaweb.administration import LabelledRows
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.canonical import difference
 from evaweb.trials.models import (
     Checkpoint,
@@ -352,7 +352,7 @@ class CheckpointAdmin(ActiveActions, LogsValues):
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
         """With the number of trials, which nobody is told from whom the checkpoint is hidden."""
-        hidden = sight_for(request).checkpoints
+        hidden = visibility_for_request(request).checkpoints
         shown = Count("trials", filter=~Q(pk__in=hidden)) if hidden else Count("trials")
         return super().get_queryset(request).annotate(n_trials=shown)
 

@@ -7,11 +7,11 @@ import zipfile
 from collections.abc import Iterator
 from typing import Any
 
-from evaweb.blinding import Sight, code_of
+from evaweb.blinding import Visibility, code_of
 from evaweb.episodes.videos import video_file
 from evaweb.errors import EvaError
 from evaweb.object_stores import StoreError
-from evaweb.tabular_export import csv_lines
+from evaweb.tabular_export import iter_csv
 from evaweb.trials.clips import clip_of
 from evaweb.trials.gallery import COLUMNS, FailureFilters, failed_list, failure_trials, row_of
 from evaweb.trials.models import Trial
@@ -23,14 +23,14 @@ _ARCHIVE_COLUMNS = (*COLUMNS, "file", "file_begin_s", "why_no_file")
 _TABLE = "failures.csv"
 
 
-def require_few(filters: FailureFilters, sight: Sight) -> None:
+def require_few(filters: FailureFilters, sight: Visibility) -> None:
     """EvaError where the filters are wrong, or mean more trials than an archive holds."""
     count = failed_list(filters, sight).count()
     if count > MOST:
         raise EvaError(f"{count} failed trials; allowed in one archive: at most {MOST}. Narrow the filters")
 
 
-def clip_archive(filters: FailureFilters, sight: Sight, root: str) -> Iterator[bytes]:
+def clip_archive(filters: FailureFilters, sight: Visibility, root: str) -> Iterator[bytes]:
     """A zip with a video per clip, named by trial and code, and the table of all; one clip in memory at a time."""
     written = _Written()
     rows: list[dict[str, Any]] = []
@@ -42,7 +42,7 @@ def clip_archive(filters: FailureFilters, sight: Sight, root: str) -> Iterator[b
                 if content:
                     packed.writestr(told["file"], content)
                 yield written.taken()
-        packed.writestr(_TABLE, "".join(csv_lines(_ARCHIVE_COLUMNS, [rows])), zipfile.ZIP_DEFLATED)
+        packed.writestr(_TABLE, "".join(iter_csv(_ARCHIVE_COLUMNS, [rows])), zipfile.ZIP_DEFLATED)
     yield written.taken()
 
 

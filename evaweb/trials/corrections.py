@@ -9,13 +9,13 @@ from django.contrib.auth.models import User
 from django.db import transaction
 
 from evaweb.errors import Conflict
-from evaweb.journal import text
-from evaweb.roles import Role, require
-from evaweb.stations.commands import identity_of
+from evaweb.journal import clean_text
+from evaweb.roles import Role, require_role
+from evaweb.stations.commands import parse_command_uuid
 from evaweb.trials import failures
-from evaweb.trials.failure_words import NOT_SAID, why_words
+from evaweb.trials.failure_words import UNSPECIFIED, failure_text
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
-from evaweb.trials.services import checked, counts_now, locked, require_scorable
+from evaweb.trials.services import counts_now, lock_trial, require_scorable, run_checks
 from evaweb.trials.verdicts import LONGEST_NOTE
 from runtime.core.sentences import Pattern
 
@@ -45,28 +45,30 @@ def trial_failure(
     `score` is the one that the user saw: Conflict where another counts by now. Without a `reason` it says what was
     changed into what. The same again adds nothing.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     with transaction.atomic():
-        held = locked(trial)
+        held = lock_trial(trial)
         seen = held.verdict
         if seen is None or held.status != TrialStatus.SCORED:
             raise Conflict(_TRIAL_ONLY_SCORE_COUNTS_HAS(trial=held.pk, status=held.get_status_display()))
         given = {"failure": failure, "failure_phase": failure_phase}
         words = {
             field: seen_words if (new := given[field]) is None else new.strip()
-            for field, seen_words in failures.said_of(seen).items()
+            for field, seen_words in failures.score_failure(seen).items()
         }
-        if words == failures.said_of(seen):
+        if words == failures.score_failure(seen):
             return seen
-        if score is not None and identity_of(score) != seen.uuid:
+        if score is not None and parse_command_uuid(score) != seen.uuid:
             raise Conflict(
                 _TRIAL_SCORED_ANEW_BY_MEANWHILE(
-                    trial=held.pk, user=seen.rater.get_username(), why=seen.why or f"failure {NOT_SAID}"
+                    trial=held.pk, user=seen.rater.get_username(), why=seen.why or f"failure {UNSPECIFIED}"
                 )
             )
-        after = why_words(words["failure_phase"], words["failure"])
-        why = reason or f"failure was {seen.why or NOT_SAID}, now {after or NOT_SAID}"
-        found = _reworded(user, held, seen, failures.stripped(**words), text("reason", why, LONGEST_NOTE))
+        after = failure_text(words["failure_phase"], words["failure"])
+        why = reason or f"failure was {seen.why or UNSPECIFIED}, now {after or UNSPECIFIED}"
+        found = _reworded(
+            user, held, seen, failures.clean_failure(**words), clean_text("reason", why, LONGEST_NOTE)
+        )
     trial.refresh_from_db()
     return found
 
@@ -74,9 +76,9 @@ def trial_failure(
 def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], reason: str) -> Score:
     """Another score like the one `seen`, but for its failure, whatever became of the scene's milestones since."""
     for what in ("scored", "reworded"):
-        checked(what, held, user)
+        run_checks(what, held, user)
     require_scorable(held, reason)
-    failures.check_failure(held.scene, words, success=seen.success, said=failures.said_of(seen))
+    failures.check_failure(held.scene, words, success=seen.success, said=failures.score_failure(seen))
     found = Score(
         trial=held,
         rater=user,

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-NOT_SAID = "not specified"
+UNSPECIFIED = "not specified"
 _BEFORE = "not said"  # addresses that were kept say it
 
 
 def is_not_said(words: str) -> bool:
     """True if these words stand for none."""
-    return words.strip().casefold() in (NOT_SAID, _BEFORE)
+    return words.strip().casefold() in (UNSPECIFIED, _BEFORE)
 
 
-def why_words(phase: str, cause: str) -> str:
+def failure_text(phase: str, cause: str) -> str:
     """ "grasp: dropped"; what was not said is left out."""
     return ": ".join(filter(None, (phase, cause)))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from evaweb.errors import EvaError
-from evaweb.journal import text
+from evaweb.journal import clean_text
 from evaweb.trials.failure_words import is_not_said
 from evaweb.trials.models import FailureTerm, Scene, Score
 from evaweb.trials.verdicts import LONGEST_FAILURE
@@ -35,7 +35,7 @@ class Choice:
 
     words: str
     key: str
-    chosen: bool
+    is_selected: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +49,10 @@ class Level:
     @property
     def said(self) -> bool:
         """True if one is chosen."""
-        return any(choice.chosen for choice in self.choices)
+        return any(choice.is_selected for choice in self.choices)
 
 
-def offered(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
+def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
     """Phases, then causes, those that are retired left out; what was `said` before stays, whatever became of it.
 
     A level without words is left out.
@@ -61,29 +61,29 @@ def offered(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
     for field, level in FIELDS.items():
         before = (said or {}).get(field, "")
         known = [Choice(row.words, row.key, row.words == before) for row in terms if row.level == level]
-        if before and not any(choice.chosen for choice in known):
+        if before and not any(choice.is_selected for choice in known):
             known.append(Choice(before, "", True))
         if known:
             found.append(Level(field, level.label.capitalize(), tuple(known)))
     return tuple(found)
 
 
-def said_of(score: Score | None) -> dict[str, str]:
+def score_failure(score: Score | None) -> dict[str, str]:
     """What a score says of it, by field."""
     return {field: getattr(score, field) for field in FIELDS} if score else {}
 
 
-def in_order() -> Mapping[str, tuple[str, ...]]:
+def ordered_terms() -> Mapping[str, tuple[str, ...]]:
     """Of each level by its field the words, retired ones too, in the lab's order."""
     rows = FailureTerm.objects.values_list("level", "words")
     return {field: tuple(words for of, words in rows if of == level) for field, level in FIELDS.items()}
 
 
-def stripped(*, failure_phase: str, failure: str) -> dict[str, str]:
+def clean_failure(*, failure_phase: str, failure: str) -> dict[str, str]:
     """Both as they are kept; EvaError where they cannot be."""
     found = {
-        "failure": text("failure", failure, LONGEST_FAILURE),
-        "failure_phase": text("failure_phase", failure_phase, LONGEST_FAILURE),
+        "failure": clean_text("failure", failure, LONGEST_FAILURE),
+        "failure_phase": clean_text("failure_phase", failure_phase, LONGEST_FAILURE),
     }
     for field, words in found.items():
         if is_not_said(words):
@@ -110,7 +110,7 @@ def check_failure(
     wanted = scene.failure_required and by_person and not success
     if not (wanted or any(words[field] for field in FIELDS)):
         return
-    offers = {level.field: [choice.words for choice in level.choices] for level in offered(said)}
+    offers = {level.field: [choice.words for choice in level.choices] for level in failure_choices(said)}
     for field in FIELDS:
         value, allowed = words[field], offers.get(field, [])
         if wanted and allowed and not value:

@@ -43,11 +43,11 @@ class SceneFigure:
     n: int
 
 
-def bar(found: Proportion) -> Bar | None:
+def rate_bar(found: Proportion) -> Bar | None:
     """The bar of a proportion; None where nothing is known."""
     if found.rate is None or found.interval is None:
         return None
-    words = f"{percent(found.rate)} of {found.n}, 95 % interval {interval(found)}"
+    words = f"{format_percent(found.rate)} of {found.n}, 95 % interval {format_interval(found)}"
     return Bar(_x(found.rate), _x(found.interval.low), _x(found.interval.high), words)
 
 
@@ -56,17 +56,17 @@ def scene_figures(rows: Iterable[StatisticsRow]) -> list[SceneFigure]:
     figures = []
     for _, group in groupby(rows, key=lambda row: row.scene.pk):
         found = list(group)
-        drawn = tuple((row, bar(row.summary.success)) for row in found)
+        drawn = tuple((row, rate_bar(row.summary.success)) for row in found)
         figures.append(SceneFigure(found[0].scene, drawn, sum(row.summary.success.n for row in found)))
     return figures
 
 
-def percent(share: float) -> str:
+def format_percent(share: float) -> str:
     """A share as whole percent."""
     return f"{100 * share:.0f} %"
 
 
-def interval(found: Proportion) -> str:
+def format_interval(found: Proportion) -> str:
     """The ends of the interval in whole percent, without the sign: "49 to 94"."""
     if found.interval is None:
         return ""

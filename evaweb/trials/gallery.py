@@ -19,10 +19,10 @@ from django.db.models import (
     When,
 )
 
-from evaweb.blinding import HIDDEN, Sight, code_of
+from evaweb.blinding import HIDDEN, Visibility, code_of
 from evaweb.errors import EvaError
 from evaweb.trials.clips import clip_of
-from evaweb.trials.failure_words import NOT_SAID, is_not_said
+from evaweb.trials.failure_words import UNSPECIFIED, is_not_said
 from evaweb.trials.models import Trial, TrialStatus
 from evaweb.trials.selectors import TrialFilters, trial_list
 from runtime.core.sentences import Pattern
@@ -84,7 +84,7 @@ class Group:
     address: str
 
 
-def failed_list(filters: FailureFilters, sight: Sight) -> QuerySet[Trial]:
+def failed_list(filters: FailureFilters, sight: Visibility) -> QuerySet[Trial]:
     """The failed trials that count, group by group, the newest of each first; EvaError says what is allowed.
 
     Trials of hidden checkpoints are there without what tells which they are of: their order is that of their numbers.
@@ -103,7 +103,7 @@ def failed_list(filters: FailureFilters, sight: Sight) -> QuerySet[Trial]:
     return rows.annotate(**_keys(filters.group, sight)).order_by(*_keys(filters.group, sight), "-pk")
 
 
-def failure_groups(filters: FailureFilters, sight: Sight) -> list[Group]:
+def failure_groups(filters: FailureFilters, sight: Visibility) -> list[Group]:
     """The groups, the largest first."""
     keys = list(_keys(filters.group, sight))
     rows = failed_list(filters, sight).order_by().values_list(*keys).annotate(n=Count("pk"))
@@ -111,7 +111,7 @@ def failure_groups(filters: FailureFilters, sight: Sight) -> list[Group]:
     return sorted(found, key=lambda group: (-group.count, group.name))
 
 
-def failures_of(keys: Sequence[int], filters: FailureFilters, sight: Sight) -> list[Trial]:
+def failures_of(keys: Sequence[int], filters: FailureFilters, sight: Visibility) -> list[Trial]:
     """Those of `failed_list` by their ids, in its order, with all that is shown of them.
 
     So that of a hundred thousand trials only the ids are sorted.
@@ -127,14 +127,14 @@ def shown_group(trial: Trial, filters: FailureFilters) -> str:
 
 
 def failure_rows(
-    filters: FailureFilters, sight: Sight, root: str, size: int = 500
+    filters: FailureFilters, sight: Visibility, root: str, size: int = 500
 ) -> Iterator[list[dict[str, Any]]]:
     """All of them as rows of COLUMNS, so many at a time, the oldest first; `root` stands before each address."""
     for page in failure_trials(filters, sight, size):
         yield [row_of(trial, sight, root) for trial in page]
 
 
-def failure_trials(filters: FailureFilters, sight: Sight, size: int = 500) -> Iterator[list[Trial]]:
+def failure_trials(filters: FailureFilters, sight: Visibility, size: int = 500) -> Iterator[list[Trial]]:
     """All of them with what is shown of them, so many at a time, the oldest first."""
     trials = (
         failed_list(filters, sight).prefetch_related("verdict__outcomes").select_related("episode", *NAMED)
@@ -145,7 +145,7 @@ def failure_trials(filters: FailureFilters, sight: Sight, size: int = 500) -> It
         last = page[-1].pk
 
 
-def row_of(trial: Trial, sight: Sight, root: str) -> dict[str, Any]:
+def row_of(trial: Trial, sight: Visibility, root: str) -> dict[str, Any]:
     """One of them by COLUMNS."""
     clip, verdict = clip_of(trial), trial.verdict
     return {
@@ -154,7 +154,7 @@ def row_of(trial: Trial, sight: Sight, root: str) -> dict[str, Any]:
         "evaluation": trial.evaluation.name,
         "scene": trial.scene.name,
         "position": trial.position.number,
-        "checkpoint": sight.label(trial),
+        "checkpoint": sight.checkpoint_label(trial),
         "operator": trial.operator.get_username(),
         "started_at": trial.started_at,
         **{name: getattr(verdict, name) for name in (*_WORDS, "note")},
@@ -165,7 +165,7 @@ def row_of(trial: Trial, sight: Sight, root: str) -> dict[str, Any]:
     }
 
 
-def _keys(group: str, sight: Sight) -> dict[str, Any]:
+def _keys(group: str, sight: Visibility) -> dict[str, Any]:
     """What trials are grouped and ordered by: two columns, of which the first puts last what has no name."""
     if group == "position":
         return {"group_scene": F("scene__name"), "group_number": F("position__number")}
@@ -189,7 +189,7 @@ def _named(group: str, key: list[Any]) -> str:
         return f"{key[0]}/{key[1]}"
     if group == "checkpoint":
         return HIDDEN if key[0] else str(key[1])
-    return str(key[1]) or NOT_SAID
+    return str(key[1]) or UNSPECIFIED
 
 
 def _alone(filters: FailureFilters, key: list[Any]) -> str:

@@ -10,12 +10,12 @@ from django.shortcuts import render
 from django.urls import reverse
 from django.views.decorators.http import require_GET
 
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.downloads import CSV, download
-from evaweb.episodes.selectors import stage_of
+from evaweb.episodes.selectors import playback_stage
 from evaweb.errors import EvaError
 from evaweb.roles import Role, role_of
-from evaweb.tabular_export import csv_lines
+from evaweb.tabular_export import iter_csv
 from evaweb.trials import clip_export, failures, gallery
 from evaweb.trials.clips import clip_of
 from evaweb.trials.gallery import FailureFilters
@@ -28,7 +28,7 @@ _TRIALS = ("evaluation", "checkpoint", "scene", "station", "since")
 @require_GET
 def failure_gallery(request: HttpRequest) -> HttpResponse:
     """Failed trials as clips, group by group; the filters are in the address."""
-    seen, filters, fault = sight_for(request), _filters(request.GET), None
+    seen, filters, fault = visibility_for_request(request), _filters(request.GET), None
     try:
         groups = gallery.failure_groups(filters, seen)
     except EvaError as problem:
@@ -45,10 +45,10 @@ def failure_gallery(request: HttpRequest) -> HttpResponse:
                 "trial": trial,
                 "group": (name := gallery.shown_group(trial, filters)),
                 "count": counts.get(name, 0),
-                "checkpoint": seen.label(trial),
+                "checkpoint": seen.checkpoint_label(trial),
                 "clip": (clip := clip_of(trial)),
                 "address": clip.share if clip else reverse("result-trial", args=[trial.pk]),
-                "stage": stage_of(episode=trial.episode) if trial.episode else None,
+                "stage": playback_stage(episode=trial.episode) if trial.episode else None,
             }
             for trial in gallery.failures_of(list(page), filters, seen)
         ],
@@ -59,7 +59,7 @@ def failure_gallery(request: HttpRequest) -> HttpResponse:
         "by": gallery.GROUPS,
         "filters": filters,
         "most_clips": clip_export.MOST,
-        "levels": failures.offered(),
+        "levels": failures.failure_choices(),
         "may_change": role_of(request.user) is not Role.VIEWER,
         "fault": fault,
         "here": "failures",
@@ -70,17 +70,17 @@ def failure_gallery(request: HttpRequest) -> HttpResponse:
 @require_GET
 def failure_table(request: HttpRequest) -> StreamingHttpResponse:
     """The same, all of them, as CSV with the address of each clip."""
-    seen, filters = sight_for(request), _filters(request.GET)
+    seen, filters = visibility_for_request(request), _filters(request.GET)
     gallery.failed_list(filters, seen)  # what is wrong with the filters is said before anything is sent
     root = request.build_absolute_uri("/").rstrip("/")
-    pieces = csv_lines(gallery.COLUMNS, gallery.failure_rows(filters, seen, root))
+    pieces = iter_csv(gallery.COLUMNS, gallery.failure_rows(filters, seen, root))
     return download(request, pieces, "failures.csv", CSV)
 
 
 @require_GET
 def failure_clips(request: HttpRequest) -> StreamingHttpResponse:
     """The clips themselves with their table, as an archive that is made while it is sent."""
-    seen, filters = sight_for(request), _filters(request.GET)
+    seen, filters = visibility_for_request(request), _filters(request.GET)
     clip_export.require_few(filters, seen)
     root = request.build_absolute_uri("/").rstrip("/")
     pieces = clip_export.clip_archive(filters, seen, root)

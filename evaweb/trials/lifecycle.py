@@ -14,7 +14,7 @@ _TRIAL_CANNOT = Pattern(
 )
 
 
-class Move(StrEnum):
+class Transition(StrEnum):
     """Moves of a trial; the value is the word for it in a sentence."""
 
     RUN = "run"
@@ -31,35 +31,35 @@ class Move(StrEnum):
 
 
 _S = TrialStatus
-MOVES: dict[tuple[TrialStatus, Move], TrialStatus] = {
-    (_S.PREPARED, Move.RUN): _S.RUNNING,
-    (_S.PREPARED, Move.ABANDON): _S.ABANDONED,
-    (_S.ABANDONED, Move.RUN): _S.RUNNING,  # it was given up, then the lost answer says that it runs
-    (_S.RUNNING, Move.GIVE_BACK): _S.PREPARED,  # its recording could not be opened: it never ran
-    (_S.PAUSED, Move.GIVE_BACK): _S.PREPARED,
-    (_S.RUNNING, Move.PAUSE): _S.PAUSED,
-    (_S.RUNNING, Move.END): _S.ENDED,
-    (_S.RUNNING, Move.INTERRUPT): _S.INTERRUPTED,
-    (_S.PAUSED, Move.RESUME): _S.RUNNING,
-    (_S.PAUSED, Move.END): _S.ENDED,
-    (_S.PAUSED, Move.INTERRUPT): _S.INTERRUPTED,
-    (_S.ENDED, Move.INTERRUPT): _S.INTERRUPTED,  # its recording turns out not to be whole
-    (_S.ENDED, Move.SCORE): _S.SCORED,
-    (_S.ENDED, Move.VOID): _S.VOIDED,
+TRANSITIONS: dict[tuple[TrialStatus, Transition], TrialStatus] = {
+    (_S.PREPARED, Transition.RUN): _S.RUNNING,
+    (_S.PREPARED, Transition.ABANDON): _S.ABANDONED,
+    (_S.ABANDONED, Transition.RUN): _S.RUNNING,  # it was given up, then the lost answer says that it runs
+    (_S.RUNNING, Transition.GIVE_BACK): _S.PREPARED,  # its recording could not be opened: it never ran
+    (_S.PAUSED, Transition.GIVE_BACK): _S.PREPARED,
+    (_S.RUNNING, Transition.PAUSE): _S.PAUSED,
+    (_S.RUNNING, Transition.END): _S.ENDED,
+    (_S.RUNNING, Transition.INTERRUPT): _S.INTERRUPTED,
+    (_S.PAUSED, Transition.RESUME): _S.RUNNING,
+    (_S.PAUSED, Transition.END): _S.ENDED,
+    (_S.PAUSED, Transition.INTERRUPT): _S.INTERRUPTED,
+    (_S.ENDED, Transition.INTERRUPT): _S.INTERRUPTED,  # its recording turns out not to be whole
+    (_S.ENDED, Transition.SCORE): _S.SCORED,
+    (_S.ENDED, Transition.VOID): _S.VOIDED,
     # An e-stop may well be the checkpoint's own failure: leaving such trials out would flatter it.
-    (_S.INTERRUPTED, Move.SCORE): _S.SCORED,
-    (_S.INTERRUPTED, Move.VOID): _S.VOIDED,
-    (_S.SCORED, Move.SCORE): _S.SCORED,  # a correction
-    (_S.SCORED, Move.VOID): _S.VOIDED,
-    (_S.SCORED, Move.ASK): _S.VOID_ASKED,  # of a blind plan: a second operator has to agree
-    (_S.VOID_ASKED, Move.VOID): _S.VOIDED,
-    (_S.VOID_ASKED, Move.KEEP): _S.SCORED,
+    (_S.INTERRUPTED, Transition.SCORE): _S.SCORED,
+    (_S.INTERRUPTED, Transition.VOID): _S.VOIDED,
+    (_S.SCORED, Transition.SCORE): _S.SCORED,  # a correction
+    (_S.SCORED, Transition.VOID): _S.VOIDED,
+    (_S.SCORED, Transition.ASK): _S.VOID_ASKED,  # of a blind plan: a second operator has to agree
+    (_S.VOID_ASKED, Transition.VOID): _S.VOIDED,
+    (_S.VOID_ASKED, Transition.KEEP): _S.SCORED,
 }
 
-OPEN = (_S.PREPARED, _S.RUNNING, _S.PAUSED)
-UNDER_WAY = (_S.RUNNING, _S.PAUSED)
-JUDGED = (_S.SCORED, _S.VOID_ASKED, _S.VOIDED)
-REPEATED = (_S.INTERRUPTED, _S.VOID_ASKED, _S.VOIDED, _S.ABANDONED)
+OPEN_STATES = (_S.PREPARED, _S.RUNNING, _S.PAUSED)
+RUNNING_STATES = (_S.RUNNING, _S.PAUSED)
+SCORED_STATES = (_S.SCORED, _S.VOID_ASKED, _S.VOIDED)
+REPEATABLE_STATES = (_S.INTERRUPTED, _S.VOID_ASKED, _S.VOIDED, _S.ABANDONED)
 """What does not count: the next trial of the same kind is another attempt of the same number."""
 
 _ADVICE = {
@@ -80,19 +80,19 @@ def advice(status: str) -> str:
     return _ADVICE[TrialStatus(status)]
 
 
-def allows(trial: Trial, move: Move) -> bool:
+def allows(trial: Trial, move: Transition) -> bool:
     """True if `move` is in the table for this trial as it stands."""
-    return (TrialStatus(trial.status), move) in MOVES
+    return (TrialStatus(trial.status), move) in TRANSITIONS
 
 
-def require(trial: Trial, move: Move) -> None:
+def require(trial: Trial, move: Transition) -> None:
     """Raise Conflict, with what can be done instead, unless the table has `move` for this trial."""
     if not allows(trial, move):
         status = TrialStatus(trial.status)
         raise Conflict(_TRIAL_CANNOT(trial=trial.pk, label=status.label, move=move, advice=advice(status)))
 
 
-def apply(trial: Trial, move: Move) -> None:
+def apply(trial: Trial, move: Transition) -> None:
     """Set the status that follows; the caller saves. Conflict where the table has no such move."""
     require(trial, move)
-    trial.status = MOVES[TrialStatus(trial.status), move]
+    trial.status = TRANSITIONS[TrialStatus(trial.status), move]

@@ -15,7 +15,7 @@ from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
 from evaweb.names import check_name
 from evaweb.stations.models import Station
-from evaweb.trials.failure_words import why_words
+from evaweb.trials.failure_words import failure_text
 from evaweb.trials.tables import check_bench, check_policy, check_strategy, check_tags, check_term
 
 
@@ -401,8 +401,8 @@ class Trial(models.Model):
             *("station", "operator", "instruction", "strategy", "seed", "time_limit_s"),
             *("prepared_at", "started_at", "ended_at", "ended_by"),
         ),
-        only=_JUDGED,
-        moves={
+        condition=_JUDGED,
+        allowed_changes={
             "status": {"scored": ("void_asked", "voided"), "void_asked": ("voided", "scored"), "voided": ()}
         },
         never=(
@@ -477,7 +477,7 @@ class VoidRequest(models.Model):
 
     append_only = AppendOnly(
         "what was asked for is answered once, never changed or removed",
-        but=("answer", "answer_reason", "answered_by", "answered_at"),
+        except_columns=("answer", "answer_reason", "answered_by", "answered_at"),
         never=(
             "OLD.answer <> '' AND (NEW.answer <> OLD.answer OR NEW.answer_reason <> OLD.answer_reason OR "
             "COALESCE(NEW.answered_by_id, 0) <> COALESCE(OLD.answered_by_id, 0) OR "
@@ -535,7 +535,7 @@ class Score(models.Model):
     @property
     def why(self) -> str:
         """Phase and cause of a failure, as far as they were said."""
-        return why_words(self.failure_phase, self.failure)
+        return failure_text(self.failure_phase, self.failure)
 
 
 class MilestoneOutcome(models.Model):
@@ -552,10 +552,10 @@ class MilestoneOutcome(models.Model):
 
     append_only = AppendOnly(
         "what was scored is never changed or removed: a correction is another score",
-        but=("milestone",),
+        except_columns=("milestone",),
         # They are added with their score, before it counts or is corrected.
-        late="EXISTS (SELECT 1 FROM trials_trial WHERE verdict_id = NEW.score_id) OR EXISTS (SELECT 1 FROM "
-        "trials_score own, trials_score later WHERE own.id = NEW.score_id AND later.trial_id = own.trial_id "
+        forbidden_inserts="EXISTS (SELECT 1 FROM trials_trial WHERE verdict_id = NEW.score_id) OR EXISTS (SELECT 1 "
+        "FROM trials_score own, trials_score later WHERE own.id = NEW.score_id AND later.trial_id = own.trial_id "
         "AND later.id > own.id)",
     )
 

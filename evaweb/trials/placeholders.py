@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from evaweb.episodes.services import station_known
+from evaweb.episodes.services import get_or_create_station
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene
 from evaweb.trials.record import TrialRecord
 from evaweb.trials.services import open_bench
 
-LOST = "Known from recordings alone: the database was lost."
+PLACEHOLDER_NOTE = "Known from recordings alone: the database was lost."
 
 
 def station(facts: TrialRecord) -> Station:
     """The station of the trial."""
-    return station_known(
+    return get_or_create_station(
         name=facts.station, robot="", simulated=facts.simulated, source=f"trial {facts.uuid}"
     )
 
@@ -22,7 +22,7 @@ def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
     """The trial's evaluation; the open bench of its station takes all versions."""
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         found, _ = Evaluation.objects.get_or_create(
-            name=facts.evaluation, version=facts.version, defaults={"description": LOST}
+            name=facts.evaluation, version=facts.version, defaults={"description": PLACEHOLDER_NOTE}
         )
         return found
     found = open_bench(station)
@@ -34,7 +34,7 @@ def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
 
 def checkpoint(facts: TrialRecord) -> Checkpoint:
     """The checkpoint of that name."""
-    words = f"{LOST} Say again how it is reached, then switch it on."
+    words = f"{PLACEHOLDER_NOTE} Say again how it is reached, then switch it on."
     found, _ = Checkpoint.objects.get_or_create(
         name=facts.checkpoint, defaults={"description": words, "active": False}
     )
@@ -43,7 +43,7 @@ def checkpoint(facts: TrialRecord) -> Checkpoint:
 
 def scene(facts: TrialRecord) -> Scene:
     """The scene of that name; milestones it gets from the first scores that are restored."""
-    words = f"{LOST} Write down again what counts as success, then switch it on."
+    words = f"{PLACEHOLDER_NOTE} Write down again what counts as success, then switch it on."
     found, _ = Scene.objects.get_or_create(
         name=facts.scene,
         defaults={
@@ -59,6 +59,6 @@ def scene(facts: TrialRecord) -> Scene:
 
 def position(scene: Scene, number: int) -> Position:
     """The position of that number."""
-    words = f"{LOST} Write down again where things stand."
+    words = f"{PLACEHOLDER_NOTE} Write down again where things stand."
     found, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": words})
     return found

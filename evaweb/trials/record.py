@@ -15,8 +15,8 @@ from uuid import UUID
 
 from pydantic import Field, StrictBool, field_validator
 
-from evaweb.blinding import HIDDEN, Sight, code_of
-from evaweb.journal import From, Journal, Line, Moment, Person, checked, value_at
+from evaweb.blinding import HIDDEN, Visibility, code_of
+from evaweb.journal import Journal, Line, Moment, Person, RowPath, parse_model, resolve_path
 from evaweb.stations.models import STATION_NAME
 from evaweb.trials.models import Evaluation, Score, Trial, TrialStatus
 
@@ -27,7 +27,7 @@ _Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 
 @dataclass(frozen=True, slots=True)
-class Column(From):
+class Column(RowPath):
     """One column: `path` is where a trial has it, "" under its own name.
 
     While it is hidden from somebody which checkpoint a trial is of, a column that is not `open` is hidden too, or is
@@ -35,8 +35,8 @@ class Column(From):
     """
 
     path: str = ""
-    open: bool = False  # it tells nothing of the checkpoint
-    seen: Callable[[Sight, Trial], Any] | None = None
+    always_visible: bool = False  # it tells nothing of the checkpoint
+    masked_value: Callable[[Visibility, Trial], Any] | None = None
     written: Literal["before", "after", "never"] = (
         "before"  # the run: manifests have what is written before it
     )
@@ -45,71 +45,86 @@ class Column(From):
     type: Any = None  # as it is shown; None: as it is read
     label: str = ""  # on the trial's page; "" where that shows it otherwise, or not
 
-    def shown(self, name: str, hint: Any, trial: Trial, sight: Sight) -> Any:
+    def shown(self, name: str, hint: Any, trial: Trial, sight: Visibility) -> Any:
         """Its value as somebody may see it."""
-        if self.seen is not None:
-            return self.seen(sight, trial)
-        if self.open or not sight.hides(trial):
-            return value_at(trial, self.path or name)
+        if self.masked_value is not None:
+            return self.masked_value(sight, trial)
+        if self.always_visible or not sight.hides(trial):
+            return resolve_path(trial, self.path or name)
         return None if type(None) in get_args(hint) else HIDDEN
 
 
 class TrialRecord(Line):
     """A trial, its columns in the order in which they are shown; what is not written is empty where it was read."""
 
-    id: Annotated[Annotated[int, Field(gt=0, lt=2**53)] | None, Column("pk", open=True, type=int)] = None
-    uuid: Annotated[UUID, Column(open=True)]
-    evaluation: Annotated[Name, Column("evaluation__name", open=True, table=False)]
+    id: Annotated[
+        Annotated[int, Field(gt=0, lt=2**53)] | None, Column("pk", always_visible=True, type=int)
+    ] = None
+    uuid: Annotated[UUID, Column(always_visible=True)]
+    evaluation: Annotated[Name, Column("evaluation__name", always_visible=True, table=False)]
     evaluation_kind: Annotated[
-        Evaluation.Kind, Column("evaluation__kind", open=True, api="never", table=False)
+        Evaluation.Kind, Column("evaluation__kind", always_visible=True, api="never", table=False)
     ] = Evaluation.Kind.OPEN_BENCH
-    version: Annotated[_Count, Column("evaluation_version", open=True, table=False)]
-    station: Annotated[str, Field(pattern=STATION_NAME), Column("station__name", open=True)]
-    simulated: Annotated[StrictBool, Column("station__simulated", open=True, api="never", table=False)] = (
-        False
-    )
+    version: Annotated[_Count, Column("evaluation_version", always_visible=True, table=False)]
+    station: Annotated[str, Field(pattern=STATION_NAME), Column("station__name", always_visible=True)]
+    simulated: Annotated[
+        StrictBool, Column("station__simulated", always_visible=True, api="never", table=False)
+    ] = False
     scene: Annotated[
-        str, Field(min_length=1, max_length=60, pattern=r"^[-\w]+$"), Column("scene__name", open=True)
+        str,
+        Field(min_length=1, max_length=60, pattern=r"^[-\w]+$"),
+        Column("scene__name", always_visible=True),
     ]
-    position: Annotated[_Small, Column("position__number", open=True)]
-    checkpoint: Annotated[Name, Column("checkpoint__name", seen=Sight.label)]
+    position: Annotated[_Small, Column("position__number", always_visible=True)]
+    checkpoint: Annotated[Name, Column("checkpoint__name", masked_value=Visibility.checkpoint_label)]
     code: Annotated[
-        str, Column("handout__code", seen=lambda sight, trial: code_of(trial), written="never")
+        str, Column("handout__code", masked_value=lambda sight, trial: code_of(trial), written="never")
     ] = ""
-    number: Annotated[_Count, Column(open=True)]
-    attempt: Annotated[_Small, Column(open=True)]
-    status: Annotated[TrialStatus | None, Column(open=True, written="never", type=TrialStatus)] = None
-    reason: Annotated[str, Column(seen=Sight.reason, written="after")] = ""
-    success: Annotated[bool | None, Column("verdict__success", open=True, written="never")] = None
-    score: Annotated[float | None, Column("verdict__score", open=True, written="never")] = None
-    duration_s: Annotated[_Seconds | None, Column(open=True, written="after")] = None
-    note: Annotated[str | None, Column("verdict__note", open=True, written="never")] = None
-    failure: Annotated[str | None, Column("verdict__failure", open=True, written="never")] = None
-    failure_phase: Annotated[str | None, Column("verdict__failure_phase", open=True, written="never")] = None
-    rater: Annotated[str | None, Column("verdict__rater__username", open=True, written="never")] = None
-    source: Annotated[str | None, Column("verdict__source", open=True, written="never")] = None
-    scored_at: Annotated[datetime | None, Column("verdict__scored_at", open=True, written="never")] = None
-    operator: Annotated[str, Field(max_length=150), Column("operator__username", open=True)] = ""
-    instruction: Annotated[str, Column(open=True, table=False)]
-    seed: Annotated[_Count | None, Column(open=True, table=False)] = None
+    number: Annotated[_Count, Column(always_visible=True)]
+    attempt: Annotated[_Small, Column(always_visible=True)]
+    status: Annotated[TrialStatus | None, Column(always_visible=True, written="never", type=TrialStatus)] = (
+        None
+    )
+    reason: Annotated[str, Column(masked_value=Visibility.reason, written="after")] = ""
+    success: Annotated[bool | None, Column("verdict__success", always_visible=True, written="never")] = None
+    score: Annotated[float | None, Column("verdict__score", always_visible=True, written="never")] = None
+    duration_s: Annotated[_Seconds | None, Column(always_visible=True, written="after")] = None
+    note: Annotated[str | None, Column("verdict__note", always_visible=True, written="never")] = None
+    failure: Annotated[str | None, Column("verdict__failure", always_visible=True, written="never")] = None
+    failure_phase: Annotated[
+        str | None, Column("verdict__failure_phase", always_visible=True, written="never")
+    ] = None
+    rater: Annotated[str | None, Column("verdict__rater__username", always_visible=True, written="never")] = (
+        None
+    )
+    source: Annotated[str | None, Column("verdict__source", always_visible=True, written="never")] = None
+    scored_at: Annotated[
+        datetime | None, Column("verdict__scored_at", always_visible=True, written="never")
+    ] = None
+    operator: Annotated[str, Field(max_length=150), Column("operator__username", always_visible=True)] = ""
+    instruction: Annotated[str, Column(always_visible=True, table=False)]
+    seed: Annotated[_Count | None, Column(always_visible=True, table=False)] = None
     strategy: Annotated[dict[str, Any] | None, Column(api="never", table=False)] = None
-    time_limit_s: Annotated[_Seconds | None, Column(open=True, table=False)] = None
-    prepared_at: Annotated[Moment | None, Column(open=True, table=False, type=datetime)] = None
-    started_at: Annotated[Moment | None, Column(open=True, written="after")] = None
-    ended_at: Annotated[Moment | None, Column(open=True, written="after")] = None
+    time_limit_s: Annotated[_Seconds | None, Column(always_visible=True, table=False)] = None
+    prepared_at: Annotated[Moment | None, Column(always_visible=True, table=False, type=datetime)] = None
+    started_at: Annotated[Moment | None, Column(always_visible=True, written="after")] = None
+    ended_at: Annotated[Moment | None, Column(always_visible=True, written="after")] = None
     ended_by: Annotated[
-        str | None, Field(max_length=14), Column(open=True, written="after", api="never", table=False)
+        str | None,
+        Field(max_length=14),
+        Column(always_visible=True, written="after", api="never", table=False),
     ] = None
-    episode: Annotated[UUID | None, Column("episode_id", open=True, written="never")] = None
-    truth: Annotated[dict[str, Any] | None, Column(open=True, written="after", api="detail", table=False)] = (
-        None
-    )
+    episode: Annotated[UUID | None, Column("episode_id", always_visible=True, written="never")] = None
+    truth: Annotated[
+        dict[str, Any] | None, Column(always_visible=True, written="after", api="detail", table=False)
+    ] = None
     voided_by: Annotated[
-        str | None, Column("voided_by__username", open=True, written="never", api="detail", table=False)
+        str | None,
+        Column("voided_by__username", always_visible=True, written="never", api="detail", table=False),
     ] = None
-    voided_at: Annotated[datetime | None, Column(open=True, written="never", api="detail", table=False)] = (
-        None
-    )
+    voided_at: Annotated[
+        datetime | None, Column(always_visible=True, written="never", api="detail", table=False)
+    ] = None
 
     @classmethod
     def names(cls) -> Iterable[str]:
@@ -117,16 +132,16 @@ class TrialRecord(Line):
         return [name for name, column in COLUMNS.items() if column.written != "never"]
 
     @classmethod
-    def asked(cls, trial: Trial) -> dict[str, Any]:
+    def for_manifest(cls, trial: Trial) -> dict[str, Any]:
         """The trial as its run is asked for, for the manifest: the uuid tells it from those of other databases."""
         whole = cls.written(trial)
         return {name: value for name, value in whole.items() if COLUMNS[name].written == "before"}
 
-    def own(self) -> dict[str, Any]:
+    def pre_run_fields(self) -> dict[str, Any]:
         """What was known before its run, as fields of models.Trial; without its id, and without other rows."""
         return self._fields("before")
 
-    def course(self) -> dict[str, Any]:
+    def run_fields(self) -> dict[str, Any]:
         """How its run went, as fields of models.Trial."""
         return self._fields("after")
 
@@ -162,12 +177,12 @@ def api_columns(where: Literal["list", "detail"]) -> dict[str, Any]:
     return {name: HINTS[name] for name, column in COLUMNS.items() if column.api == where}
 
 
-def shown(trial: Trial, sight: Sight, names: Iterable[str]) -> dict[str, Any]:
+def visible_columns(trial: Trial, sight: Visibility, names: Iterable[str]) -> dict[str, Any]:
     """The trial as somebody may see it."""
     return {name: COLUMNS[name].shown(name, HINTS[name], trial, sight) for name in names}
 
 
-def labelled(trial: Trial, sight: Sight) -> Iterator[tuple[str, Any]]:
+def visible_labels(trial: Trial, sight: Visibility) -> Iterator[tuple[str, Any]]:
     """What the trial's page shows of itself, as somebody may see it."""
     for name, column in COLUMNS.items():
         if column.label:
@@ -194,8 +209,8 @@ class ScoreLine(Line):
     kind: Literal["score"] = "score"
     uuid: UUID
     trial: TrialRecord
-    rater: Annotated[Person, From("rater__username")]
-    at: Annotated[Moment, From("scored_at")]
+    rater: Annotated[Person, RowPath("rater__username")]
+    at: Annotated[Moment, RowPath("scored_at")]
     success: StrictBool
     score: Annotated[float, Field(ge=0, le=1)]
     note: str = ""
@@ -203,7 +218,7 @@ class ScoreLine(Line):
     failure_phase: Annotated[str, Field(max_length=60)] = ""
     reason: str = ""
     source: Score.Source = Score.Source.HUMAN
-    milestones: Annotated[tuple[OutcomeLine, ...], From("outcomes__all")] = ()
+    milestones: Annotated[tuple[OutcomeLine, ...], RowPath("outcomes__all")] = ()
 
     @field_validator("milestones")
     @classmethod
@@ -218,9 +233,9 @@ class VoidLine(Line):
 
     kind: Literal["void"] = "void"
     trial: TrialRecord
-    by: Annotated[Person, From("voided_by__username")]
+    by: Annotated[Person, RowPath("voided_by__username")]
     reason: str
-    at: Annotated[Moment, From("voided_at")]
+    at: Annotated[Moment, RowPath("voided_at")]
 
     @classmethod
     def written(cls, row: Trial, **given: Any) -> dict[str, Any]:
@@ -234,7 +249,7 @@ class VoidRequestLine(Line):
     kind: Literal["void_request"] = "void_request"
     uuid: UUID
     trial: TrialRecord
-    by: Annotated[Person, From("by__username")]
+    by: Annotated[Person, RowPath("by__username")]
     reason: str
     at: Moment
 
@@ -247,20 +262,20 @@ class VoidAnswerLine(Line):
     uuid: UUID  # of the request
     trial: TrialRecord
     answer: Annotated[str, Field(pattern="^(agreed|refused|lapsed)$")]
-    reason: Annotated[str, From("answer_reason")] = ""
-    by: Annotated[Person, From("answered_by__username")]
-    at: Annotated[Moment, From("answered_at")]
+    reason: Annotated[str, RowPath("answer_reason")] = ""
+    by: Annotated[Person, RowPath("answered_by__username")]
+    at: Annotated[Moment, RowPath("answered_at")]
 
 
 Judgement = ScoreLine | VoidLine | VoidRequestLine | VoidAnswerLine
 JUDGEMENTS: Journal[Judgement] = Journal("scores", ScoreLine, VoidLine, VoidRequestLine, VoidAnswerLine)
 
 
-def file_of(trial: Trial) -> UUID:
+def journal_uuid(trial: Trial) -> UUID:
     """What the file of a trial's verdicts is named by."""
     return trial.episode_id or trial.uuid
 
 
-def asked_trial(asked: Mapping[str, Any]) -> TrialRecord | None:
+def trial_of_manifest(asked: Mapping[str, Any]) -> TrialRecord | None:
     """The trial that a manifest names; None where its run was none of ours."""
-    return checked(TrialRecord, asked, "the manifest's trial") if "uuid" in asked else None
+    return parse_model(TrialRecord, asked, "the manifest's trial") if "uuid" in asked else None

@@ -19,13 +19,13 @@ from django.utils import timezone
 
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder
-from evaweb.episodes.manifest import CLOSED, recorded_in
+from evaweb.episodes.manifest import CLOSED, read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.reconcile import Kept, restores
-from evaweb.episodes.selectors import unrecorded_because
+from evaweb.episodes.reconcile import RestorableRun, register_restorer
+from evaweb.episodes.selectors import why_unrecorded
 from evaweb.errors import EvaError
-from evaweb.journal import absent
-from evaweb.roles import known_person
+from evaweb.journal import missing_rows
+from evaweb.roles import get_or_create_person
 from evaweb.trials import lifecycle, placeholders
 from evaweb.trials.models import (
     Milestone,
@@ -44,7 +44,7 @@ from evaweb.trials.record import (
     VoidAnswerLine,
     VoidLine,
     VoidRequestLine,
-    asked_trial,
+    trial_of_manifest,
 )
 from runtime.core.sentences import Pattern
 from runtime.recording.reader import read_events
@@ -59,14 +59,14 @@ _TRIAL_HAS_EPISODE_CANNOT_HAVE = Pattern(
     "trial {trial} has episode {episode_id}, and cannot have another one",
 )
 
-_BEHIND = (*lifecycle.OPEN, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
+_BEHIND = (*lifecycle.OPEN_STATES, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
 _GHOST_S = 0.1  # the clock of a run that never began stood at a few hundredths of a second
 
 
-@restores
-def restore(kept: Kept) -> int:
+@register_restorer
+def restore(kept: RestorableRun) -> int:
     """Make the trial of a run and its scores, where they are not there; how many rows that were."""
-    asked = recorded_in(journal_folder(kept.uuid)).trial if kept.recorded else {}
+    asked = read_recorded_episode(journal_folder(kept.uuid)).trial if kept.recorded else {}
     lines = _judgements(kept, asked)
     if not lines and Trial.objects.filter(episode_id=kept.uuid).exclude(status__in=_BEHIND).exists():
         return 0
@@ -77,24 +77,24 @@ def restore(kept: Kept) -> int:
     with transaction.atomic():
         trial, made = _trial(facts, kept, episode)
         scores = _scores(trial, [line for line in lines if isinstance(line, ScoreLine)])
-        _judged(trial, lines)
-        scores += _asked(trial, lines)
+        _apply_outcomes(trial, lines)
+        scores += _restore_void_requests(trial, lines)
         if made or scores:
             _publish(trial, made=made)
-    if never := _never_ran(trial):
-        kept.say(never)
+    if never := _never_ran_reason(trial):
+        kept.report_problem(never)
     return made + scores
 
 
-def _never_ran(trial: Trial) -> str:
+def _never_ran_reason(trial: Trial) -> str:
     """What is said of a score that earlier versions took for a run whose recording could not be opened; "" else."""
     if trial.status != TrialStatus.SCORED or trial.episode is None or (trial.duration_s or 0.0) >= _GHOST_S:
         return ""
-    why = unrecorded_because(episode=trial.episode)
+    why = why_unrecorded(episode=trial.episode)
     return why and f"trial {trial.pk} is scored and never ran, {why}: void it with a reason"
 
 
-def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[Judgement]:
+def _judgements(kept: RestorableRun, asked: Mapping[str, Any]) -> list[Judgement]:
     """What its lines say; of a score that was given once more, as the database did not take it, the last.
 
     Those of another trial than its recording, in a copy of another file, are left out.
@@ -103,7 +103,7 @@ def _judgements(kept: Kept, asked: Mapping[str, Any]) -> list[Judgement]:
     own = asked.get("uuid", "")
     foreign = [str(line.trial.uuid) for line in lines if kept.recorded and str(line.trial.uuid) != own]
     if foreign:
-        kept.say(
+        kept.report_problem(
             f"run {kept.uuid}: {len(foreign)} of its scores are of trial {', '.join(dict.fromkeys(foreign))}, "
             f"its recording is of {f'trial {own}' if own else 'no trial'}: left out"
         )
@@ -117,13 +117,13 @@ def _facts(lines: Sequence[Judgement], asked: Mapping[str, Any]) -> TrialRecord 
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
         raise EvaError(_SCORES_SEVERAL_TRIALS(named=", ".join(sorted(map(str, named)))))
-    return lines[-1].trial if lines else asked_trial(asked)
+    return lines[-1].trial if lines else trial_of_manifest(asked)
 
 
 # --- the trial ---------------------------------------------------------------------------------------------
 
 
-def _trial(facts: TrialRecord, kept: Kept, episode: Episode | None) -> tuple[Trial, bool]:
+def _trial(facts: TrialRecord, kept: RestorableRun, episode: Episode | None) -> tuple[Trial, bool]:
     """The trial's row, held, and whether it was made."""
     trial = Trial.objects.select_for_update().filter(uuid=facts.uuid).first()
     if trial is None:
@@ -131,7 +131,7 @@ def _trial(facts: TrialRecord, kept: Kept, episode: Episode | None) -> tuple[Tri
     if kept.uuid not in (trial.uuid, trial.episode_id or kept.uuid):
         raise EvaError(_TRIAL_HAS_EPISODE_CANNOT_HAVE(trial=trial.pk, episode_id=trial.episode_id))
     if trial.status in _BEHIND:
-        for name, value in _course(facts, _episode(facts, kept, episode)).items():
+        for name, value in _run_values(facts, _episode(facts, kept, episode)).items():
             setattr(trial, name, value)
         log.warning("trial %s was behind its recording: it is %s now", trial.pk, trial.status)
         trial.save()
@@ -141,11 +141,11 @@ def _trial(facts: TrialRecord, kept: Kept, episode: Episode | None) -> tuple[Tri
     return trial, False
 
 
-def _episode(facts: TrialRecord, kept: Kept, found: Episode | None) -> Episode | None:
+def _episode(facts: TrialRecord, kept: RestorableRun, found: Episode | None) -> Episode | None:
     """The recording, known as missing where its folder is lost too; a run that was none has the trial's uuid."""
     if found is not None or kept.uuid == facts.uuid:
         return found
-    return episodes.episode_missed(
+    return episodes.create_missing_episode(
         station=placeholders.station(facts),
         uuid=kept.uuid,
         task=facts.instruction,
@@ -166,16 +166,16 @@ def _made(facts: TrialRecord, episode: Episode | None) -> Trial:
         "scene": scene,
         "position": placeholders.position(scene, facts.position),
     }
-    course = _course(facts, episode)
+    course = _run_values(facts, episode)
     trial = Trial.objects.create(
         pk=None if Trial.objects.filter(pk=facts.id).exists() else facts.id,
         station=station,
-        operator=known_person((episode.operator if episode else "") or facts.operator),
-        **(facts.own() | key | course | _numbered(facts, key, course["reason"])),
+        operator=get_or_create_person((episode.operator if episode else "") or facts.operator),
+        **(facts.pre_run_fields() | key | course | _numbered(facts, key, course["reason"])),
     )
     prepared_at = facts.prepared_at or course["started_at"] or timezone.now()
     Trial.objects.filter(pk=trial.pk).update(prepared_at=prepared_at)  # `create` takes the present
-    _count_on(Trial)
+    _advance_sequence(Trial)
     return Trial.objects.get(pk=trial.pk)
 
 
@@ -189,14 +189,14 @@ def _numbered(facts: TrialRecord, key: Mapping[str, Any], reason: str) -> dict[s
     return {"number": newest + 1, "attempt": 1, "reason": f"{reason} ({was})" if reason else was}
 
 
-def _course(facts: TrialRecord, episode: Episode | None) -> dict[str, Any]:
+def _run_values(facts: TrialRecord, episode: Episode | None) -> dict[str, Any]:
     """How the run went: what is kept of the trial itself first, then what its recording says."""
     ended_at, truth = _end(episode) if episode else (None, None)
     exact = episode.duration_s if episode else None
     missing = episode is None or episode.status == EpisodeStatus.MISSING
     whole = missing or (episode.status == EpisodeStatus.FINISHED and episode.frames > 0)
     return {
-        **facts.course(),
+        **facts.run_fields(),
         "episode": episode,
         "status": TrialStatus.ENDED if whole else TrialStatus.INTERRUPTED,
         "reason": facts.reason or (episode.reason if episode else ""),
@@ -214,7 +214,7 @@ def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
     folder = journal_folder(episode.uuid)
     events = (json.loads(line) for line in read_events(folder / "events.jsonl").lines)
     told = [event.get("data") for event in events if event.get("kind") == "truth"]
-    return recorded_in(folder).ended_at, told[-1] if told else None
+    return read_recorded_episode(folder).ended_at, told[-1] if told else None
 
 
 # --- what was said of it -----------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
 
 def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
     """Add the scores that are not there."""
-    lost = absent(Score, lines, trial=trial)
+    lost = missing_rows(Score, lines, trial=trial)
     for line in lost:
         _score(trial, line)
     if lost:
@@ -239,44 +239,50 @@ def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
 
 
 def _score(trial: Trial, line: ScoreLine) -> None:
-    score = Score.objects.create(trial=trial, **line.values())
+    score = Score.objects.create(trial=trial, **line.to_row_values())
     known = _milestones(trial.scene, line.milestones)
     MilestoneOutcome.objects.bulk_create(
-        MilestoneOutcome(score=score, milestone=known.get((each.order, each.text)), **each.values())
+        MilestoneOutcome(score=score, milestone=known.get((each.order, each.text)), **each.to_row_values())
         for each in line.milestones
     )
 
 
 def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int, str], Milestone]:
     """The scene's by order and words; a scene that was made here gets those of the first score that has any."""
-    if not scene.active and scene.criterion.startswith(placeholders.LOST) and not scene.milestones.exists():
+    if (
+        not scene.active
+        and scene.criterion.startswith(placeholders.PLACEHOLDER_NOTE)
+        and not scene.milestones.exists()
+    ):
         for each in outcomes:
             Milestone.objects.create(scene=scene, **each.model_dump(exclude={"reached", "at_s"}))
     return {(milestone.order, milestone.text): milestone for milestone in scene.milestones.all()}
 
 
-def _judged(trial: Trial, lines: Sequence[Judgement]) -> None:
+def _apply_outcomes(trial: Trial, lines: Sequence[Judgement]) -> None:
     """Move the trial to where its lines have brought it; nothing leaves voided."""
     void = next((line for line in lines if isinstance(line, VoidLine)), None)
     asked = [line for line in lines if isinstance(line, VoidRequestLine | VoidAnswerLine)]
     if void is not None and trial.status != TrialStatus.VOIDED:
-        for name, value in {"status": TrialStatus.VOIDED, **void.values()}.items():
+        for name, value in {"status": TrialStatus.VOIDED, **void.to_row_values()}.items():
             setattr(trial, name, value)
         trial.save()
     elif void is None and lines:
         waits = bool(asked) and isinstance(asked[-1], VoidRequestLine)
         status = TrialStatus.VOID_ASKED if waits else TrialStatus.SCORED
-        if trial.status not in lifecycle.JUDGED or (asked and trial.status != status):
+        if trial.status not in lifecycle.SCORED_STATES or (asked and trial.status != status):
             trial.status = status
             trial.save()
 
 
-def _asked(trial: Trial, lines: Sequence[Judgement]) -> int:
+def _restore_void_requests(trial: Trial, lines: Sequence[Judgement]) -> int:
     """The voids that were asked for, and their answers; how many rows were not there, or not answered."""
-    answers = {line.uuid: line.values() for line in lines if isinstance(line, VoidAnswerLine)}
-    asked = absent(VoidRequest, [line for line in lines if isinstance(line, VoidRequestLine)], trial=trial)
+    answers = {line.uuid: line.to_row_values() for line in lines if isinstance(line, VoidAnswerLine)}
+    asked = missing_rows(
+        VoidRequest, [line for line in lines if isinstance(line, VoidRequestLine)], trial=trial
+    )
     for line in asked:
-        VoidRequest.objects.create(trial=trial, **line.values(), **answers.get(line.uuid, {}))
+        VoidRequest.objects.create(trial=trial, **line.to_row_values(), **answers.get(line.uuid, {}))
     behind = VoidRequest.objects.filter(uuid__in=answers, answer="")
     for row in behind:
         VoidRequest.objects.filter(pk=row.pk).update(**answers[row.uuid])
@@ -286,13 +292,13 @@ def _asked(trial: Trial, lines: Sequence[Judgement]) -> int:
 def _publish(trial: Trial, *, made: bool) -> None:
     """Have it published where that may not have been done: the job is lost with the database."""
     episode = trial.episode
-    if trial.status not in lifecycle.JUDGED or episode is None or episode.status not in CLOSED:
+    if trial.status not in lifecycle.SCORED_STATES or episode is None or episode.status not in CLOSED:
         return
     if not made or episode.dataset_index is None:
-        episodes.publish_asked(episode=episode)
+        episodes.request_publish(episode=episode)
 
 
-def _count_on(model: type[Trial]) -> None:
+def _advance_sequence(model: type[Trial]) -> None:
     """Where the database counts apart from the rows, let it go on after the highest number given by us."""
     statements = connection.ops.sequence_reset_sql(no_style(), [model])
     with connection.cursor() as cursor:

@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from evaweb.canonical import difference
 from evaweb.errors import Conflict, EvaError
 from evaweb.races import once_more
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from evaweb.stations.surroundings import AREA
 from evaweb.trials.models import Milestone, Position, Scene
 from evaweb.trials.scene_reading import (
@@ -92,7 +92,7 @@ def scene_write(
     answer lost: nothing is written again. Raises NotAllowed, SceneRefused with every place that is wrong,
     ChangedMeanwhile. Nothing is written then.
     """
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     wanted = table_of(given)
     scene = Scene.objects.select_for_update().filter(name=name).first() if name is not None else Scene()
     if scene is None:

@@ -14,9 +14,9 @@ from django.db.models.functions import Cast
 from django.utils import timezone
 from django.utils.dateparse import parse_date, parse_datetime
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.errors import EvaError, NotFound
-from evaweb.memo import Kept
+from evaweb.memo import FingerprintCache
 from evaweb.stations.models import Command, Station
 from evaweb.statistics.proportions import Summary, summary
 from evaweb.trials import lifecycle
@@ -51,7 +51,7 @@ _SINCE_THERE_NO_SUCH_TIME = Pattern(
     "since = {given!r:.80}: there is no such time in UTC",
 )
 
-UNFINISHED = (*lifecycle.OPEN, TrialStatus.ENDED)
+UNFINISHED = (*lifecycle.OPEN_STATES, TrialStatus.ENDED)
 _Named = TypeVar("_Named", bound=Model)
 
 
@@ -63,7 +63,7 @@ def scene_get(*, name: str | int) -> Scene:
     return _by_name(Scene.objects.all(), "scene", name)
 
 
-def checkpoint_get(*, name: str | int, sight: Sight = EVERYTHING) -> Checkpoint:
+def checkpoint_get(*, name: str | int, sight: Visibility = FULL_VISIBILITY) -> Checkpoint:
     """The checkpoint of that name or id; NotFound lists those that there are. What is hidden is not there."""
     return _by_name(_checkpoints(sight), "checkpoint", name)
 
@@ -107,7 +107,7 @@ def checkpoint_used(checkpoint: Checkpoint) -> bool:
 
 
 def checkpoint_list(
-    *, all_of_them: bool = False, tag: str = "", sight: Sight = EVERYTHING
+    *, all_of_them: bool = False, tag: str = "", sight: Visibility = FULL_VISIBILITY
 ) -> QuerySet[Checkpoint]:
     """Checkpoints: those offered to operators, or all; those with that tag, if one is given; none that are hidden."""
     rows = _checkpoints(sight)
@@ -116,10 +116,12 @@ def checkpoint_list(
     return rows if all_of_them else rows.filter(active=True)
 
 
-def _checkpoints(sight: Sight) -> QuerySet[Checkpoint]:
+def _checkpoints(sight: Visibility) -> QuerySet[Checkpoint]:
     """Those that are not hidden, each without a parent that is."""
-    rows: QuerySet[Checkpoint] = sight.open(Checkpoint.objects.all(), "pk")
-    return rows.prefetch_related(Prefetch("parent", queryset=sight.open(Checkpoint.objects.all(), "pk")))
+    rows: QuerySet[Checkpoint] = sight.filter_visible(Checkpoint.objects.all(), "pk")
+    return rows.prefetch_related(
+        Prefetch("parent", queryset=sight.filter_visible(Checkpoint.objects.all(), "pk"))
+    )
 
 
 def evaluation_list() -> QuerySet[Evaluation]:
@@ -165,7 +167,7 @@ class TrialFilters:
     status: str = ""
     since: str = ""
 
-    def apply(self, trials: QuerySet[Trial], sight: Sight = EVERYTHING) -> QuerySet[Trial]:
+    def apply(self, trials: QuerySet[Trial], sight: Visibility = FULL_VISIBILITY) -> QuerySet[Trial]:
         """The trials that fit; raises NotFound or EvaError that names what is allowed.
 
         A checkpoint that is hidden from `sight` does not exist: a user who may ask which trials are of it knows it.
@@ -185,14 +187,14 @@ class TrialFilters:
         return trials
 
 
-def trial_list(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -> QuerySet[Trial]:
+def trial_list(filters: TrialFilters | None = None, sight: Visibility = FULL_VISIBILITY) -> QuerySet[Trial]:
     """Trials that fit, the newest first, with what names them."""
     rows = Trial.objects.select_related(*_NAMED, "verdict__rater").order_by("-prepared_at", "-pk")
     return (filters or TrialFilters()).apply(rows, sight)
 
 
 def trials_in_pages(
-    filters: TrialFilters, *, sight: Sight = EVERYTHING, size: int = 1000
+    filters: TrialFilters, *, sight: Visibility = FULL_VISIBILITY, size: int = 1000
 ) -> Iterator[list[Trial]]:
     """All trials that fit, the oldest first, a page at a time: for exports of any length."""
     rows = trial_list(filters, sight).order_by("pk").prefetch_related("verdict__outcomes")
@@ -236,13 +238,15 @@ class StatisticsRow:
     voided: int
 
 
-def statistics(filters: TrialFilters | None = None, sight: Sight = EVERYTHING) -> list[StatisticsRow]:
+def statistics(
+    filters: TrialFilters | None = None, sight: Visibility = FULL_VISIBILITY
+) -> list[StatisticsRow]:
     """Per scene and checkpoint, both by name: only scored trials count, what else was run is beside them.
 
     Trials of hidden checkpoints are left out.
     """
     which = filters or TrialFilters()
-    trials = which.apply(sight.open(Trial.objects.order_by()), sight)
+    trials = which.apply(sight.filter_visible(Trial.objects.order_by()), sight)
     cells = _cells(trials)
     others = _other_counts(trials)
     keys = {*cells, *others}
@@ -278,7 +282,7 @@ class _Known:
     recent: frozenset[_Row]
 
 
-_known: Kept[_Known] = Kept()
+_known: FingerprintCache[_Known] = FingerprintCache()
 
 
 def forget() -> None:

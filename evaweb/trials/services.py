@@ -12,16 +12,16 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Max
 
-from evaweb.episodes.selectors import unrecorded_because
-from evaweb.episodes.services import publish_asked
+from evaweb.episodes.selectors import why_unrecorded
+from evaweb.episodes.services import request_publish
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.journal import text
-from evaweb.roles import Role, require, role_of
-from evaweb.stations.commands import identity_of
+from evaweb.journal import clean_text
+from evaweb.roles import Role, require_role, role_of
+from evaweb.stations.commands import parse_command_uuid
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import lease_open
 from evaweb.trials import failures, lifecycle
-from evaweb.trials.lifecycle import Move
+from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,
@@ -33,10 +33,10 @@ from evaweb.trials.models import (
     Trial,
     TrialStatus,
 )
-from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, file_of
+from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, journal_uuid
 from evaweb.trials.selectors import attempts_of, trial_open
-from evaweb.trials.station_events import run_changed
-from evaweb.trials.verdicts import LONGEST_NOTE, Verdict, reached_in_truth, verdict
+from evaweb.trials.station_events import apply_station_event
+from evaweb.trials.verdicts import LONGEST_NOTE, ScoredOutcome, reached_in_truth, score_outcome
 from runtime.core.sentences import Pattern
 
 _PREPARED_AT_ONCE = Pattern(
@@ -102,17 +102,17 @@ _NO_REASON = Pattern(
 )
 
 __all__ = [
-    "checked",
-    "declare_check",
+    "abandon_trial",
+    "apply_station_event",
+    "create_trial",
     "declare_failing",
-    "declare_settled",
     "failing",
     "open_bench",
-    "run_changed",
-    "trial_abandon",
-    "trial_create",
-    "trial_prepare",
-    "trial_score",
+    "prepare_trial",
+    "register_check",
+    "register_settled",
+    "run_checks",
+    "score_trial",
 ]
 
 HIGHEST_SEED = 2**31 - 1
@@ -123,7 +123,7 @@ _failing: list[Callable[[Trial], str]] = []
 _TRIES = 5  # to get a number that nobody else takes at the same moment
 
 
-def declare_check(check: Check) -> None:
+def register_check(check: Check) -> None:
     """`check` is asked before a trial is "run", "scored", "voided" or the like, with the trial and the user.
 
     And of "judged" while the trial is locked, whenever its scene says what is success: scored, corrected, rated again.
@@ -135,7 +135,7 @@ def declare_check(check: Check) -> None:
     _checks.append(check)
 
 
-def declare_settled(told: Callable[[Trial, Any], None]) -> None:
+def register_settled(told: Callable[[Trial, Any], None]) -> None:
     """`told` hears of each trial that was scored, voided or abandoned, with the user, in the same transaction."""
     _settled.append(told)
 
@@ -150,7 +150,7 @@ def failing(trial: Trial) -> str:
     return next((why for rule in _failing if (why := rule(trial))), "")
 
 
-def checked(what: str, trial: Trial, user: Any) -> None:
+def run_checks(what: str, trial: Trial, user: Any) -> None:
     """Ask the declared checks."""
     for check in _checks:
         check(what, trial, user)
@@ -159,7 +159,7 @@ def checked(what: str, trial: Trial, user: Any) -> None:
 # --- preparing ---------------------------------------------------------------------------------------------
 
 
-def trial_prepare(
+def prepare_trial(
     *,
     user: User,
     station: Station,
@@ -173,7 +173,7 @@ def trial_prepare(
     It repeats the lowest number whose newest attempt does not count, as a new attempt; else it is the next
     number. Conflict where the station has a trial that is not finished, and says what to do about it.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _check_choice(station, scene, position, checkpoint, seed)
     for _ in range(_TRIES):
         try:
@@ -224,7 +224,7 @@ def _prepared(
         "position": position,
     }
     number, attempt = _next_attempt(key)
-    return trial_create(
+    return create_trial(
         user=user,
         station=station,
         evaluation=evaluation,
@@ -237,7 +237,7 @@ def _prepared(
     )
 
 
-def trial_create(
+def create_trial(
     *,
     user: User,
     station: Station,
@@ -255,7 +255,7 @@ def trial_create(
     Conflict where the station has a trial that is not finished, and says what to do about it. IntegrityError where
     there is one of this number and attempt.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     _check_choice(station, scene, position, checkpoint, seed)
     Station.objects.select_for_update().get(pk=station.pk)  # one at a time
     require_none_open(station)
@@ -296,7 +296,7 @@ def _next_attempt(key: Mapping[str, Any]) -> tuple[int, int]:
     for number, attempt, status in attempts.values_list("number", "attempt", "status"):
         newest[number] = (attempt, status)
     for number, (attempt, status) in newest.items():
-        if status in lifecycle.REPEATED:
+        if status in lifecycle.REPEATABLE_STATES:
             return number, attempt + 1
     return max(newest, default=0) + 1, 1
 
@@ -309,7 +309,7 @@ def seed_of(scene: Scene, position: Position, number: int) -> int:
 # --- judging -----------------------------------------------------------------------------------------------
 
 
-def trial_score(
+def score_trial(
     *,
     user: User,
     trial: Trial,
@@ -332,33 +332,33 @@ def trial_score(
     The same `uuid` again, or without one word by word what this rater said and counts already, is the first score,
     whose answer was lost: nothing is added. Conflict for a uuid that is another score's.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     if source not in Score.Source.values:
         raise EvaError(_SOURCE(source=source, values=", ".join(Score.Source.values)))
     words = {
-        "note": text("note", note, LONGEST_NOTE),
-        **failures.stripped(failure_phase=failure_phase, failure=failure),
-        "reason": text("reason", reason, LONGEST_NOTE),
+        "note": clean_text("note", note, LONGEST_NOTE),
+        **failures.clean_failure(failure_phase=failure_phase, failure=failure),
+        "reason": clean_text("reason", reason, LONGEST_NOTE),
     }
     with transaction.atomic():
-        checked("scored", trial, user)
-        held = locked(trial)
-        checked("judged", held, user)
+        run_checks("scored", trial, user)
+        held = lock_trial(trial)
+        run_checks("judged", held, user)
         rows = list(held.scene.milestones.order_by("order"))
         when = _times_before(held, rows, milestones) if times is None else times
         fails = bool(failing(held))
         judged = partial(
-            verdict, rows, milestones, success, times=when, ordered=held.scene.ordered, fails=fails
+            score_outcome, rows, milestones, success, times=when, ordered=held.scene.ordered, fails=fails
         )
         said = {"rater": user, "source": source, **words}
-        first = held.verdict if uuid is None else Score.objects.filter(uuid=identity_of(uuid)).first()
-        if first is not None and first.trial == held and _says(first, said, judged()):
+        first = held.verdict if uuid is None else Score.objects.filter(uuid=parse_command_uuid(uuid)).first()
+        if first is not None and first.trial == held and _is_same_score(first, said, judged()):
             return first
         if first is not None and uuid is not None:
             raise Conflict(_UUID_OF_ANOTHER_SCORE(uuid=uuid, trial_id=first.trial_id))
         require_scorable(held, words["reason"])
         found = judged()
-        checked(f"judged {'success' if found.success else 'failure'}", held, user)
+        run_checks(f"judged {'success' if found.success else 'failure'}", held, user)
         if uuid is None:
             _require_said_anew(held, said, found)
         if source == Score.Source.TRUTH:
@@ -368,61 +368,63 @@ def trial_score(
             words,
             success=found.success,
             by_person=source == Score.Source.HUMAN,
-            said=failures.said_of(held.verdict),
+            said=failures.score_failure(held.verdict),
         )
         if held.status == TrialStatus.SCORED and _judges_alike(held.verdict, found):
-            checked("reworded", held, user)
+            run_checks("reworded", held, user)
         elif held.verdict is not None:
             require_own(held, user)
-        score = Score(uuid=identity_of(uuid), trial=held, success=found.success, score=found.score, **said)
+        score = Score(
+            uuid=parse_command_uuid(uuid), trial=held, success=found.success, score=found.score, **said
+        )
         counts_now(held, score, _outcomes(score, found), user)
     trial.refresh_from_db()
     return score
 
 
-def trial_abandon(*, user: User, trial: Trial, reason: str = "") -> Trial:
+def abandon_trial(*, user: User, trial: Trial, reason: str = "") -> Trial:
     """Give up a trial that never ran; its number is given out again as another attempt."""
-    require(user, Role.OPERATOR)
-    why = text("reason", reason, LONGEST_NOTE) or "abandoned"
+    require_role(user, Role.OPERATOR)
+    why = clean_text("reason", reason, LONGEST_NOTE) or "abandoned"
     with transaction.atomic():
-        held = locked(trial)
+        held = lock_trial(trial)
         why = f"{why} ({user.get_username()})"
         if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
             return held  # asked for once more, because the answer was lost
         require_own(held, user)
-        lifecycle.apply(held, Move.ABANDON)
+        lifecycle.apply(held, Transition.ABANDON)
         held.reason = why
         held.save()
-        settled(held, user)
+        notify_settled(held, user)
     trial.refresh_from_db()
     return trial
 
 
-def publish(trial: Trial) -> None:
+def request_publication(trial: Trial) -> None:
     """Have its episode written into the dataset with what counts now."""
     if trial.episode is not None:
-        publish_asked(episode=trial.episode)
+        request_publish(episode=trial.episode)
 
 
-def settled(trial: Trial, user: Any) -> None:
+def notify_settled(trial: Trial, user: Any) -> None:
     """Tell whoever declared to hear of it."""
     for told in _settled:
         told(trial, user)
 
 
-def locked(trial: Trial) -> Trial:
+def lock_trial(trial: Trial) -> Trial:
     """The trial's row as it is now, kept from others until the transaction ends."""
     return Trial.objects.select_for_update().get(pk=trial.pk)
 
 
-def _require_said_anew(trial: Trial, said: Mapping[str, Any], found: Verdict) -> None:
+def _require_said_anew(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
     """Conflict where it may be an earlier score that comes late: it must not take the place of what corrected it."""
     before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
-    if any(_says(score, said, found) for score in before):
+    if any(_is_same_score(score, said, found) for score in before):
         raise Conflict(_SAID_BEFORE(trial=trial.pk))
 
 
-def _require_truth(trial: Trial, found: Verdict) -> None:
+def _require_truth(trial: Trial, found: ScoredOutcome) -> None:
     """EvaError unless the bench of the trial says the same: nobody says more in its name."""
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
@@ -434,7 +436,7 @@ def _require_truth(trial: Trial, found: Verdict) -> None:
             )
 
 
-def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:
+def _is_same_score(score: Score, said: Mapping[str, Any], found: ScoredOutcome) -> bool:
     """True if that score is word by word what is said now."""
     outcomes = {outcome.milestone_id: (outcome.reached, outcome.at_s) for outcome in score.outcomes.all()}
     same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in found.reached}
@@ -442,7 +444,7 @@ def _says(score: Score, said: Mapping[str, Any], found: Verdict) -> bool:
     return same and words and score.success == found.success
 
 
-def _judges_alike(score: Score | None, found: Verdict) -> bool:
+def _judges_alike(score: Score | None, found: ScoredOutcome) -> bool:
     """True if that score has the same milestones and success: what is new are words."""
     if score is None or score.success != found.success:
         return False
@@ -467,7 +469,7 @@ def _times_before(
 
 def require_scorable(trial: Trial, reason: str) -> None:
     """Conflict or EvaError says why a score, a correction for that `reason`, cannot be added."""
-    lifecycle.require(trial, Move.SCORE)
+    lifecycle.require(trial, Transition.SCORE)
     if trial.status == TrialStatus.SCORED and not reason:
         raise EvaError(_SCORED_ALREADY(trial=trial.pk))
     if trial.status == TrialStatus.INTERRUPTED and _repeated(trial):
@@ -475,7 +477,7 @@ def require_scorable(trial: Trial, reason: str) -> None:
     other = attempts_of(trial=trial).filter(status=TrialStatus.SCORED).exclude(pk=trial.pk).first()
     if other is not None:  # as where this one had been given up, and its run turns out to have been accepted
         raise Conflict(_ANOTHER_COUNTS(other=other.pk, trial=trial.pk))
-    unrecorded = "" if trial.status == TrialStatus.SCORED else unrecorded_because(episode=trial.episode)
+    unrecorded = "" if trial.status == TrialStatus.SCORED else why_unrecorded(episode=trial.episode)
     if unrecorded:
         raise Conflict(_NEVER_RAN(trial=trial.pk, unrecorded=unrecorded))
 
@@ -495,7 +497,7 @@ def _repeated(trial: Trial) -> bool:
     return bool(newest > trial.attempt)
 
 
-def _outcomes(score: Score, found: Verdict) -> list[MilestoneOutcome]:
+def _outcomes(score: Score, found: ScoredOutcome) -> list[MilestoneOutcome]:
     return [
         MilestoneOutcome(
             score=score,
@@ -514,18 +516,18 @@ def _outcomes(score: Score, found: Verdict) -> list[MilestoneOutcome]:
 def counts_now(trial: Trial, score: Score, outcomes: Sequence[MilestoneOutcome], user: User) -> None:
     """Keep a new score with its outcomes, which counts from then on: disk first, then the rows, then publication."""
     milestones = [OutcomeLine.written(outcome) for outcome in outcomes]
-    JUDGEMENTS.append(file_of(trial), ScoreLine.written(score, milestones=milestones))
+    JUDGEMENTS.append(journal_uuid(trial), ScoreLine.written(score, milestones=milestones))
     score.save()
     MilestoneOutcome.objects.bulk_create(outcomes)
-    lifecycle.apply(trial, Move.SCORE)
+    lifecycle.apply(trial, Transition.SCORE)
     trial.verdict = score
     trial.save()
-    publish(trial)
-    settled(trial, user)
+    request_publication(trial)
+    notify_settled(trial, user)
 
 
-def reason_given(reason: str, when: str) -> str:
-    why = text("reason", reason, LONGEST_NOTE)
+def require_reason(reason: str, when: str) -> str:
+    why = clean_text("reason", reason, LONGEST_NOTE)
     if not why:
         raise EvaError(_NO_REASON(when=when))
     return why

@@ -12,19 +12,19 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from django.db import transaction
 
-from evaweb.binary_frames import plain
-from evaweb.blinding import sight_of
+from evaweb.binary_frames import to_json_value
+from evaweb.blinding import visibility_for_user
 from evaweb.errors import Conflict, EvaError
-from evaweb.roles import Role, require
-from evaweb.stations.commands import TABLES, identity_of, issue
+from evaweb.roles import Role, require_role
+from evaweb.stations.commands import TABLES, issue_command, parse_command_uuid
 from evaweb.stations.models import CARRIED_OUT, NOT_CARRIED_OUT, Command
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from evaweb.stations.selectors import last_set_up
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Checkpoint, Trial, TrialStatus
 from evaweb.trials.record import TrialRecord
-from evaweb.trials.services import checked
-from evaweb.trials.station_events import run_begun
+from evaweb.trials.services import run_checks
+from evaweb.trials.station_events import begin_run
 from evaweb.trials.tables import simulated_bench
 from runtime.core.sentences import Pattern, fixed
 
@@ -84,8 +84,8 @@ def trial_command(
     Never within a transaction. An accepted run has begun: its episode has a row. Raises Conflict where the
     trial is not prepared, or the station was last set up for something else.
     """
-    require(user, Role.OPERATOR)
-    identity = identity_of(uuid)
+    require_role(user, Role.OPERATOR)
+    identity = parse_command_uuid(uuid)
     given = {
         "user": user,
         "station": trial.station,
@@ -100,21 +100,21 @@ def trial_command(
         return _set_up(trial, given)
     if kind == "run":
         return _run(trial, given)
-    return issue(**given, args=dict(args or {}))
+    return issue_command(**given, args=dict(args or {}))
 
 
 def checkpoint_command(
     *, user: User, checkpoint: Checkpoint, kind: str, args: Mapping[str, Any] | None = None, **given: Any
 ) -> Command:
     """Set a station up for a checkpoint, for no trial; `given` as in `issue`. Raises EvaError for other commands."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     if kind != "setup":
         raise EvaError(_CHECKPOINT_OF_SETUP_ALONE(kind=kind))
     if "policy" in (args or {}) or "checkpoint" in (args or {}):
         raise EvaError(_NAMED_TWICE)
     if not checkpoint.active:
         raise Conflict(_CHECKPOINT_OFF(name=checkpoint.name))
-    return issue(
+    return issue_command(
         user=user, kind=kind, args={**(args or {}), **_policy_args(checkpoint)}, vouched=TABLES, **given
     )
 
@@ -128,7 +128,7 @@ Least = Callable[[Trial], Mapping[str, float] | None]
 _least: list[Least] = []
 
 
-def declare_least(find: Least) -> None:
+def register_min_stage_times(find: Least) -> None:
     """`find` says how long the policy's stages of a trial's set-up last at least, None: as long as they take."""
     _least.append(find)
 
@@ -152,7 +152,7 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
 def run_args(trial: Trial, user: User) -> dict[str, Any]:
     """Facts for the episode's manifest, and when the run ends by itself; never simulated or by steps."""
     args: dict[str, Any] = {
-        "trial": TrialRecord.asked(trial),
+        "trial": TrialRecord.for_manifest(trial),
         "operator": user.get_username(),
         "mode": "continuous",
     }
@@ -167,12 +167,14 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
         _require_prepared(trial, "set up", given["user"])
     args = setup_args(trial, given["uuid"])
     if first is not None:
-        _require_same(first, trial, trial.setup == first.pk or _asked(first.args) == _asked(plain(args)))
+        _require_same(
+            first, trial, trial.setup == first.pk or _asked(first.args) == _asked(to_json_value(args))
+        )
         args = first.args
-    row = issue(**given, args=args, vouched=TABLES)
+    row = issue_command(**given, args=args, vouched=TABLES)
     if row.status not in NOT_CARRIED_OUT:
         with transaction.atomic():
-            held = _held(trial)
+            held = _lock_trial(trial)
             if held.status == TrialStatus.PREPARED:
                 held.setup = row.pk
                 held.save()
@@ -192,14 +194,14 @@ def _run(trial: Trial, given: Mapping[str, Any]) -> Command:
         _require_set_up(trial)
         took = _require_loaded(trial, given["user"])
         Trial.objects.filter(pk=trial.pk).update(setup_took=took)
-        checked("run", trial, given["user"])
+        run_checks("run", trial, given["user"])
     else:
         _require_same(first, trial, _is_about(first, trial))
     args = first.args if first else run_args(trial, given["user"])
-    row = issue(**given, args=args)
+    row = issue_command(**given, args=args)
     if row.status in CARRIED_OUT:
         with transaction.atomic():
-            run_begun(_held(trial), command=row, episode=_episode_of(row))
+            begin_run(_lock_trial(trial), command=row, episode=_episode_of(row))
     trial.refresh_from_db()
     return row
 
@@ -210,9 +212,11 @@ def _require_prepared(trial: Trial, what: str, user: User) -> None:
         raise Conflict(
             _NOT_IN_THIS_STATE(trial=trial.pk, label=status.label, what=what, advice=lifecycle.advice(status))
         )
-    checked("prepared", trial, user)
+    run_checks("prepared", trial, user)
     if not trial.checkpoint.active:
-        raise Conflict(_CHECKPOINT_OFF_SINCE(label=sight_of(user).label(trial), trial=trial.pk))
+        raise Conflict(
+            _CHECKPOINT_OFF_SINCE(label=visibility_for_user(user).checkpoint_label(trial), trial=trial.pk)
+        )
 
 
 def _require_set_up(trial: Trial) -> None:
@@ -230,14 +234,14 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
 
     What changes after this look makes the run stale, which the station refuses by itself. How long its policy took.
     """
-    status = wire_to(trial.station.name).status()
+    status = connection_to(trial.station.name).status()
     told = status.get("checkpoint") or {}
     if told.get("id") != trial.checkpoint_id:
-        seen = sight_of(user)
+        seen = visibility_for_user(user)
         other = "another checkpoint" if told.get("id") in seen.checkpoints else told.get("name")
         raise Conflict(
             _SET_UP_BY_SOMEONE(
-                name=trial.station.name, other=other or "no checkpoint", label=seen.label(trial)
+                name=trial.station.name, other=other or "no checkpoint", label=seen.checkpoint_label(trial)
             )
         )
     took = status.get("setup_took")
@@ -259,7 +263,7 @@ def _episode_of(row: Command) -> UUID | None:
     return UUID(episode) if episode else None
 
 
-def _held(trial: Trial) -> Trial:
+def _lock_trial(trial: Trial) -> Trial:
     return Trial.objects.select_for_update().get(pk=trial.pk)
 
 

@@ -15,19 +15,21 @@ from django.db import transaction
 from django.utils import timezone
 
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.services import episode_opened, publish_asked
-from evaweb.stations.commands import settle
+from evaweb.episodes.services import record_opened, request_publish
+from evaweb.stations.commands import resolve_unknown_outcome
 from evaweb.stations.models import Command, Station
 from evaweb.trials import lifecycle
 from evaweb.trials.endings import ending_of
-from evaweb.trials.lifecycle import Move
+from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import Trial, TrialStatus
 from runtime.ipc.session_state import SessionState
 
 log = logging.getLogger(__name__)
 
 
-def run_changed(*, station: Station, event: Mapping[str, Any], boot: str | None = None) -> Trial | None:
+def apply_station_event(
+    *, station: Station, event: Mapping[str, Any], boot: str | None = None
+) -> Trial | None:
     """Take one row of a station's event log; the trial that it changed, or None.
 
     `event`: number, kind, text, time [s, the runtime's clock], data. `boot`: of the runtime that numbered it.
@@ -42,13 +44,13 @@ def run_changed(*, station: Station, event: Mapping[str, Any], boot: str | None 
         if kind == "state":
             return _state_entered(station, event, boot)
         if kind == "truth":
-            return _truth_told(station, event)
+            return _record_truth(station, event)
         if kind == "episode_closed":
             return _episode_closed(station, event)
     return None
 
 
-def run_begun(trial: Trial, *, command: Command, episode: UUID | None) -> None:
+def begin_run(trial: Trial, *, command: Command, episode: UUID | None) -> None:
     """The station has accepted the command to run: at the answer, or where that was lost, at the event.
 
     The caller holds the trial's row. Taken twice it changes nothing, nor does that of a run that never began.
@@ -56,7 +58,7 @@ def run_begun(trial: Trial, *, command: Command, episode: UUID | None) -> None:
     if Command.objects.filter(pk=command.pk).exclude(unopened="").exists():
         return
     if trial.run is None and _may_begin(trial):
-        lifecycle.apply(trial, Move.RUN)
+        lifecycle.apply(trial, Transition.RUN)
         trial.run, trial.run_boot, trial.reason = command.pk, command.boot, ""
         trial.started_at = timezone.now()
         trial.operator = command.user or trial.operator
@@ -66,15 +68,17 @@ def run_begun(trial: Trial, *, command: Command, episode: UUID | None) -> None:
 
 
 def _may_begin(trial: Trial) -> bool:
-    others = Trial.objects.filter(station=trial.station, status__in=lifecycle.OPEN).exclude(pk=trial.pk)
-    if lifecycle.allows(trial, Move.RUN) and not others.exists():
+    others = Trial.objects.filter(station=trial.station, status__in=lifecycle.OPEN_STATES).exclude(
+        pk=trial.pk
+    )
+    if lifecycle.allows(trial, Transition.RUN) and not others.exists():
         return True
     log.error("trial %s is %s, but %s accepted its run", trial.pk, trial.status, trial.station.name)
     return False
 
 
 def _episode(trial: Trial, uuid: UUID) -> Episode:
-    return episode_opened(
+    return record_opened(
         station=trial.station,
         uuid=uuid,
         task=trial.instruction,
@@ -95,9 +99,9 @@ def _find_trial_of(station: Station, episode: UUID | None) -> None:
     )
     if trial is None or command is None:
         return
-    if _uuid(settle(row=command).data.get("episode")) == episode:
+    if _uuid(resolve_unknown_outcome(row=command).data.get("episode")) == episode:
         with transaction.atomic():
-            run_begun(Trial.objects.select_for_update().get(pk=trial.pk), command=command, episode=episode)
+            begin_run(Trial.objects.select_for_update().get(pk=trial.pk), command=command, episode=episode)
 
 
 def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
@@ -108,10 +112,10 @@ def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | Non
         return None
     command = Command.objects.filter(pk=_uuid(data.get("uuid")), station=station, kind="run").first()
     asked = (command.args.get("trial") or {}) if command else {}
-    trial = _held(uuid=_uuid(asked.get("uuid")), station=station) if asked else None
+    trial = _lock_latest(uuid=_uuid(asked.get("uuid")), station=station) if asked else None
     if command is None or trial is None or trial.run_event is not None:
         return None
-    run_begun(trial, command=command, episode=_uuid(command.data.get("episode")))
+    begin_run(trial, command=command, episode=_uuid(command.data.get("episode")))
     if trial.run != command.pk:
         return None
     trial.run_boot, trial.run_event = boot, event["number"]
@@ -123,38 +127,38 @@ def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | Non
 def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
     data = event.get("data") or {}
     state = data.get("state") or data.get("to")
-    trial = _held(station=station, status__in=lifecycle.UNDER_WAY)
+    trial = _lock_latest(station=station, status__in=lifecycle.RUNNING_STATES)
     if trial is None or not state:
         return None
     if trial.run_boot != boot:
         return _runtime_restarted(trial)
     if trial.run_event is None or event["number"] <= trial.run_event:
         return None
-    move = _meaning(state, data.get("unbegun") or {})
+    move = _transition_for(state, data.get("unbegun") or {})
     if not lifecycle.allows(trial, move):  # it is there already
         return None
-    if move is Move.GIVE_BACK:
-        _given_back(trial, _reason(event))
+    if move is Transition.GIVE_BACK:
+        _reset_to_prepared(trial, _reason(event))
     else:
-        _moved(trial, move, _reason(event), _time(event))
+        _apply_transition(trial, move, _reason(event), _time(event))
         trial.run_event = event["number"]
     trial.save()
     return trial
 
 
-def _meaning(state: str, unbegun: Mapping[str, Any]) -> Move:
+def _transition_for(state: str, unbegun: Mapping[str, Any]) -> Transition:
     """A run that never began is no attempt: it is made again as it is where nothing of it was opened, else repeated."""
     if unbegun:
-        return Move.GIVE_BACK if unbegun.get("unopened") else Move.INTERRUPT
+        return Transition.GIVE_BACK if unbegun.get("unopened") else Transition.INTERRUPT
     session = SessionState.meaning_of(state)
     if session is None or not session.set_up:
-        return Move.INTERRUPT
-    return Move.END if session.ready else Move.RESUME if session.moving else Move.PAUSE
+        return Transition.INTERRUPT
+    return Transition.END if session.ready else Transition.RESUME if session.moving else Transition.PAUSE
 
 
-def _given_back(trial: Trial, reason: str) -> None:
+def _reset_to_prepared(trial: Trial, reason: str) -> None:
     """It is as it was before its run was asked for, and says why."""
-    lifecycle.apply(trial, Move.GIVE_BACK)
+    lifecycle.apply(trial, Transition.GIVE_BACK)
     trial.run = trial.run_event = trial.run_since = trial.episode = None
     trial.started_at = trial.duration_s = trial.ended_by = None
     trial.run_boot, trial.reason = "", reason
@@ -164,32 +168,36 @@ def _runtime_restarted(trial: Trial) -> Trial:
     """Its events are lost: what the recording says counts."""
     episode = trial.episode
     if episode is not None and episode.status == EpisodeStatus.FINISHED and episode.frames:
-        _moved(trial, Move.END, episode.reason or "ended while the web was away", None)
+        _apply_transition(trial, Transition.END, episode.reason or "ended while the web was away", None)
         trial.duration_s = episode.duration_s
     else:
-        _moved(trial, Move.INTERRUPT, "the station was restarted during the run", None)
+        _apply_transition(trial, Transition.INTERRUPT, "the station was restarted during the run", None)
     trial.save()
     return trial
 
 
-def _moved(trial: Trial, move: Move, reason: str, time: float | None) -> None:
+def _apply_transition(trial: Trial, move: Transition, reason: str, time: float | None) -> None:
     """Apply the move; the clock stands while the trial is paused. `time` [s] None: not known."""
     if trial.run_since is not None and time is not None:
         trial.duration_s = (trial.duration_s or 0.0) + max(0.0, time - trial.run_since)
     lifecycle.apply(trial, move)
     trial.run_since = time if trial.status == TrialStatus.RUNNING else None
-    trial.reason = "" if move is Move.RESUME else reason
-    if move in (Move.END, Move.INTERRUPT):
+    trial.reason = "" if move is Transition.RESUME else reason
+    if move in (Transition.END, Transition.INTERRUPT):
         trial.ended_at = timezone.now()
         # What ended the run stays, whatever becomes of its recording.
-        trial.ended_by = trial.ended_by or ending_of(move is Move.INTERRUPT, reason)
+        trial.ended_by = trial.ended_by or ending_of(move is Transition.INTERRUPT, reason)
 
 
-def _truth_told(station: Station, event: Mapping[str, Any]) -> Trial | None:
+def _record_truth(station: Station, event: Mapping[str, Any]) -> Trial | None:
     """Note the state of the simulated bench at the end of an episode."""
     data = dict(event.get("data") or {})
-    trial = _held(station=station, episode_id=_uuid(data.get("episode")))
-    if trial is None or trial.truth == data or (trial.truth is not None and trial.status in lifecycle.JUDGED):
+    trial = _lock_latest(station=station, episode_id=_uuid(data.get("episode")))
+    if (
+        trial is None
+        or trial.truth == data
+        or (trial.truth is not None and trial.status in lifecycle.SCORED_STATES)
+    ):
         return None
     trial.truth = data
     trial.save()
@@ -199,29 +207,31 @@ def _truth_told(station: Station, event: Mapping[str, Any]) -> Trial | None:
 def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
     """The recording is on disk: its duration is the exact one, and what is not whole is interrupted."""
     data = event.get("data") or {}
-    trial = _held(station=station, episode_id=_uuid(data.get("uuid")))
+    trial = _lock_latest(station=station, episode_id=_uuid(data.get("uuid")))
     if trial is None or data.get("waits"):  # for room on the disk: it is told again when it is closed
         return None
-    if data.get("rows") == 0 and lifecycle.allows(trial, Move.INTERRUPT):
-        _moved(trial, Move.INTERRUPT, f"nothing of it was recorded: {data.get('reason')}", _time(event))
+    if data.get("rows") == 0 and lifecycle.allows(trial, Transition.INTERRUPT):
+        _apply_transition(
+            trial, Transition.INTERRUPT, f"nothing of it was recorded: {data.get('reason')}", _time(event)
+        )
     _closed_as(trial, str(data.get("status")), str(data.get("reason") or ""), _time(event))
     if trial.episode is not None and trial.episode.duration_s is not None:
         trial.duration_s = trial.episode.duration_s
     trial.save()
-    if trial.episode is not None and trial.status in lifecycle.JUDGED:
-        publish_asked(episode=trial.episode)  # it was judged before its recording was on disk
+    if trial.episode is not None and trial.status in lifecycle.SCORED_STATES:
+        request_publish(episode=trial.episode)  # it was judged before its recording was on disk
     return trial
 
 
 def _closed_as(trial: Trial, status: str, reason: str, time: float | None) -> None:
     if status == EpisodeStatus.FINISHED:
-        if trial.status in lifecycle.UNDER_WAY:
-            _moved(trial, Move.END, reason, time)
-    elif lifecycle.allows(trial, Move.INTERRUPT):
-        _moved(trial, Move.INTERRUPT, f"its recording is {status}: {reason}", time)
+        if trial.status in lifecycle.RUNNING_STATES:
+            _apply_transition(trial, Transition.END, reason, time)
+    elif lifecycle.allows(trial, Transition.INTERRUPT):
+        _apply_transition(trial, Transition.INTERRUPT, f"its recording is {status}: {reason}", time)
 
 
-def _held(**key: Any) -> Trial | None:
+def _lock_latest(**key: Any) -> Trial | None:
     """The newest such trial, its row kept from others until the transaction ends."""
     if any(value is None for name, value in key.items() if name in ("uuid", "episode_id")):
         return None

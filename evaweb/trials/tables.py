@@ -41,7 +41,7 @@ def _check_kinds(given: object, kinds: Mapping[str, type[pydantic.BaseModel]], e
         raise ValidationError(f"kind = {wanted!r}; allowed: {', '.join(kinds)}")
     problems = {kind: _problems(given, kinds[kind]) for kind in ([wanted] if wanted else kinds)}
     if all(problems.values()):
-        raise ValidationError(problems[max(problems, key=lambda kind: _likeness(given, kinds[kind]))])
+        raise ValidationError(problems[max(problems, key=lambda kind: _matching_keys(given, kinds[kind]))])
 
 
 def check_tags(given: object) -> None:
@@ -142,7 +142,7 @@ def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
     return []
 
 
-def _likeness(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
+def _matching_keys(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
     """Number of keys that are, or nearly are, those of this kind; of two alike, the kind with more keys."""
     near = [key for key in given if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)

@@ -63,7 +63,7 @@ LONGEST_RUN_S = 24 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ScoredOutcome:
     """Which milestones were reached and when [s], the share of their points, and whether that is a success."""
 
     reached: tuple[tuple[Milestone, bool, float | None], ...]
@@ -71,7 +71,7 @@ class Verdict:
     success: bool
 
 
-def verdict(
+def score_outcome(
     milestones: Sequence[Milestone],
     ticks: Mapping[object, object],
     success: bool | None,
@@ -79,7 +79,7 @@ def verdict(
     times: Mapping[object, object] | None = None,
     ordered: bool = False,
     fails: bool = False,
-) -> Verdict:
+) -> ScoredOutcome:
     """The verdict on one trial from `ticks`: milestone id -> reached, one for each of the scene's milestones.
 
     `times`: milestone id -> when it was reached [s after the start of the run], as far as that is known; one reached
@@ -94,13 +94,13 @@ def verdict(
     reached = tuple((m, answers[m.pk], when.get(m.pk)) for m in milestones)
     if ordered:
         _require_order(reached)
-    implied = False if fails and not success else _implied(reached)
+    implied = False if fails and not success else _implied_success(reached)
     if implied is None and success is None:
         raise EvaError(_SUCCESS_MISSING_NO_MILESTONE_THIS)
     if implied is not None and success is not None and success != implied:
         raise EvaError(_SUCCESS_CONTRADICTS_REQUIRED_MILESTONES_WHICH(success=success, implied=implied))
     final = bool(success if implied is None else implied)
-    return Verdict(reached, _share(reached, final), final)
+    return ScoredOutcome(reached, _share(reached, final), final)
 
 
 def reached_in_truth(truth: Mapping[str, Any], milestone: Milestone) -> bool | None:
@@ -161,7 +161,7 @@ def _require_order(reached: Sequence[tuple[Milestone, bool, float | None]]) -> N
         missed, last = missed or ("" if done else milestone.text), at if at is not None else last
 
 
-def _implied(reached: Sequence[tuple[Milestone, bool, float | None]]) -> bool | None:
+def _implied_success(reached: Sequence[tuple[Milestone, bool, float | None]]) -> bool | None:
     required = [done for milestone, done, _ in reached if milestone.required]
     return all(required) if required else None
 

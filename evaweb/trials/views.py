@@ -11,17 +11,17 @@ from django.http import HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.blinding import Sight, sight_for
-from evaweb.episodes.selectors import stage_of
+from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.episodes.selectors import playback_stage
 from evaweb.errors import EvaError, NotAllowed
 from evaweb.lists import DAY, Column, Filter, Listing
 from evaweb.roles import Role, role_of
 from evaweb.stations.selectors import station_list
 from evaweb.trials import failures, lifecycle, selectors, services, voids
 from evaweb.trials.figures import scene_figures
-from evaweb.trials.lifecycle import Move
+from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.record import labelled
+from evaweb.trials.record import visible_labels
 from evaweb.trials.selectors import TrialFilters
 
 PER_PAGE = 50
@@ -30,7 +30,7 @@ PER_PAGE = 50
 @require_GET
 def result(request: HttpRequest) -> HttpResponse:
     """Success per scene and checkpoint, then the trials; filters and order are in the address."""
-    seen = sight_for(request)
+    seen = visibility_for_request(request)
     listing = Listing(request.GET, _columns(seen), _filters(seen))
     filters = TrialFilters(**listing.chosen)
     try:
@@ -62,7 +62,7 @@ def score(request: HttpRequest, id: int) -> HttpResponse:
     milestones = {key: str(key) in ticked for key in found.scene.milestones.values_list("pk", flat=True)}
     given = {name: request.POST.get(name, "") for name in ("note", "reason", *failures.FIELDS)}
     try:
-        services.trial_score(
+        services.score_trial(
             user=request.user,  # type: ignore[arg-type]
             trial=found,
             milestones=milestones,
@@ -81,7 +81,7 @@ def void(request: HttpRequest, id: int) -> HttpResponse:
     """Take it out of the count."""
     reason = request.POST.get("void_reason", "")
     try:
-        voids.trial_void(
+        voids.void_trial(
             user=request.user,  # type: ignore[arg-type]
             trial=selectors.trial_get(id=id),
             reason=reason,
@@ -95,7 +95,7 @@ def void(request: HttpRequest, id: int) -> HttpResponse:
 def void_answer(request: HttpRequest, id: int) -> HttpResponse:
     """Agree to its void, or refuse it."""
     try:
-        voids.void_answer(
+        voids.answer_void(
             user=request.user,  # type: ignore[arg-type]
             trial=selectors.trial_get(id=id),
             agree=request.POST.get("agree") == "yes",
@@ -115,36 +115,36 @@ def _trial_page(
     request: HttpRequest, id: int, fault: EvaError | None = None, typed: Mapping[str, Any] | None = None
 ) -> HttpResponse:
     found = selectors.trial_get(id=id)
-    hidden = sight_for(request).hides(found)
+    hidden = visibility_for_request(request).hides(found)
     operator = role_of(request.user) is not Role.VIEWER
     milestones = list(found.scene.milestones.order_by("order"))
     typed = typed or _as_scored(found)
     context = {
         "trial": found,
         "episode": found.episode,
-        "stage": stage_of(episode=found.episode) if found.episode else None,
+        "stage": playback_stage(episode=found.episode) if found.episode else None,
         "scores": list(found.scores.all()),
         "truth": () if hidden and not found.verdict_id else _truth(found),
-        "milestones": [(milestone, _ticked(found, milestone.pk, typed)) for milestone in milestones],
+        "milestones": [(milestone, _is_checked(found, milestone.pk, typed)) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
         "fails": services.failing(found),
-        "may_score": operator and lifecycle.allows(found, Move.SCORE),
+        "may_score": operator and lifecycle.allows(found, Transition.SCORE),
         "words_alone": _words_alone(found, request.user) if found.verdict_id else "",
         "may_void": operator
-        and lifecycle.allows(found, Move.VOID)
+        and lifecycle.allows(found, Transition.VOID)
         and found.status != TrialStatus.VOID_ASKED,
-        "by_two": voids.by_two(found),
+        "by_two": voids.needs_two_people(found),
         "void_requests": list(found.void_requests.all()),
-        "may_answer": operator and voids.may_answer(found, request.user),
+        "may_answer": operator and voids.can_answer_void(found, request.user),
         "attempts": selectors.attempts_of(trial=found),
         # When a set-up was asked for and the run could begin tells how long a policy warms up.
         "commands": () if hidden else selectors.commands_of(trial=found),
         "hidden": hidden,
-        "laid_out": laid_out(found),
-        "further": labelled(found, sight_for(request)),
+        "laid_out": bench_images(found),
+        "further": visible_labels(found, visibility_for_request(request)),
         "fault": fault,
         "typed": typed,
-        "failures": failures.offered(typed),
+        "failures": failures.failure_choices(typed),
         "uuid": uuid4(),  # of the score that may be sent from this page, and then be sent again
     }
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
@@ -159,7 +159,7 @@ def _words_alone(trial: Trial, user: Any) -> str:
     return ""
 
 
-def laid_out(trial: Trial) -> list[Any]:
+def bench_images(trial: Trial) -> list[Any]:
     """Pictures of the cameras before the run, the newest look at each; bound to trials by evaweb.plans."""
     newest: dict[str, Any] = {}
     for row in trial.achieved.select_related("reference", "by").order_by("pk"):
@@ -167,7 +167,7 @@ def laid_out(trial: Trial) -> list[Any]:
     return list(newest.values())
 
 
-def _ticked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
+def _is_checked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
     """True if its box is ticked: as it was typed, else as it was last scored."""
     if typed and "milestones" in typed:
         return bool(typed["milestones"].get(milestone))
@@ -181,10 +181,10 @@ def _as_scored(trial: Trial) -> dict[str, Any]:
     if verdict is None:
         return {}
     success = "yes" if verdict.success else "no"
-    return {"note": verdict.note, "success": success, **failures.said_of(verdict)}
+    return {"note": verdict.note, "success": success, **failures.score_failure(verdict)}
 
 
-def _filters(sight: Sight) -> list[Filter]:
+def _filters(sight: Visibility) -> list[Filter]:
     """What the list of trials is narrowed by; TrialFilters says what it does not know."""
     scenes = selectors.scene_list(all_of_them=True).prefetch_related(None)
     checkpoints = selectors.checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None)
@@ -204,15 +204,15 @@ def _filters(sight: Sight) -> list[Filter]:
     ]
 
 
-def _columns(sight: Sight) -> list[Column]:
+def _columns(sight: Visibility) -> list[Column]:
     """By checkpoint it is sorted only where none is hidden: the order of codes would tell which are of one."""
     return [
         Column("trial", "Trial", ("pk",), down=True),
         Column("prepared", "Prepared", ("prepared_at",), down=True),
         Column("scene", "Scene", ("scene__title", "position__number")),
         Column("position", "Position", ("position__number",), number=True),
-        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if sight.clear else ()),
-        Column("number", "No.", ("number", "attempt") if sight.clear else (), number=True),
+        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if sight.sees_everything else ()),
+        Column("number", "No.", ("number", "attempt") if sight.sees_everything else (), number=True),
         Column("status", "Status", ("status",)),
         Column("success", "Success", ("verdict__success",), down=True),
         Column("score", "Score", ("verdict__score",), number=True),

@@ -17,18 +17,18 @@ from django.db.models import QuerySet
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.roles import Role, require
+from evaweb.roles import Role, require_role
 from evaweb.trials import lifecycle
-from evaweb.trials.lifecycle import Move
+from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import Trial, TrialStatus, VoidRequest
 from evaweb.trials.record import (
     JUDGEMENTS,
     VoidAnswerLine,
     VoidLine,
     VoidRequestLine,
-    file_of,
+    journal_uuid,
 )
-from evaweb.trials.services import checked, locked, publish, reason_given, settled
+from evaweb.trials.services import lock_trial, notify_settled, request_publication, require_reason, run_checks
 from runtime.core.sentences import Pattern
 
 _ASKED_ALREADY = Pattern(
@@ -57,51 +57,51 @@ KEPT = "the trial that it repeats counts: its void was not agreed to"
 _rules: list[Callable[[Trial], bool]] = []
 
 
-def declare_by_two(rule: Callable[[Trial], bool]) -> None:
+def register_two_person_rule(rule: Callable[[Trial], bool]) -> None:
     """`rule` says of a trial that has a score whether two operators have to agree that it is voided."""
     _rules.append(rule)
 
 
-def by_two(trial: Trial) -> bool:
+def needs_two_people(trial: Trial) -> bool:
     """Whether two operators have to agree that the trial is voided."""
     return trial.verdict_id is not None and any(rule(trial) for rule in _rules)
 
 
-def may_answer(trial: Trial, user: User) -> bool:
+def can_answer_void(trial: Trial, user: User) -> bool:
     """Whether a void of the trial was asked for, which this user may answer."""
     asked = trial.void_requests.filter(answer="").first()
     return asked is not None and _why_not(asked, user) is None
 
 
-def trial_void(*, user: User, trial: Trial, reason: str) -> Trial:
+def void_trial(*, user: User, trial: Trial, reason: str) -> Trial:
     """Take a trial out of the count, or ask for it where a second operator has to agree.
 
     Void is not fail: the trial stays in the record with its reason, and is repeated.
     """
-    require(user, Role.OPERATOR)
-    why = reason_given(reason, "a trial is voided")
+    require_role(user, Role.OPERATOR)
+    why = require_reason(reason, "a trial is voided")
     with transaction.atomic():
-        checked("voided", trial, user)
-        held = locked(trial)
-        if _said_already(held, user, why):
+        run_checks("voided", trial, user)
+        held = lock_trial(trial)
+        if _already_requested(held, user, why):
             return held
         if held.status == TrialStatus.VOID_ASKED:
             raise Conflict(_ASKED_ALREADY(trial=held.pk, advice=lifecycle.advice(held.status)))
-        if by_two(held):
+        if needs_two_people(held):
             _ask(held, user, why)
         else:
             _void(held, user, why)
-        settled(held, user)
+        notify_settled(held, user)
     trial.refresh_from_db()
     return trial
 
 
-def void_answer(*, user: User, trial: Trial, agree: bool, reason: str = "") -> Trial:
+def answer_void(*, user: User, trial: Trial, agree: bool, reason: str = "") -> Trial:
     """Agree to a void that another operator asked for, or refuse it with a reason."""
-    require(user, Role.OPERATOR)
-    why = reason if agree and not reason.strip() else reason_given(reason, "a void is refused")
+    require_role(user, Role.OPERATOR)
+    why = reason if agree and not reason.strip() else require_reason(reason, "a void is refused")
     with transaction.atomic():
-        held = locked(trial)
+        held = lock_trial(trial)
         asked = held.void_requests.filter(answer="").select_for_update().first()
         if asked is None:
             raise Conflict(_NOBODY_ASKS(trial=held.pk, label=TrialStatus(held.status).label))
@@ -109,36 +109,36 @@ def void_answer(*, user: User, trial: Trial, agree: bool, reason: str = "") -> T
         if fault is not None:
             raise fault
         if agree:
-            checked("void agreed", held, user)
+            run_checks("void agreed", held, user)
             _answered(asked, VoidRequest.Answer.AGREED, user, why)
             _void(held, asked.by, asked.reason)
         else:
-            _keep(held, asked, VoidRequest.Answer.REFUSED, user, why)
-        settled(held, user)
+            _restore_counting(held, asked, VoidRequest.Answer.REFUSED, user, why)
+        notify_settled(held, user)
     trial.refresh_from_db()
     return trial
 
 
-def voids_waiting(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
+def open_void_requests(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
     """What nobody has answered yet, the oldest first."""
     return VoidRequest.objects.filter(trial__in=trials, answer="").select_related("trial__handout", "by")
 
 
-def voids_lapse(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
+def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
     """Have those of `trials` count again whose void nobody has answered in time; with `now` all of them.
 
     One whose repetition is under way waits for its end. Within a transaction.
     """
-    asked = voids_waiting(trials)
+    asked = open_void_requests(trials)
     if not now:
         asked = asked.filter(at__lt=timezone.now() - ANSWERED_WITHIN)
     for each in asked.order_by("pk"):
-        held = locked(each.trial)
+        held = lock_trial(each.trial)
         each.refresh_from_db(fields=("answer",))
         if each.answer:
             continue  # with one before it, whose repetition this trial is
-        if not _repetitions(held).filter(status__in=lifecycle.OPEN).exists():
-            _keep(held, each, VoidRequest.Answer.LAPSED, user, "")
+        if not _repetitions(held).filter(status__in=lifecycle.OPEN_STATES).exists():
+            _restore_counting(held, each, VoidRequest.Answer.LAPSED, user, "")
 
 
 def _why_not(asked: VoidRequest, user: User) -> EvaError | None:
@@ -148,16 +148,16 @@ def _why_not(asked: VoidRequest, user: User) -> EvaError | None:
     if asked.at + ANSWERED_WITHIN < timezone.now():
         return Conflict(_ASKED_TOO_LONG_AGO(trial_id=asked.trial_id, days=ANSWERED_WITHIN.days))
     try:
-        checked("void answered", asked.trial, user)
+        run_checks("void answered", asked.trial, user)
     except EvaError as fault:
         return fault
     return None
 
 
 def _ask(held: Trial, user: User, why: str) -> None:
-    lifecycle.apply(held, Move.ASK)
+    lifecycle.apply(held, Transition.ASK)
     asked = VoidRequest(trial=held, reason=why, by=user)
-    JUDGEMENTS.append(file_of(held), VoidRequestLine.written(asked))
+    JUDGEMENTS.append(journal_uuid(held), VoidRequestLine.written(asked))
     asked.save()
     held.save()
 
@@ -165,32 +165,32 @@ def _ask(held: Trial, user: User, why: str) -> None:
 def _answered(asked: VoidRequest, answer: str, user: User, why: str) -> None:
     asked.answer, asked.answer_reason, asked.answered_by = answer, why, user
     asked.answered_at = timezone.now()
-    JUDGEMENTS.append(file_of(asked.trial), VoidAnswerLine.written(asked, uuid=str(asked.uuid)))
+    JUDGEMENTS.append(journal_uuid(asked.trial), VoidAnswerLine.written(asked, uuid=str(asked.uuid)))
     asked.save()
 
 
 def _void(held: Trial, by: User, why: str) -> None:
-    lifecycle.apply(held, Move.VOID)
+    lifecycle.apply(held, Transition.VOID)
     held.reason, held.voided_by, held.voided_at = why, by, timezone.now()
-    JUDGEMENTS.append(file_of(held), VoidLine.written(held))
+    JUDGEMENTS.append(journal_uuid(held), VoidLine.written(held))
     held.save()
-    publish(held)
+    request_publication(held)
 
 
-def _keep(held: Trial, asked: VoidRequest, answer: str, user: User, why: str) -> None:
+def _restore_counting(held: Trial, asked: VoidRequest, answer: str, user: User, why: str) -> None:
     """The trial counts again; what was made in its place does not."""
     for other in _repetitions(held):
-        if other.status in lifecycle.OPEN:
+        if other.status in lifecycle.OPEN_STATES:
             raise Conflict(
                 _BEING_REPEATED(trial=held.pk, other=other.pk, advice=lifecycle.advice(other.status))
             )
-        if lifecycle.allows(other, Move.VOID):
-            row = locked(other)
+        if lifecycle.allows(other, Transition.VOID):
+            row = lock_trial(other)
             for pending in row.void_requests.filter(answer=""):
-                lifecycle.apply(row, Move.KEEP)
+                lifecycle.apply(row, Transition.KEEP)
                 _answered(pending, VoidRequest.Answer.LAPSED, user, KEPT)
             _void(row, user, KEPT)
-    lifecycle.apply(held, Move.KEEP)
+    lifecycle.apply(held, Transition.KEEP)
     _answered(asked, answer, user, why)
     held.save()
 
@@ -200,7 +200,7 @@ def _repetitions(trial: Trial) -> QuerySet[Trial]:
     return Trial.objects.filter(**{name: getattr(trial, name) for name in same}, attempt__gt=trial.attempt)
 
 
-def _said_already(held: Trial, user: Any, why: str) -> bool:
+def _already_requested(held: Trial, user: Any, why: str) -> bool:
     """Asked for once more, because the answer was lost."""
     if held.status == TrialStatus.VOID_ASKED:
         return held.void_requests.filter(answer="", by=user, reason=why).exists()

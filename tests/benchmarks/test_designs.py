@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import coverage, designs
 from benchmarks.designs import DESIGNS, DRIFTING, boundary_of, errors_at, worst_drift
-from evaweb.statistics.designs import conclude, design, in_blocks
+from evaweb.statistics.designs import design, evaluate_design, in_blocks
 from evaweb.statistics.difference import barnard
 from evaweb.statistics.planning import exact_power
 
@@ -47,7 +47,7 @@ def test_an_error_under_drift_is_that_of_constant_rates_where_there_is_none(name
     assert exact is not None
     margin = exact.margin or 0.0
     for rate in (0.2, 0.7):
-        wrong = exact.course(margin + (1 - margin) * rate, (1 - margin) * rate).power
+        wrong = exact.operating_characteristics(margin + (1 - margin) * rate, (1 - margin) * rate).power
         assert errors_at(exact, np.full((1, 20), rate))[0] == pytest.approx(wrong)
     assert worst_drift(exact)[0] >= wrong
 
@@ -60,6 +60,7 @@ def test_an_error_under_drift_is_how_often_the_design_ends() -> None:
     chance, worse = np.random.default_rng(2), 0.8 * rates
     runs = chance.random((4000, pairs, 2)) < np.stack([worse, 0.2 + worse], axis=1)
     ended = sum(
-        conclude(planned, in_blocks([(float(a), float(b)) for a, b in run])).winner == "first" for run in runs
+        evaluate_design(planned, in_blocks([(float(a), float(b)) for a, b in run])).winner == "first"
+        for run in runs
     )
     assert ended / 4000 == pytest.approx(float(errors_at(exact, rates[None])[0]), abs=0.02)

@@ -18,15 +18,15 @@ SHARE = 0.02
 
 def test_what_was_not_done_counts_as_all_of_the_patience() -> None:
     presses = [Press("done", "", 20.0), Press("failed", "control is away", 60.0), Press("", "no answer", 0.0)]
-    found = estop.judged(presses, lost=1)
+    found = estop.summarize_presses(presses, lost=1)
     assert found["max_ms"] == PATIENCE_S * 1000.0
     assert (found["presses"], found["failed"], found["unanswered"], found["lost"]) == (3, 1, 1, 1)
     assert found["undone"] == ["failed: control is away", "unanswered: no answer"]
 
 
 def test_figures_say_what_is_wanted_of_an_attack() -> None:
-    found = estop.judged([Press("done", "", 20.0)], lost=0)
-    slow = estop.judged([Press("done", "", 900.0)], lost=0)
+    found = estop.summarize_presses([Press("done", "", 20.0)], lost=0)
+    slow = estop.summarize_presses([Press("done", "", 900.0)], lost=0)
     row = {"attack": "logins", "interrupted": "", "recovery_s": 0.1, **dict.fromkeys(estop.WAYS, slow)}
     row |= {"main_late_ms": 3.0, "web_growth_mb": 1.0, "station_growth_mb": 0.0}
     figures = {figure.name: figure.holds for figure in estop.figures(row)}
@@ -89,7 +89,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[estop.Bench]:
 @pytest.mark.slow
 @pytest.mark.parametrize("attack", estop.ATTACKS)
 def test_presses_beside_a_small_attack_arrive_and_are_done(lab: estop.Bench, attack: str) -> None:
-    row = estop.once(lab, attack, seconds=0.0, share=SHARE, moving=attack == "none")
+    row = estop.measure_attack(lab, attack, seconds=0.0, share=SHARE, moving=attack == "none")
     for way in estop.WAYS:
         found = row[way]
         assert (found["lost"], found["unanswered"]) == (0, 0), found["undone"]

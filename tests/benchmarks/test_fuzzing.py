@@ -93,10 +93,10 @@ def test_every_fuzzer_is_part_of_a_soak():
 
 
 def test_what_leaks_and_grows_is_seen():
-    before, kept = soak.held(), []
+    before, kept = soak.held_resources(), []
     kept.append(open(__file__))  # noqa: SIM115
     kept.append(b"x" * 40_000_000)
-    after = soak.held()
+    after = soak.held_resources()
     kept[0].close()
     missed = {figure.name for figure in soak._grown([before, after]) if figure.holds is False}
     assert missed == {"leaks.files"}
@@ -108,7 +108,7 @@ def test_what_leaks_and_grows_is_seen():
 )
 def test_what_comes_and_goes_is_no_growth_and_too_few_rounds_say_nothing(leaked, rounds, holds):
     memory = 250.0 + np.random.default_rng(3).normal(0.0, 3.0, rounds) + leaked * np.arange(rounds)
-    figures = soak._grown([soak.Held(5, 1, 0, mb) for mb in memory])
+    figures = soak._grown([soak.HeldResources(5, 1, 0, mb) for mb in memory])
     assert {figure.name: figure.holds for figure in figures}["growth.memory"] is holds
 
 

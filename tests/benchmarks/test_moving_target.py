@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import moving_target
-from benchmarks.moving_target import STRATEGIES, Chased, chase
+from benchmarks.moving_target import STRATEGIES, ChaseResult, run_chase
 
 
 @pytest.fixture(autouse=True)
@@ -12,8 +12,8 @@ def short_course(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("runtime.sim.conveyor.COURSE_S", 6.0)
 
 
-def chased(strategy: str, delay: int, seed: int = 1) -> Chased:
-    return chase({"kind": strategy, **STRATEGIES[strategy]}, delay, seed)
+def chased(strategy: str, delay: int, seed: int = 1) -> ChaseResult:
+    return run_chase({"kind": strategy, **STRATEGIES[strategy]}, delay, seed)
 
 
 @pytest.mark.exhaustive
@@ -35,8 +35,8 @@ def test_without_delay_both_do_and_an_episode_is_the_same_to_the_last_bit() -> N
 
 
 def test_a_row_is_the_mean_of_its_episodes() -> None:
-    one = Chased("rtc", 3, 0, True, 0.9, 4.0, 20.0, 5.0, "running")
-    two = Chased("rtc", 3, 1, False, 0.5, 8.0, 40.0, 7.0, "holding")
+    one = ChaseResult("rtc", 3, 0, True, 0.9, 4.0, 20.0, 5.0, "running")
+    two = ChaseResult("rtc", 3, 1, False, 0.5, 8.0, 40.0, 7.0, "holding")
     assert moving_target._row([one, two]) == {
         "strategy": "rtc",
         "delay": 3,

@@ -16,7 +16,7 @@ from benchmarks import __main__ as command_line
 from benchmarks import recording_busy
 from benchmarks.recording import figures
 from benchmarks.recording_kills import RUNNING, _loss
-from benchmarks.recording_pace import Frames, finish, give
+from benchmarks.recording_pace import Frames, feed_frames, finish
 from benchmarks.recording_station import lost, published, to_disk
 from evaweb.jobs.models import Job, JobStatus
 from runtime.recording.base import Outcome
@@ -112,7 +112,7 @@ def test_frames_go_to_and_fro_and_every_writer_is_given_all(tmp_path: Path) -> N
     frames = Frames(tmp_path / "frames.npy")
     assert [int(frames(index)["cam_high"][0, 0, 0]) for index in range(8)] == [0, 1, 2, 3, 2, 1, 0, 1]
     taken: list[int] = []
-    given = give(frames, 5, lambda index, seen: taken.append(index))
+    given = feed_frames(frames, 5, lambda index, seen: taken.append(index))
     written = finish(given, lambda: None, tmp_path)
     assert taken == [0, 1, 2, 3, 4]
     assert (written.frames, written.bytes) == (5, (tmp_path / "frames.npy").stat().st_size)

@@ -119,28 +119,34 @@ def test_a_hurried_sender_gives_up_what_does_not_arrive() -> None:
 def test_a_pictures_number_is_in_what_a_tick_keeps_of_it(number: int) -> None:
     for picture in SCENE.draw(number, 0.0, PIPER.poses["home"]).values():
         assert (
-            wires_transports.strip_number(wires_transports.marks(picture)) == frame_number(picture) == number
+            wires_transports.strip_number(wires_transports.number_marks(picture))
+            == frame_number(picture)
+            == number
         )
 
 
 @given(st.integers(0, 400))
 def test_a_cameras_picture_is_the_newest_that_left_with_its_bar(number: int) -> None:
     sent = [n / 30 for n in range(600)]
-    marks = wires_transports.marks(camera_server.picture(number, 640, 480))
+    marks = wires_transports.number_marks(camera_server.picture(number, 640, 480))
     assert wires_transports.bar_birth(marks, sent[number] + 0.02, sent) == sent[number]
 
 
 def test_the_age_is_that_of_the_oldest_picture_and_unknown_while_one_is_overwritten() -> None:
-    drawn = {n: wires_transports.marks(SCENE.draw(n, 0.0, PIPER.poses["home"])["cam_high"]) for n in (3, 4)}
+    drawn = {
+        n: wires_transports.number_marks(SCENE.draw(n, 0.0, PIPER.poses["home"])["cam_high"]) for n in (3, 4)
+    }
     sent = [n / 10 for n in range(6)]
     looks: Any = [
         [(drawn[4], 0.0, 0.5), (drawn[3], 0.0, 0.5)],
         [(drawn[4], 0.0, 0.5), (None, 0.0, 0.5)],
     ]
-    ages = wires_transports.ages(looks, "strip", sent)
+    ages = wires_transports.image_ages(looks, "strip", sent)
     assert ages[0] == pytest.approx(0.2)
     assert ages[1] is None
-    assert wires_transports.ages([[(None, 0.4, 0.5), (None, 0.3, 0.5)]], "due", []) == [pytest.approx(0.2)]
+    assert wires_transports.image_ages([[(None, 0.4, 0.5), (None, 0.3, 0.5)]], "due", []) == [
+        pytest.approx(0.2)
+    ]
 
 
 def test_the_slowest_stream_is_what_the_sender_kept_up_with() -> None:

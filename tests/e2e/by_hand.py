@@ -9,7 +9,7 @@ from tests.processes import PATIENCE_S, eventually
 MODE_KEYS = {"sim": "1", "step": "2", "preview": "3", "continuous": "4", "manual": "5"}
 
 
-class ByHand(BenchPage):
+class DebugPage(BenchPage):
     """Somebody at the Debug tab who uses keys wherever there are some."""
 
     def snapshot(self):

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from evaweb.lab.patience import VisitFailed
-from evaweb.lab.visitor import LivePage, Visitor
+from evaweb.lab.patience import DemoFailed
+from evaweb.lab.visitor import LivePage, RestClient
 from tests.e2e.lab import STATION
 from tests.processes import PATIENCE_S, eventually
 
@@ -15,14 +15,14 @@ SCENE, SKILLED = "block-on-plate", "pick-place-40k"
 
 def visitor(demo, username, password=None):
     """Somebody who has logged in."""
-    found = Visitor(demo.url)
+    found = RestClient(demo.url)
     found.login(username, password or demo.passwords[username])
     return found
 
 
 def refusal(ask):
     """The sentence with which `ask()` is refused."""
-    with pytest.raises(VisitFailed) as refused:
+    with pytest.raises(DemoFailed) as refused:
         ask()
     return str(refused.value)
 
@@ -32,7 +32,7 @@ def was_late(reason):
     return "s old (limit" in reason or "have not been seen for" in reason
 
 
-class Page(LivePage):
+class RestPage(LivePage):
     """A page of somebody at the station; `told` has every message but frames."""
 
     def __init__(self, visitor, page=""):
@@ -60,8 +60,8 @@ class Page(LivePage):
 
         def given():
             try:
-                return super(Page, self).command(kind, trial)
-            except VisitFailed as refusal:
+                return super(RestPage, self).command(kind, trial)
+            except DemoFailed as refusal:
                 if "try again in a moment" not in str(refusal):
                     raise
 
@@ -126,7 +126,7 @@ class Page(LivePage):
         def scored():
             try:
                 return self.visitor.post(f"trials/{trial}/score", {"milestones": said})
-            except VisitFailed as refusal:  # the page says so too, and its operator presses again
+            except DemoFailed as refusal:  # the page says so too, and its operator presses again
                 if "on the disk yet" not in str(refusal):
                     raise
 
@@ -178,9 +178,9 @@ class Page(LivePage):
         """Over the live socket."""
         self._send(message)
 
-    def _told(self, message):
+    def _on_message(self, message):
         self.told.append(message)
-        super()._told(message)
+        super()._on_message(message)
 
 
 def opened(visitor, page=""):
@@ -188,8 +188,8 @@ def opened(visitor, page=""):
 
     def tried():
         try:
-            return Page(visitor, page)
-        except VisitFailed:  # nobody listens yet
+            return RestPage(visitor, page)
+        except DemoFailed:  # nobody listens yet
             return None
 
     return eventually(tried, "the web opens a live page", 3 * PATIENCE_S)
@@ -205,7 +205,7 @@ def page_of(visitor):
         page.close()
 
 
-def tidy(admin):
+def reset_station(admin):
     """Leave the station ready or idle, nobody's, without an open trial."""
     with page_of(admin) as page:
         page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")

@@ -6,7 +6,7 @@ import pytest
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
 from tests.e2e.pixels import pixels, share
-from tests.e2e.remote import SKILLED, tidy, visitor
+from tests.e2e.remote import SKILLED, reset_station, visitor
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -98,7 +98,7 @@ def bench(browser, patient):
         live.press("stop")
     assert live.errors == []
     live.close()
-    tidy(visitor(patient, "admin"))
+    reset_station(visitor(patient, "admin"))
 
 
 def test_a_proposed_chunk_is_a_ghost_until_it_is_cancelled(bench):

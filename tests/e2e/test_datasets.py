@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.e2e.by_hand import ByHand
+from tests.e2e.by_hand import DebugPage
 from tests.e2e.lab import WIDE
 from tests.e2e.pixels import share, white
 from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
@@ -34,7 +34,7 @@ def cups(patient):
 
 @pytest.fixture(scope="module")
 def viewer(browser, patient):
-    page = ByHand(browser, patient, "ann", WIDE)
+    page = DebugPage(browser, patient, "ann", WIDE)
     yield page
     assert page.errors == []
     page.close()

@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from tests.e2e.by_hand import ByHand
+from tests.e2e.by_hand import DebugPage
 from tests.e2e.lab import STATION, WIDE
 from tests.processes import PATIENCE_S, eventually
 
@@ -19,7 +19,7 @@ demo_checkpoint(name="{MUTE}", description="", policy={{{{"url": "ws://127.0.0.1
 
 @pytest.fixture(scope="module")
 def bench(browser, patient):
-    bench = ByHand(browser, patient, "operator", WIDE).open(f"/stations/{STATION}/debug/")
+    bench = DebugPage(browser, patient, "operator", WIDE).open(f"/stations/{STATION}/debug/")
     bench.at_rest()
     bench.take()
     bench.page.fill("#seed", "1")  # the block is put back: whoever has done the task does not move any more

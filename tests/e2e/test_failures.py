@@ -24,13 +24,13 @@ station, ann = Station.objects.create(name="walked", simulated=False), User.obje
 checkpoint, scene = Checkpoint.objects.filter(active=True).first(), Scene.objects.filter(active=True).first()
 made = []
 for uuid in {uuids}:
-    trial = services.trial_prepare(
+    trial = services.prepare_trial(
         user=ann, station=station, scene=scene, position=scene.positions.first(), checkpoint=checkpoint
     )
     Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=3.0, episode=Episode.objects.get(pk=uuid))
     trial.refresh_from_db()
     keys = list(scene.milestones.values_list("pk", flat=True))
-    services.trial_score(
+    services.score_trial(
         user=ann, trial=trial, milestones={{key: n == 0 for n, key in enumerate(keys)}}, times={{keys[0]: 1.5}}
     )
     made.append(trial.pk)

@@ -12,11 +12,11 @@ from uuid import UUID
 
 import pytest
 
-from evaweb.lab.patience import VisitFailed
+from evaweb.lab.patience import DemoFailed
 from runtime.clients.client import StationClient
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, STATION, WIDE
-from tests.e2e.remote import SKILLED, opened, page_of, refusal, tidy, visitor, was_late
+from tests.e2e.remote import SKILLED, opened, page_of, refusal, reset_station, visitor, was_late
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -37,7 +37,7 @@ def people(demo):
 def station(people):
     """Left in order whatever becomes of it."""
     yield
-    tidy(people["admin"])
+    reset_station(people["admin"])
 
 
 @pytest.fixture
@@ -202,7 +202,7 @@ def test_a_policy_server_that_dies_mid_run_is_tried_again_until_it_is_back_or_pa
 
     def goes_on():
         if bench.state()["state"] == "holding":
-            with suppress(VisitFailed):  # refused for as long as a process is late to give a sign of life
+            with suppress(DemoFailed):  # refused for as long as a process is late to give a sign of life
                 bench.command("resume", trial)
         return bench.state()["state"] == "running" and bench.state()["policy"]["answers"] > answers
 

@@ -12,9 +12,9 @@ MAKE = """
 from django.contrib.auth.models import User
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Scene, Trial
@@ -24,13 +24,13 @@ scene = Scene.objects.filter(active=True).first()
 plan = Plan.objects.create(name="judged", title="Judged", owner=ann, blind=False, second_rater_share=1.0)
 plan.checkpoints.set(Checkpoint.objects.filter(active=True)[:2])
 plan.positions.set([scene.positions.first()])
-plan = plan_freeze(user=ann, plan=plan)
+plan = freeze_plan(user=ann, plan=plan)
 for uuid in {uuids}:
-    trial = hand_out(user=ann, station=station, plan=plan).trial
+    trial = allocate_trial(user=ann, station=station, plan=plan).trial
     Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=3.0, episode=Episode.objects.get(pk=uuid))
     trial.refresh_from_db()
     ticks = dict.fromkeys(scene.milestones.values_list("pk", flat=True), True)
-    services.trial_score(user=ann, trial=trial, milestones=ticks)
+    services.score_trial(user=ann, trial=trial, milestones=ticks)
 Station.objects.filter(pk=station.pk).update(active=False)
 """
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, TABLET, WIDE
-from tests.e2e.remote import tidy, visitor
+from tests.e2e.remote import reset_station, visitor
 
 pytestmark = pytest.mark.slow
 SIZES = [WIDE, {"width": 1280, "height": 800}, TABLET, {"width": 820, "height": 1180}]
@@ -82,7 +82,7 @@ def page(browser, patient):
 
 @pytest.mark.parametrize("tab", TABS)
 def test_a_page_of_a_station_is_whole_at_every_size_also_while_its_e_stop_is_latched(page, admin, tab):
-    tidy(admin)
+    reset_station(admin)
     page.page.set_viewport_size(WIDE)
     page.open(f"/stations/{STATION}/{tab}/").at_rest()
     page.cameras_live()
@@ -92,7 +92,7 @@ def test_a_page_of_a_station_is_whole_at_every_size_also_while_its_e_stop_is_lat
     page.reaches("FAULTED")
     page.page.locator("#situation").wait_for()
     assert faults(page) == {}
-    tidy(admin)
+    reset_station(admin)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from evaweb.lab.visitor import Visitor
+from evaweb.lab.visitor import RestClient
 from tests.e2e.lab import ROOT, STATION, left
-from tests.e2e.remote import page_of, refusal, tidy, visitor
+from tests.e2e.remote import page_of, refusal, reset_station, visitor
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -34,7 +34,7 @@ def test_a_wrong_password_opens_nothing(demo):
 
 
 def test_who_has_not_logged_in_is_asked_to(demo):
-    assert "HTTP 401" in refusal(lambda: Visitor(demo.url).get("stations"))
+    assert "HTTP 401" in refusal(lambda: RestClient(demo.url).get("stations"))
     with dial(demo, demo.url) as socket, pytest.raises(ConnectionClosed) as closed:
         socket.recv(20)
     assert closed.value.rcvd.code == 4401
@@ -97,7 +97,7 @@ def test_ctrl_c_ends_everything_and_a_second_start_keeps_trials_under_new_passwo
     with page_of(operator) as page:
         page.wait(lambda state: state["state"] != "disconnected", PATIENCE_S, "the station")
         assert page.prepare() == first + 1
-    tidy(visitor(demo, "admin"))
+    reset_station(visitor(demo, "admin"))
 
 
 @pytest.mark.story

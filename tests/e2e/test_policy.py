@@ -44,11 +44,11 @@ from evaweb.trials.models import Checkpoint, Scene
 from evaweb.episodes.reconcile import reconcile
 reconcile()
 scene, user = Scene.objects.earliest("pk"), User.objects.get(username="admin")
-trial = services.trial_prepare(
+trial = services.prepare_trial(
     user=user, station=Station.objects.get(name="{STATION}"), scene=scene, position=scene.positions.first(),
     checkpoint=Checkpoint.objects.first(), seed=1,
 )
-services.trial_abandon(user=user, trial=trial)
+services.abandon_trial(user=user, trial=trial)
 """
 # Of these at least one page has to be found; whatever else there is is looked at as well.
 WANTED = {

@@ -6,7 +6,7 @@ import pytest
 
 from runtime.datasets.journal import read_finished_episode
 from runtime.datasets.published import publish
-from tests.e2e.by_hand import ByHand
+from tests.e2e.by_hand import DebugPage
 from tests.e2e.lab import STATION, WIDE
 from tests.processes import PATIENCE_S, eventually
 from tests.runtime.quality import built
@@ -33,7 +33,7 @@ def recorded(patient):
 
 @pytest.fixture(scope="module")
 def operator(browser, patient):
-    page = ByHand(browser, patient, "operator", WIDE)
+    page = DebugPage(browser, patient, "operator", WIDE)
     yield page
     assert page.errors == []
     page.close()

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from tests.e2e.by_hand import ByHand
+from tests.e2e.by_hand import DebugPage
 from tests.e2e.conftest import SETS
 from tests.e2e.lab import STATION, WIDE, Demo
 from tests.e2e.pixels import moved, pixels
@@ -34,7 +34,7 @@ def demo(tmp_path_factory):
 
 
 def test_body_and_head_are_moved_drawn_recorded_and_played_back(browser, demo):
-    bench = ByHand(browser, demo, "operator", WIDE)
+    bench = DebugPage(browser, demo, "operator", WIDE)
     fetched = []
     bench.page.on("response", lambda answer: "/meshes/" in answer.url and fetched.append(answer.status))
     bench.page.route("**/geometry*", lambda route: route.abort(), times=1)  # the web is too busy for once

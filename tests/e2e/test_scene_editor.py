@@ -8,7 +8,7 @@ from PIL import Image
 
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
-from tests.e2e.remote import tidy, visitor
+from tests.e2e.remote import reset_station, visitor
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -17,7 +17,7 @@ TITLE = "Block beside the plate"
 
 @pytest.fixture
 def admin(browser, patient):
-    tidy(visitor(patient, "admin"))
+    reset_station(visitor(patient, "admin"))
     bench = BenchPage(browser, patient, "admin", WIDE)
     yield bench
     assert bench.errors == []

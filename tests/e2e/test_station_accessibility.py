@@ -3,7 +3,7 @@
 import pytest
 
 from tests.e2e.axe import themed, violations
-from tests.e2e.by_hand import ByHand
+from tests.e2e.by_hand import DebugPage
 from tests.e2e.lab import STATION, WIDE
 
 pytestmark = pytest.mark.slow
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_axe_finds_nothing(browser, patient, theme):
-    bench = ByHand(browser, patient, "operator", WIDE)
+    bench = DebugPage(browser, patient, "operator", WIDE)
     themed(bench.context, theme)
 
     def look(tab):

@@ -10,7 +10,7 @@ import pytest
 from runtime.ipc.estop_latch import Latch
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import STATION, WIDE
-from tests.e2e.remote import tidy, visitor
+from tests.e2e.remote import reset_station, visitor
 from tests.e2e.test_faults import suspended
 from tests.processes import PATIENCE_S, alive, eventually
 
@@ -66,7 +66,7 @@ def page(window, admin):
     window.at_rest()
     window.page.locator(f"{AREA}[data-second-way]").wait_for()
     yield window
-    tidy(admin)
+    reset_station(admin)
 
 
 def latched(demo):

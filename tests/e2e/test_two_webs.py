@@ -9,9 +9,9 @@ from urllib.request import Request
 
 import pytest
 
-from evaweb.lab.visitor import Visitor
+from evaweb.lab.visitor import RestClient
 from tests.e2e.lab import STATION
-from tests.e2e.remote import opened, page_of, refusal, tidy
+from tests.e2e.remote import opened, page_of, refusal, reset_station
 from tests.e2e.two_webs import in_turn, second_web
 from tests.processes import PATIENCE_S, eventually
 
@@ -28,7 +28,7 @@ class Behind:
         self.passwords = demo.passwords
 
     def visitor(self, username):
-        found = Visitor(self.url)
+        found = RestClient(self.url)
         found.login(username, self.passwords[username])
         return found
 
@@ -47,11 +47,11 @@ def admin(lab):
 @pytest.fixture
 def bench(lab, admin):
     """A page of an operator that has the station."""
-    tidy(admin)
+    reset_station(admin)
     with page_of(lab.visitor("operator")) as page:
         page.take()
         yield page
-    tidy(admin)
+    reset_station(admin)
 
 
 def test_a_trial_is_run_watched_stopped_and_scored_though_each_request_meets_another_process(lab, bench):

@@ -12,7 +12,7 @@ os.environ["DJANGO_SETTINGS_MODULE"] = "evaweb.settings"
 from asgiref.testing import ApplicationCommunicator
 
 from evaweb.asgi import application
-from evaweb.lock_wait import for_pages
+from evaweb.lock_wait import limit_page_waits
 from tests.processes import PATIENCE_S
 
 
@@ -39,6 +39,6 @@ async def answered(method: str, path: str, body: str, headers: dict[str, str]) -
 
 
 if __name__ == "__main__":
-    for_pages()
+    limit_page_waits()
     for question in json.loads(sys.argv[1]):
         print(json.dumps(asyncio.run(answered(*question))), flush=True)

@@ -15,11 +15,11 @@ from django.utils import timezone
 
 from evaweb.episodes.job_kinds import publish_episode
 from evaweb.episodes.models import Episode
-from evaweb.jobs.kinds import Work
+from evaweb.jobs.kinds import JobContext
 from evaweb.jobs.models import Job
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze
+from evaweb.plans.services import close_plan, freeze_plan
 from evaweb.preflights.models import Preflight
 from evaweb.results.models import Judgement
 from evaweb.reviews.services import tags_change
@@ -59,7 +59,7 @@ def in_the_other_world(text: str) -> str:
     return _HERE.sub(lambda found: _THERE[found[0]], text)
 
 
-class Lab:
+class BlindLab:
     """One trial of a blind plan, stage by stage; `checkpoint` is the one that it is of."""
 
     def __init__(self, station, runtime, operator, folder, data):
@@ -85,7 +85,7 @@ class Lab:
         )
         draft.checkpoints.set(rows)
         draft.positions.set(self.scene.positions.all())
-        self.plan = plan_freeze(user=self.owner, plan=draft)
+        self.plan = freeze_plan(user=self.owner, plan=draft)
         self.trial: Trial | None = None
         self.command: Command | None = None
         self.episode: Episode | None = None
@@ -101,9 +101,9 @@ class Lab:
                 report={"verdict": "ok", "url": row.policy["url"], "round_trip_ms": FIGURE},
             )
 
-    def handed(self):
+    def allocate(self):
         """The next trial; the station is being set up for it."""
-        self.trial = trial = hand_out(user=self.operator, station=self.station, plan=self.plan).trial
+        self.trial = trial = allocate_trial(user=self.operator, station=self.station, plan=self.plan).trial
         self.runtime.do(
             lambda: setattr(self.runtime, "snapshot", self._snapshot(type(self.runtime).snapshot))
         )
@@ -245,7 +245,7 @@ class Lab:
         assert self.episode is not None
         self.trial.refresh_from_db()
         ticks = dict.fromkeys(self.scene.milestones.values_list("pk", flat=True), True)
-        trials.trial_score(user=self.operator, trial=self.trial, milestones=ticks, note="fine")
+        trials.score_trial(user=self.operator, trial=self.trial, milestones=ticks, note="fine")
         words = [[text, True, FIGURE / 1e12] for text in self.scene.milestones.values_list("text", flat=True)]
         Judgement.objects.create(
             trial=self.trial, judge="seer", version="chat 1, x", milestones=words, reason=ERROR
@@ -254,9 +254,9 @@ class Lab:
             user=self.owner, episode=self.episode, add=["slips", f"{self.trial.checkpoint.name}-slips"]
         )
         if not self.dataset:
-            told = publish_episode(Work({"uuid": str(self.episode.uuid)}, lambda text: None))
+            told = publish_episode(JobContext({"uuid": str(self.episode.uuid)}, lambda text: None))
             self.dataset = told["dataset"].removeprefix("datasets/")
 
     def closed(self):
         """No more trials are handed out."""
-        self.plan = plan_close(user=self.owner, plan=self.plan, reason="enough")
+        self.plan = close_plan(user=self.owner, plan=self.plan, reason="enough")

@@ -22,7 +22,7 @@ from evaweb.stations.models import Command, Station
 from evaweb.trials import selectors as trial_selectors
 from tests import migrated
 from tests.evaweb.as_migrated import CHECK, AsMigrated
-from tests.evaweb.stand_in import StandIn
+from tests.evaweb.stand_in import FakeStation
 from tests.evaweb.trials import builders
 from tests.processes import PATIENCE_S
 
@@ -30,7 +30,7 @@ from tests.processes import PATIENCE_S
 @pytest.fixture(autouse=True)
 def _noted_in_the_tests_own_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """Threads see nothing of a test's transaction. Within an event loop they are the real ones."""
-    note = commands.notes.note
+    note = commands.notes.record
 
     def here(row: Command) -> None:
         try:
@@ -40,7 +40,7 @@ def _noted_in_the_tests_own_thread(monkeypatch: pytest.MonkeyPatch) -> None:
         else:
             note(row)
 
-    monkeypatch.setattr(commands.notes, "note", here)
+    monkeypatch.setattr(commands.notes, "record", here)
 
 
 @pytest.fixture(autouse=True)
@@ -66,9 +66,9 @@ def _no_summaries_of_another_test() -> None:
 
 def _written(row: Command) -> None:
     try:
-        commands._written(row)
+        commands._stored_row(row)
     except Error:
-        commands.unwritten.keep(row)
+        commands.unwritten.store(row)
     except NotFound as fault:
         commands.log.error("%s is not written down: %s", row, fault)
 
@@ -151,12 +151,12 @@ def nobody_computes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def make_stand_in() -> Iterator[Callable[..., StandIn]]:
+def make_stand_in() -> Iterator[Callable[..., FakeStation]]:
     """Starts runtimes; they end with the test. Each has a name of its own: wires and feeds are kept by name."""
-    made: list[StandIn] = []
+    made: list[FakeStation] = []
 
-    def make(ttl: float = 5.0) -> StandIn:
-        made.append(StandIn(settings.DATA_DIR, f"bench-{uuid4().hex[:12]}", ttl))
+    def make(ttl: float = 5.0) -> FakeStation:
+        made.append(FakeStation(settings.DATA_DIR, f"bench-{uuid4().hex[:12]}", ttl))
         return made[-1]
 
     yield make
@@ -165,27 +165,27 @@ def make_stand_in() -> Iterator[Callable[..., StandIn]]:
 
 
 @pytest.fixture
-def runtime(make_stand_in: Callable[..., StandIn]) -> StandIn:
+def runtime(make_stand_in: Callable[..., FakeStation]) -> FakeStation:
     """A runtime that waits for its first observation."""
     return make_stand_in()
 
 
 @pytest.fixture
-def live(runtime: StandIn, db: None) -> Station:
+def live(runtime: FakeStation, db: None) -> Station:
     """The station whose runtime is `runtime`."""
     return Station.objects.create(name=runtime.name, robot="agilex_piper", title="Bench 1")
 
 
 @pytest.fixture
-def bench(db: None) -> builders.Bench:
+def bench(db: None) -> builders.TrialBench:
     """A station without a runtime, with all that a trial is made of."""
     return builders.bench()
 
 
 @pytest.fixture
-def wire(monkeypatch: pytest.MonkeyPatch) -> builders.Wire:
+def wire(monkeypatch: pytest.MonkeyPatch) -> builders.FakeConnection:
     """What stands where wires to runtimes stand."""
-    made = builders.Wire()
+    made = builders.FakeConnection()
     places = (
         "stations.commands",
         "stations.stops",

@@ -160,9 +160,9 @@ def _opened(body):
     return body
 
 
-def leaks(lab, client, queries=(), *, posts=False):
+def find_leaks(lab, client, queries=(), *, posts=False):
     """Where a secret can be read by somebody who has not said it, one after the other."""
-    yield from secrets_in(everything(lab, client, queries, posts=posts))
+    yield from secrets_in(crawl_everything(lab, client, queries, posts=posts))
 
 
 def secrets_in(answers):
@@ -171,7 +171,7 @@ def secrets_in(answers):
         yield from ((asked, secret) for secret in SECRETS if secret in told and secret not in asked)
 
 
-def everything(lab, client, queries=(), *, posts=False, uncovers=True):
+def crawl_everything(lab, client, queries=(), *, posts=False, uncovers=True):
     """What is answered to orders, then everything that can be read; without `uncovers` nobody reveals or looks."""
     for path, content in orders(lab) if lab.command is not None else ():
         if uncovers or not UNCOVERS.search(path):
@@ -194,7 +194,7 @@ def orders(lab):
     yield reverse("api:plan-reveal", args=[lab.plan.name]), {}
 
 
-def told_apart(lab, client):
+def distinguishable(lab, client):
     """Lists that answer differently to who asks for the one checkpoint and for the other.
 
     What was asked for is taken out of the answers, and what is drawn for each anew.
@@ -235,7 +235,7 @@ async def heard(lab, user):
     return said, b"".join(frame.body for frame in page.frames)
 
 
-def whispers(lab, user):
+def websocket_texts(lab, user):
     """Which secrets the live socket told."""
     said, arrays = asyncio.run(heard(lab, user))
     wanted = ["what the policy wants"] if AIM.tobytes() in arrays else []

@@ -8,7 +8,7 @@ from evaweb.stations import commands
 from tests.processes import eventually
 
 
-def settled() -> None:
+def wait_for_stop_records() -> None:
     """Return when none waits any more."""
     eventually(lambda: not commands.notes._waiting and not list(_files()), "stops are written down")
 

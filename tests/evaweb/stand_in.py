@@ -28,7 +28,7 @@ DIM = 14
 _CHANGED = Pattern("session.changed", "{before} -> {after}: {reason}")  # as the coordinator says it
 
 
-class Effortless:
+class NoOpActions:
     """In place of the coordinator's actions and parts: everything succeeds at once and moves nothing.
 
     `situation` is what the test says it is.
@@ -36,14 +36,14 @@ class Effortless:
 
     situation = GuardFacts()
 
-    def __getattr__(self, name: str) -> Effortless:
+    def __getattr__(self, name: str) -> NoOpActions:
         return self
 
     def __call__(self, *arguments: Any) -> Mapping[str, Any]:
         return {}
 
 
-class StandIn:
+class FakeStation:
     """A station `name` whose folder is below `data`; `mute` says nothing at all; commands of the kinds in `swallows`
     never arrive."""
 
@@ -58,7 +58,7 @@ class StandIn:
         self.collect: dict[str, Any] | None = None
         self.aims: list[Command] = []
         self.aim_says = Ack("", "done", data={"joints": [0.2] * DIM, "reached": True})
-        self.effects: Any = Effortless()
+        self.effects: Any = NoOpActions()
         self._folder = data / "stations" / name
         self.key = Key(self._folder)
         self._ended = threading.Event()
@@ -97,7 +97,7 @@ class StandIn:
         """Let something happen to the session; returns when it has."""
         self.do(lambda: self._happen(happening, reason))
 
-    def say(self, kind: str, text: str = "", **data: Any) -> None:
+    def emit(self, kind: str, text: str = "", **data: Any) -> None:
         """An event; returns when it is in the log."""
         self.do(lambda: self.events.append(Event(kind, text, time.monotonic(), data=data)))
 
@@ -199,7 +199,7 @@ class StandIn:
         self._cameras.publish("camera/cam_high", b"\xff\xd8 a picture")
 
 
-def before_an_upgrade(station: StandIn, monkeypatch: pytest.MonkeyPatch) -> None:
+def old_snapshot(station: FakeStation, monkeypatch: pytest.MonkeyPatch) -> None:
     """It was started when states did not say what they mean."""
     today = station.snapshot
     monkeypatch.setattr(

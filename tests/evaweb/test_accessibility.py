@@ -9,10 +9,10 @@ from django.test import Client
 from django.urls import reverse
 from playwright.sync_api import sync_playwright
 
-from evaweb.plans.services import plan_reveal
+from evaweb.plans.services import reveal_plan
 from tests.e2e.axe import SIZES, themed, violations
 from tests.e2e.lab import CHROMIUM, NO_CHROMIUM, browsing
-from tests.evaweb.blind_lab import Lab
+from tests.evaweb.blind_lab import BlindLab
 from tests.evaweb.crawling import addresses
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
 
@@ -23,11 +23,11 @@ pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow, pytest.
 def lab(live, runtime, ann, recorded, tmp_path, monkeypatch):  # noqa: F811
     """A plan that was revealed, its trial, an episode and a dataset."""
     monkeypatch.setattr("django.conf.settings.DATA_DIR", tmp_path)
-    monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
-    lab = Lab(live, runtime, ann, recorded["finished"], tmp_path)
+    monkeypatch.setattr("evaweb.jobs.doorbell.notify_workers", lambda queue: True)
+    lab = BlindLab(live, runtime, ann, recorded["finished"], tmp_path)
     for stage in ("handed", "running", "failed", "scored", "closed"):
         getattr(lab, stage)()
-    lab.plan = plan_reveal(user=lab.owner, plan=lab.plan)
+    lab.plan = reveal_plan(user=lab.owner, plan=lab.plan)
     return lab
 
 

@@ -10,18 +10,18 @@ import pytest
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.api.tokens import token_create
-from evaweb.blinding import sight_of
-from evaweb.plans.blinding_rules import look
+from evaweb.api.tokens import create_token
+from evaweb.blinding import visibility_for_user
+from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Handout, Look, PlanEvent, Slot
-from evaweb.plans.services import plan_reveal
+from evaweb.plans.services import reveal_plan
 from evaweb.preflights.models import Preflight
 from evaweb.trials.models import Checkpoint
-from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, Lab
-from tests.evaweb.crawling import QUERIES, crawled, leaks, secrets_in, told_apart, whispers
+from tests.evaweb.blind_lab import LATENCY, NAMES, SECRETS, BlindLab
+from tests.evaweb.crawling import QUERIES, crawled, distinguishable, find_leaks, secrets_in, websocket_texts
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
 from tests.evaweb.two_worlds import differences, read, swap
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
 
@@ -29,13 +29,13 @@ pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
 @pytest.fixture(autouse=True)
 def _data(settings, tmp_path, monkeypatch, nobody_computes):  # what is planned is of no trial
     settings.DATA_DIR = tmp_path
-    monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
+    monkeypatch.setattr("evaweb.jobs.doorbell.notify_workers", lambda queue: True)
 
 
 @pytest.fixture
 def lab(live, runtime, ann, recorded, settings):  # noqa: F811
     """A frozen plan of olga's, a runtime that says secrets, a scene, and an operator."""
-    return Lab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
+    return BlindLab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
 
 
 STAGES = ("before", "handed", "running", "failed", "scored", "closed")
@@ -85,16 +85,16 @@ def test_nothing_that_an_operator_can_reach_tells_before_the_reveal(lab):
     client = told_by(lab, lab.operator)
     for stage in STAGES[1:]:
         getattr(lab, stage)()
-        assert whispers(lab, lab.operator) == [], stage
+        assert websocket_texts(lab, lab.operator) == [], stage
     by_name = [client.get(reverse("api:checkpoint", args=[name])).status_code for name in NAMES]
     assert by_name == [404, 404]
     assert client.get(reverse("api:trials"), {"checkpoint": NAMES[0]}).status_code == 404
-    lab.plan = plan_reveal(user=lab.owner, plan=lab.plan)
+    lab.plan = reveal_plan(user=lab.owner, plan=lab.plan)
     assert NAMES.index(lab.trial.checkpoint.name) >= 0
     shown = client.get(reverse("api:trial", args=[lab.trial.pk])).json()
     assert shown["checkpoint"] == lab.trial.checkpoint.name
     assert shown["code"]
-    assert LATENCY in whispers(lab, lab.operator)
+    assert LATENCY in websocket_texts(lab, lab.operator)
 
 
 @pytest.mark.exhaustive
@@ -102,9 +102,9 @@ def test_lists_answer_alike_to_questions_for_either_until_the_reveal(lab):
     client = told_by(lab, lab.operator)
     for stage in STAGES[1:]:
         getattr(lab, stage)()
-    assert list(leaks(lab, client, posts=True)) == []
-    assert list(told_apart(lab, client)) == []
-    plan_reveal(user=lab.owner, plan=lab.plan)
+    assert list(find_leaks(lab, client, posts=True)) == []
+    assert list(distinguishable(lab, client)) == []
+    reveal_plan(user=lab.owner, plan=lab.plan)
     told = "".join(text for _, _, text in crawled(lab, client))
     assert all(name in told for name in NAMES)
 
@@ -113,8 +113,8 @@ def test_lists_answer_alike_to_questions_for_either_until_the_reveal(lab):
 def test_a_token_tells_what_a_login_tells(lab):
     for stage in STAGES[1:5]:
         getattr(lab, stage)()
-    bearer = Client(headers={"Authorization": f"Bearer {token_create(user=lab.operator, name='crawler')}"})
-    assert list(leaks(lab, bearer, QUERIES)) == []
+    bearer = Client(headers={"Authorization": f"Bearer {create_token(user=lab.operator, name='crawler')}"})
+    assert list(find_leaks(lab, bearer, QUERIES)) == []
 
 
 @pytest.mark.exhaustive
@@ -129,13 +129,13 @@ def test_a_plan_that_was_lost_with_the_database_goes_on_hiding(lab, alma, who):
     user = alma if who == "alma" else getattr(lab, who)
     client = Client()
     client.force_login(user)
-    assert list(leaks(lab, client, QUERIES)) == []
-    assert whispers(lab, user) == []
+    assert list(find_leaks(lab, client, QUERIES)) == []
+    assert websocket_texts(lab, user) == []
 
 
 def lose(plan):
     """As after a database that was lost: no plan, no hand-outs, no codes; its trials are there."""
-    with unguarded("plans"):
+    with without_triggers("plans"):
         for model in (Look, PlanEvent, Handout, Slot):
             model.objects.filter(plan=plan).delete()
         plan.delete()
@@ -150,10 +150,10 @@ def test_who_has_looked_is_told_everything(lab):
     lab.running()
     client = Client()
     client.force_login(lab.owner)
-    assert list(leaks(lab, client)) == []
-    look(lab.plan, lab.owner)
-    assert {secret for _, secret in leaks(lab, client)} >= {"secret-alder", "secret-birch", LATENCY}
-    assert set(whispers(lab, lab.owner)) >= {"secret-alder", LATENCY, "something_new"}
+    assert list(find_leaks(lab, client)) == []
+    record_unblinding(lab.plan, lab.owner)
+    assert {secret for _, secret in find_leaks(lab, client)} >= {"secret-alder", "secret-birch", LATENCY}
+    assert set(websocket_texts(lab, lab.owner)) >= {"secret-alder", LATENCY, "something_new"}
 
 
 def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administration(lab, alma):
@@ -161,7 +161,7 @@ def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administrat
     client.force_login(alma)
     lab.operator = alma
     lab.handed()
-    assert not sight_of(alma).clear
+    assert not visibility_for_user(alma).sees_everything
     for model in ("trials_trial", "trials_score", "stations_command", "episodes_episode", "jobs_job"):
         answer = client.get(reverse(f"admin:{model}_changelist"), headers={"Accept": "text/html"})
         assert answer.status_code == 403, model
@@ -170,14 +170,14 @@ def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administrat
 
 
 SEAMS = {
-    "evaweb.blinding.Sight.label": lambda self, trial: trial.checkpoint.name,
-    "evaweb.blinding.Sight.told": lambda self, text: text,
-    "evaweb.blinding.Sight.policy_of": lambda self, episode: episode.checkpoint,
-    "evaweb.blinding.Sight.hides_episode": lambda self, episode: False,
-    "evaweb.blinding.Sight.require_episode": lambda self, episode: None,
-    "evaweb.blinding.Sight.open": lambda self, rows, checkpoint="checkpoint": rows,
-    "evaweb.blinding.Sight.veils": lambda self, station, snapshot: False,
-    "evaweb.stations.redaction.answer": lambda data: dict(data),
+    "evaweb.blinding.Visibility.checkpoint_label": lambda self, trial: trial.checkpoint.name,
+    "evaweb.blinding.Visibility.redact_text": lambda self, text: text,
+    "evaweb.blinding.Visibility.policy_of": lambda self, episode: episode.checkpoint,
+    "evaweb.blinding.Visibility.hides_episode": lambda self, episode: False,
+    "evaweb.blinding.Visibility.require_episode": lambda self, episode: None,
+    "evaweb.blinding.Visibility.filter_visible": lambda self, rows, checkpoint="checkpoint": rows,
+    "evaweb.blinding.Visibility.redacts_snapshot": lambda self, station, snapshot: False,
+    "evaweb.stations.redaction.redact_answer": lambda data: dict(data),
 }
 
 
@@ -190,7 +190,7 @@ def test_without_one_seam_something_tells(lab, monkeypatch):
     for seam, instead in SEAMS.items():
         with monkeypatch.context() as without:
             without.setattr(seam, instead)
-            assert any(leaks(lab, client)), seam
+            assert any(find_leaks(lab, client)), seam
 
 
 @pytest.mark.exhaustive
@@ -199,15 +199,17 @@ def test_without_its_seam_a_filter_tells(lab, monkeypatch):
     client.force_login(lab.operator)
     for stage in ("handed", "running", "failed", "scored"):
         getattr(lab, stage)()
-    monkeypatch.setattr("evaweb.blinding.Sight.open", SEAMS["evaweb.blinding.Sight.open"])
-    assert any(told_apart(lab, client))
+    monkeypatch.setattr(
+        "evaweb.blinding.Visibility.filter_visible", SEAMS["evaweb.blinding.Visibility.filter_visible"]
+    )
+    assert any(distinguishable(lab, client))
 
 
 def test_without_one_seam_the_live_socket_tells(lab, monkeypatch):
     lab.handed()
     lab.running()
-    assert whispers(lab, lab.operator) == []
-    for seam in ("veils", "veils_events"):
+    assert websocket_texts(lab, lab.operator) == []
+    for seam in ("redacts_snapshot", "redacts_events"):
         with monkeypatch.context() as without:
-            without.setattr(f"evaweb.blinding.Sight.{seam}", lambda self, *given: False)
-            assert whispers(lab, lab.operator) != [], seam
+            without.setattr(f"evaweb.blinding.Visibility.{seam}", lambda self, *given: False)
+            assert websocket_texts(lab, lab.operator) != [], seam

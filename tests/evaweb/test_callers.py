@@ -4,7 +4,7 @@ from ipaddress import ip_network
 
 import pytest
 
-from evaweb.callers import address_of, share_of
+from evaweb.callers import client_address, client_key
 
 PROXIES = [ip_network("127.0.0.1"), ip_network("10.1.0.0/16")]
 
@@ -31,12 +31,12 @@ def test_the_last_that_a_proxy_of_ours_has_seen(rf, settings, peer, forwarded, f
     settings.EVA_PROXIES = PROXIES
     request = rf.get("/", headers={"x-forwarded-for": forwarded} if forwarded else {})
     request.META["REMOTE_ADDR"] = peer
-    assert address_of(request) == found
+    assert client_address(request) == found
 
 
 def test_without_a_declared_proxy_nothing_forwarded_is_believed(rf):
     request = rf.get("/", headers={"x-forwarded-for": "198.51.100.1"}, REMOTE_ADDR="127.0.0.1")
-    assert address_of(request) == "127.0.0.1"
+    assert client_address(request) == "127.0.0.1"
 
 
 @pytest.mark.parametrize(
@@ -56,4 +56,4 @@ def test_the_share_of_who_asks_is_that_of_the_address_and_of_a_whole_network_of_
 ):
     settings.EVA_PROXIES = PROXIES
     headers = [(b"x-forwarded-for", value.encode()) for value in forwarded]
-    assert share_of({"headers": headers, "client": [peer, 4000] if peer else None}) == found
+    assert client_key({"headers": headers, "client": [peer, 4000] if peer else None}) == found

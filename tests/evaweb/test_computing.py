@@ -16,7 +16,7 @@ from evaweb.computing import AT_ONCE_S, REFILLED, Beside, Busy, Questions
 from evaweb.plans.models import Plan
 from evaweb.statistics import boundaries, courses, planning, score_courses
 from evaweb.statistics.base import StatisticsError
-from tests.evaweb.blind_lab import Lab
+from tests.evaweb.blind_lab import BlindLab
 from tests.evaweb.crawling import crawled
 from tests.evaweb.episodes.conftest import recorded  # noqa: F401  a fixture
 from tests.processes import PATIENCE_S, eventually
@@ -109,7 +109,7 @@ def test_the_process_beside_computes_says_what_fails_and_is_started_anew():
         assert beside.run(os.getpid)[0] not in (os.getpid(), None)
         assert beside.run(os.nice, 0)[0] == 19
         with pytest.raises(StatisticsError, match="allowed: 1 to 250"):
-            beside.run(courses.course, "none", 251, 0.2, 0.9, 0.05)
+            beside.run(courses.design_power, "none", 251, 0.2, 0.9, 0.05)
         here = courses.outlook(0.2, 0.9, 0.8, 0.05, 5, (0.1,))
         there, seconds = beside.run(courses.outlook, 0.2, 0.9, 0.8, 0.05, 5, (0.1,))
         assert (there, seconds > 0) == (here, True)
@@ -164,8 +164,8 @@ def counted(monkeypatch):
 @pytest.fixture
 def lab(live, runtime, ann, recorded, settings, tmp_path, monkeypatch):  # noqa: F811
     settings.DATA_DIR = tmp_path
-    monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
-    return Lab(live, runtime, ann, recorded["finished"], tmp_path)
+    monkeypatch.setattr("evaweb.jobs.doorbell.notify_workers", lambda queue: True)
+    return BlindLab(live, runtime, ann, recorded["finished"], tmp_path)
 
 
 @pytest.mark.django_db(transaction=True)

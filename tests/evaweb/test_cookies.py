@@ -12,8 +12,8 @@ from django.contrib.sessions.models import Session
 from django.test import Client
 from django.utils import timezone
 
-from evaweb.cookies import cookies_of, sessions_of
-from evaweb.credentials import OF_ANY_AGE, SESSION, credentials, digest
+from evaweb.cookies import cookie_values, session_keys
+from evaweb.credentials import EXPIRED_ALLOWED, SESSION, credentials, digest
 
 NAME = settings.SESSION_COOKIE_NAME
 
@@ -30,17 +30,17 @@ NAME = settings.SESSION_COOKIE_NAME
     ],
 )
 def test_all_that_cookies_of_a_name_say_is_found_in_order(headers, found):
-    assert cookies_of(headers, "a") == found
+    assert cookie_values(headers, "a") == found
 
 
-@pytest.mark.parametrize("kind", [SESSION, OF_ANY_AGE[SESSION]])
+@pytest.mark.parametrize("kind", [SESSION, EXPIRED_ALLOWED[SESSION]])
 def test_eight_sessions_are_asked_about_and_one_that_is_remembered_is_among_them(kind):
     account = User(pk=1, username="ann", is_superuser=True)
     made_up = [f"{NAME}=of-{number}" for number in range(99)]
-    assert sessions_of(made_up) == [f"of-{number}" for number in range(8)]
-    credentials.note(kind, "good", account)
+    assert session_keys(made_up) == [f"of-{number}" for number in range(8)]
+    credentials.remember(kind, "good", account)
     try:
-        assert sessions_of([*made_up, f"{NAME}=good"]) == ["good", *(f"of-{number}" for number in range(7))]
+        assert session_keys([*made_up, f"{NAME}=good"]) == ["good", *(f"of-{number}" for number in range(7))]
     finally:
         credentials.forget(kind, digest("good"))
 

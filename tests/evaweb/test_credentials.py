@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 
 from evaweb import credentials as module
 from evaweb.api.models import Token
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.credentials import (
     COUNTS_S,
     SESSION,
     TOKEN,
-    Busy,
-    Credentials,
+    CredentialCache,
+    LookupOverload,
     Unverifiable,
     credentials,
     session_user,
 )
-from evaweb.lookups import Lookups
+from evaweb.lookups import FairLookupPool
 from evaweb.roles import Role
 from tests.processes import PATIENCE_S
 
@@ -95,9 +95,9 @@ def now():
 @pytest.fixture
 def known(base, now, monkeypatch):
     monkeypatch.setattr(module.connection, "close", lambda: None)
-    made = Credentials(clock=lambda: now[0], wait=base.waited_for)
-    made.learn("key", base)
-    base.heard = made.heard
+    made = CredentialCache(clock=lambda: now[0], wait=base.waited_for)
+    made.register_kind("key", base)
+    base.heard = made.record_answer
     return made
 
 
@@ -147,7 +147,7 @@ def test_a_database_that_answers_others_is_waited_for_longer_and_who_has_no_turn
 ):
     base.answers.clear()
     base.meanwhile = known.heard
-    with pytest.raises(Busy, match="has not come to this login within 1 s"):
+    with pytest.raises(LookupOverload, match="has not come to this login within 1 s"):
         ask(known)
     assert now[0] == pytest.approx(101.0)
 
@@ -313,12 +313,12 @@ def test_without_another_thread_a_press_is_not_lost(known, base, now, monkeypatc
 )
 def test_nobody_who_is_remembered_waits_behind_anybody_who_is_not(crowd, remembered):
     now, closed = [100.0], threading.Event()
-    known = Credentials(clock=lambda: now[0])
+    known = CredentialCache(clock=lambda: now[0])
     users = {f"known {number}": Person("ann") for number in range(6)}
-    known.learn("key", lambda secret: users.get(secret) or (closed.wait(PATIENCE_S) and None))
+    known.register_kind("key", lambda secret: users.get(secret) or (closed.wait(PATIENCE_S) and None))
     with mock.patch.object(module.connection, "close"):
         for secret in users:
-            known.look("key", secret)
+            known.look_up("key", secret)
         now[0] += 60.0
         for share, number in crowd:
             known._check("key", f"made up {number}", share)
@@ -333,7 +333,7 @@ def test_nobody_who_is_remembered_waits_behind_anybody_who_is_not(crowd, remembe
 @pytest.mark.usefixtures("patient")
 def test_a_crowd_waits_behind_itself_and_is_turned_away_where_there_is_no_room(known, base):
     crowd, more = "203.0.113.9", "198.51.100.4"
-    known._strangers = Lookups(1, most=4)
+    known._strangers = FairLookupPool(1, most=4)
 
     async def pressed():
         base.answers.clear()
@@ -348,9 +348,9 @@ def test_a_crowd_waits_behind_itself_and_is_turned_away_where_there_is_no_room(k
 
     *asked, refused, ann = run(pressed())
     assert ann.username == "ann"
-    assert isinstance(refused, Busy)
+    assert isinstance(refused, LookupOverload)
     assert "too many logins from this address" in str(refused)
-    assert [isinstance(one, Busy) for one in asked] == [False] * 4 + [True], "the newest gives way"
+    assert [isinstance(one, LookupOverload) for one in asked] == [False] * 4 + [True], "the newest gives way"
     assert base.questions.index("a") == 2
 
 
@@ -366,9 +366,9 @@ def test_so_many_are_remembered(known, base, monkeypatch):
 def test_a_session_that_is_logged_out_and_a_token_that_is_withdrawn_are_forgotten(ann):
     client = Client()
     client.force_login(ann)
-    key, token = client.session.session_key, token_create(user=ann, name="x")
+    key, token = client.session.session_key, create_token(user=ann, name="x")
     for kind, secret in ((SESSION, key), (TOKEN, token)):
-        assert credentials.look(kind, secret) == ann
+        assert credentials.look_up(kind, secret) == ann
         assert credentials.recall(kind, secret).username == "ann"
     client.post("/logout/")
     Token.objects.get().delete()

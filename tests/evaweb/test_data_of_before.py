@@ -8,10 +8,10 @@ import json
 import pytest
 from django.contrib.auth.models import User
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.episodes.reconcile import reconcile
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze, plan_reveal
+from evaweb.plans.services import freeze_plan, reveal_plan
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.data_of_before.reading import HERE, MODELS, answers, restored, rows
 
@@ -57,10 +57,10 @@ def test_the_api_says_what_it_said_then(report):
     """Once an administrator has frozen and revealed the plan that was lost; what was blind stays so until then."""
     rater, trials = User.objects.get(username="rita"), Trial.objects.filter(evaluation__kind="plan")
     assert trials
-    assert all(sight_of(rater).hides(trial) for trial in trials)
+    assert all(visibility_for_user(rater).hides(trial) for trial in trials)
     adam, plan = User.objects.get(username="adam"), Plan.objects.get()
     Checkpoint.objects.update(active=True)
-    plan_reveal(user=adam, plan=plan_freeze(user=adam, plan=plan))
+    reveal_plan(user=adam, plan=freeze_plan(user=adam, plan=plan))
     found = answers()
     assert _as_far(EXPECTED["trials"], found["trials"]) == EXPECTED["trials"]
     header = EXPECTED["csv"][0]

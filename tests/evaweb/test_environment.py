@@ -18,20 +18,20 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.parametrize(("given", "found"), [("1", True), (" Yes ", True), ("off", False), ("", False)])
 def test_a_flag_is_a_word(monkeypatch, given, found):
     monkeypatch.setenv("EVA_X", given)
-    assert environment.flag("EVA_X", not found) is found
+    assert environment.read_flag("EVA_X", not found) is found
 
 
 @pytest.mark.parametrize(
     ("read", "given", "allowed"),
     [
-        (lambda: environment.flag("EVA_X", False), "maybe", "1, true, yes, on, 0, false, no, off"),
-        (lambda: environment.seconds("EVA_X", 1.0), "0", "seconds above zero"),
-        (lambda: environment.seconds("EVA_X", 1.0), "nan", "seconds above zero"),
-        (lambda: environment.seconds("EVA_X", 1.0), "2 s", "seconds above zero"),
+        (lambda: environment.read_flag("EVA_X", False), "maybe", "1, true, yes, on, 0, false, no, off"),
+        (lambda: environment.read_seconds("EVA_X", 1.0), "0", "seconds above zero"),
+        (lambda: environment.read_seconds("EVA_X", 1.0), "nan", "seconds above zero"),
+        (lambda: environment.read_seconds("EVA_X", 1.0), "2 s", "seconds above zero"),
         (lambda: environment.niceness("EVA_X", 19), "20", "allowed: 0 to 19"),
         (lambda: environment.niceness("EVA_X", 19), "-1", "allowed: 0 to 19"),
-        (lambda: environment.networks("EVA_X"), "10.0.0.1/24", "10.0.0.0/24"),
-        (lambda: environment.networks("EVA_X"), "proxy", "127.0.0.1"),
+        (lambda: environment.read_networks("EVA_X"), "10.0.0.1/24", "10.0.0.0/24"),
+        (lambda: environment.read_networks("EVA_X"), "proxy", "127.0.0.1"),
         (lambda: environment.log_level("EVA_X", "INFO"), "LOUD", "DEBUG, INFO, WARNING, ERROR, CRITICAL"),
         (lambda: environment.time_zone("EVA_X", "UTC"), "Mars", "UTC, Europe/Berlin"),
         (lambda: environment.time_zone("EVA_X", "UTC"), "Europe", "UTC, Europe/Berlin"),
@@ -48,17 +48,17 @@ def test_what_cannot_be_used_is_named_with_what_is_allowed(monkeypatch, read, gi
 
 def test_what_is_not_given_is_the_default(monkeypatch):
     monkeypatch.delenv("EVA_X", raising=False)
-    assert environment.flag("EVA_X", True) is True
-    assert environment.seconds("EVA_X", 2.5) == 2.5
+    assert environment.read_flag("EVA_X", True) is True
+    assert environment.read_seconds("EVA_X", 2.5) == 2.5
     assert environment.niceness("EVA_X", 19) == 19
-    assert environment.words("EVA_X", ("a", "b")) == ["a", "b"]
+    assert environment.read_list("EVA_X", ("a", "b")) == ["a", "b"]
     assert environment.log_level("EVA_X", "INFO") == "INFO"
     assert environment.time_zone("EVA_X", "Asia/Shanghai") == "Asia/Shanghai"
 
 
 def test_a_list_has_commas_and_no_blanks(monkeypatch):
     monkeypatch.setenv("EVA_X", " lab.example.org, 10.0.0.7 ,")
-    assert environment.words("EVA_X") == ["lab.example.org", "10.0.0.7"]
+    assert environment.read_list("EVA_X") == ["lab.example.org", "10.0.0.7"]
 
 
 def test_an_absent_driver_is_named_with_how_to_get_it(monkeypatch):
@@ -134,7 +134,7 @@ def test_what_others_can_read_is_named_at_the_start_with_what_to_do(monkeypatch,
         path.touch()
     for path, mode in wrong.items():
         path.chmod(mode)
-    told = private.data_is_private()
+    told = private.check_private_files()
     assert [one.msg for one in told] == [
         f"{path} can be read by others: {mode:o}" for path, mode in wrong.items()
     ]
@@ -143,20 +143,24 @@ def test_what_others_can_read_is_named_at_the_start_with_what_to_do(monkeypatch,
     ]
     for path, mode in zip(wrong, (0o700, 0o600, 0o600), strict=True):
         path.chmod(mode)
-    assert private.data_is_private() == []
+    assert private.check_private_files() == []
 
 
 def test_a_proxy_that_nobody_has_declared_is_asked_for(settings):
-    assert private.proxy_is_declared() == []
+    assert private.check_declared_proxy() == []
     settings.SESSION_COOKIE_SECURE = True
-    assert "EVA_PROXIES is not given" in private.proxy_is_declared()[0].msg
+    assert "EVA_PROXIES is not given" in private.check_declared_proxy()[0].msg
     settings.EVA_PROXIES = ["127.0.0.1"]
-    assert private.proxy_is_declared() == []
+    assert private.check_declared_proxy() == []
 
 
 def test_networks_are_addresses_too(monkeypatch):
     monkeypatch.setenv("EVA_X", "127.0.0.1, 10.0.0.0/24,::1")
-    assert [str(one) for one in environment.networks("EVA_X")] == ["127.0.0.1/32", "10.0.0.0/24", "::1/128"]
+    assert [str(one) for one in environment.read_networks("EVA_X")] == [
+        "127.0.0.1/32",
+        "10.0.0.0/24",
+        "::1/128",
+    ]
 
 
 def test_a_wrong_setting_ends_the_start_with_one_sentence(tmp_path):

@@ -10,8 +10,8 @@ from django.contrib.auth.hashers import PBKDF2PasswordHasher, check_password, ma
 
 from evaweb import hashing
 from evaweb.callers import SHARE
-from evaweb.hashing import Busy, QueuedHasher
-from evaweb.lookups import Lookups
+from evaweb.hashing import HashingOverload, QueuedHasher
+from evaweb.lookups import FairLookupPool
 from tests.processes import PATIENCE_S, eventually
 
 
@@ -44,7 +44,7 @@ def test_a_hash_is_that_of_django(settings):
 @pytest.fixture
 def turns(monkeypatch):
     """Three wait, behind the one that is hashed."""
-    made = Lookups(1, 3, "passwords", hashing._give_way)
+    made = FairLookupPool(1, 3, "passwords", hashing._give_way)
     monkeypatch.setattr(hashing, "_turns", made)
     return made
 
@@ -57,7 +57,7 @@ def test_a_crowd_of_one_address_waits_behind_itself_and_its_last_are_sent_away(s
         SHARE.set(address)
         try:
             done.append(QueuedHasher().encode(password, "salt"))
-        except Busy as busy:
+        except HashingOverload as busy:
             done.append(str(busy))
 
     with ThreadPoolExecutor(6) as people:

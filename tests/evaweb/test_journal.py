@@ -12,10 +12,10 @@ from uuid import uuid4
 import pytest
 from django.core.exceptions import FieldDoesNotExist
 
-from evaweb.blinding import EVERYTHING, HIDDEN, Sight
+from evaweb.blinding import FULL_VISIBILITY, HIDDEN, Visibility
 from evaweb.collect.models import SessionEvent
 from evaweb.collect.record import EventLine
-from evaweb.journal import NotKept
+from evaweb.journal import NotWritten
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.reviews.models import Review, Segment
@@ -225,7 +225,7 @@ def test_what_the_disk_did_not_take_is_taken_back(settings, tmp_path, monkeypatc
         sync(descriptor)
 
     monkeypatch.setattr(os, "fsync", fail_once)
-    with pytest.raises(NotKept, match="; nothing was changed"):
+    with pytest.raises(NotWritten, match="; nothing was changed"):
         REVIEWS.append(uuid, {})
     assert path.read_bytes() == there
 
@@ -237,7 +237,7 @@ def test_of_a_line_that_is_half_on_the_disk_nothing_stays(settings, tmp_path):
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (longest, limit[1]))
     try:
-        with pytest.raises(NotKept, match="; nothing was changed"):
+        with pytest.raises(NotWritten, match="; nothing was changed"):
             REVIEWS.append(uuid, {"second": "x" * longest})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
@@ -252,7 +252,7 @@ def test_what_cannot_be_taken_back_is_said_to_be_there(settings, tmp_path, monke
         raise FULL
 
     monkeypatch.setattr(os, "fsync", broken)
-    with pytest.raises(NotKept, match="could not be taken back: the next reconcile may take it for said"):
+    with pytest.raises(NotWritten, match="could not be taken back: the next reconcile may take it for said"):
         REVIEWS.append(uuid4(), {})
 
 
@@ -271,7 +271,7 @@ def test_every_column_of_a_trial_leads_to_a_field(name):
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, column in COLUMNS.items() if not (column.open or column.seen)]
+    "name", [name for name, column in COLUMNS.items() if not (column.always_visible or column.masked_value)]
 )
 def test_what_may_be_hidden_can_be_nothing_or_a_word(name):
     assert HINTS[name] is str or type(None) in get_args(HINTS[name])
@@ -279,17 +279,17 @@ def test_what_may_be_hidden_can_be_nothing_or_a_word(name):
 
 def test_what_is_not_said_to_be_open_is_hidden_with_the_checkpoint(bench):
     trial = bench.prepare()
-    blind = Sight(checkpoints=frozenset({trial.checkpoint_id}))
+    blind = Visibility(checkpoints=frozenset({trial.checkpoint_id}))
     column = Column("instruction")
-    assert column.shown("words", str, trial, EVERYTHING) == trial.instruction
+    assert column.shown("words", str, trial, FULL_VISIBILITY) == trial.instruction
     assert column.shown("words", str, trial, blind) == HIDDEN
     assert column.shown("words", str | None, trial, blind) is None
-    assert replace(column, open=True).shown("words", str, trial, blind) == trial.instruction
+    assert replace(column, always_visible=True).shown("words", str, trial, blind) == trial.instruction
 
 
 def test_a_trial_is_asked_for_with_what_is_known_before_its_run(bench):
     trial = bench.ended()
-    assert TrialRecord.written(trial).keys() - TrialRecord.asked(trial).keys() == {
+    assert TrialRecord.written(trial).keys() - TrialRecord.for_manifest(trial).keys() == {
         *("reason", "duration_s", "started_at", "ended_at", "ended_by", "truth")
     }
-    assert builders.BOOT not in json.dumps(TrialRecord.asked(trial))
+    assert builders.BOOT not in json.dumps(TrialRecord.for_manifest(trial))

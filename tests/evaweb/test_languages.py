@@ -14,7 +14,7 @@ from django.test import Client
 from evaweb import languages
 from evaweb.console.feed import History
 from evaweb.lab import sentences
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.core.sentences import Pattern, fixed, told
 from runtime.processes.coordinator.session.transitions import SessionEvent
 
@@ -214,12 +214,12 @@ def test_who_has_chosen_is_refused_in_words(german, live, ann):
 @pytest.mark.django_db(transaction=True)
 def test_a_stations_event_refusal_and_state_are_shown_in_words(german, live, runtime, ann):
     runtime.enter(SessionEvent.CONNECTED, fixed("health.connected", "the robot is seen: press Set up"))
-    (event,) = wire_to(live.name).events_since(0)[1]
+    (event,) = connection_to(live.name).events_since(0)[1]
     assert (event["text"], event["id"]) == (
         "disconnected -> idle: the robot is seen: press Set up",
         "session.changed",
     )
-    snapshot = wire_to(live.name).status()
+    snapshot = connection_to(live.name).status()
 
     english, there = shown_by_node([event, snapshot])
     assert english[0] == "disconnected → idle: the robot is seen: press Set up"
@@ -234,6 +234,6 @@ def test_events_of_another_version_lose_what_is_no_sentence(live, runtime):
     row = {"number": 2, "kind": "held", "text": "x", "id": "No Id", "arguments": {"a": []}, "data": {}}
     runtime.do(lambda: runtime.events._events.append(row))
 
-    boot, rows = wire_to(live.name).events_since(0)
+    boot, rows = connection_to(live.name).events_since(0)
     assert [sorted(row) for row in rows][-1] == ["data", "kind", "number", "text"]
     assert History().extended(boot, rows).rows[-1]["text"] == "x"

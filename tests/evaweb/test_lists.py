@@ -8,10 +8,10 @@ from django.test import Client
 
 from evaweb.errors import EvaError
 from evaweb.lists import SEARCH, UNSEEN, Column, Filter, Listing
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.blinding_rules import look
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.blind_lab import NAMES
 from tests.evaweb.trials import builders
@@ -99,8 +99,10 @@ def test_nobody_from_whom_checkpoints_are_hidden_sorts_by_them(address, settings
     plan = Plan.objects.create(name="blocks", title="Blocks", owner=olga)
     plan.checkpoints.set(Checkpoint.objects.create(name=name, policy={"url": "ws://h:1"}) for name in NAMES)
     plan.positions.set(bench.scene.positions.all())
-    plan = plan_freeze(user=olga, plan=plan)
-    trial = builders.over(hand_out(user=bench.operator, station=bench.station, plan=plan).trial)
+    plan = freeze_plan(user=olga, plan=plan)
+    trial = builders.finished_trial(
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    )
     browser = Client()
     browser.force_login(bench.operator)
     for sort in ("checkpoint", "-checkpoint"):
@@ -110,6 +112,6 @@ def test_nobody_from_whom_checkpoints_are_hidden_sorts_by_them(address, settings
     file = b"".join(browser.get("/replay/", {"format": "csv"}).streaming_content).decode()
     assert trial.handout.code in file
     assert "secret" not in file
-    look(plan, olga)
+    record_unblinding(plan, olga)
     browser.force_login(olga)
     assert "aria-sort" in browser.get(address, {"sort": "checkpoint"}).content.decode()

@@ -3,7 +3,7 @@ import threading
 import pytest
 from django.db import connection, connections
 
-from evaweb.lock_wait import for_pages, hurried, lock_wait
+from evaweb.lock_wait import limit_page_waits, lock_wait, short_lock_wait
 
 pytestmark = pytest.mark.django_db
 
@@ -40,7 +40,7 @@ def test_a_connection_that_is_opened_in_a_hurry_stays_so():
 
     def request():
         try:
-            with hurried(1.5):
+            with short_lock_wait(1.5):
                 found.append(patience())
                 with lock_wait(0.25):
                     found.append(patience())
@@ -58,5 +58,5 @@ def test_a_connection_that_is_opened_in_a_hurry_stays_so():
 def test_pages_do_not_wait_long_for_a_server_and_other_processes_do(monkeypatch):
     options = {"connect_timeout": 10}
     monkeypatch.setitem(connections.settings, "default", {"OPTIONS": options})
-    for_pages()
+    limit_page_waits()
     assert options == {"connect_timeout": 2}

@@ -13,9 +13,9 @@ from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
 from evaweb import audit
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.lockout import MOST_NAMES
-from evaweb.rarely import Rarely
+from evaweb.rarely import LogThrottle
 from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db
@@ -124,7 +124,7 @@ def test_nothing_is_kept_of_a_password(ann):
 def test_who_is_logged_in_goes_on_and_stops_while_the_name_is_locked(ann, live):
     client = Client(REMOTE_ADDR="10.0.0.5")
     client.force_login(ann)
-    token = token_create(user=ann, name="pedal")
+    token = create_token(user=ann, name="pedal")
     assert locked().status_code == 429
     assert client.get("/").status_code == 200
     press = f"/api/v1/stations/{live.name}/estop"
@@ -169,11 +169,11 @@ def test_control_characters_of_a_name_are_escaped(caplog):
 
 def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, caplog):
     now = [100.0]
-    monkeypatch.setattr(audit, "_refused", Rarely(60.0, 10, clock=lambda: now[0]))
+    monkeypatch.setattr(audit, "_refused", LogThrottle(60.0, 10, clock=lambda: now[0]))
     for _ in range(3):
-        audit.token_refused("10.0.0.5", "is not known")
+        audit.log_token_refused("10.0.0.5", "is not known")
     now[0] += 61
-    audit.token_refused("10.0.0.5", "is not known")
+    audit.log_token_refused("10.0.0.5", "is not known")
     assert caplog.messages == [
         "a token from 10.0.0.5 is not known",
         "a token from 10.0.0.5 is not known (2 before it)",
@@ -182,7 +182,7 @@ def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, cap
 
 def test_a_crowd_of_unverified_presses_is_a_line_in_ten_seconds_of_each_station(caplog, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(audit, "_unverified", Rarely(10.0, 16, clock=lambda: now[0]))
+    monkeypatch.setattr(audit, "_unverified", LogThrottle(10.0, 16, clock=lambda: now[0]))
     for _ in range(500):
         audit.estop_unverified("bench-1", TimeoutError("no turn"))
     audit.estop_unverified("bench-2", TimeoutError("no turn"))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.lookups import Crowded, Lookups
+from evaweb.lookups import FairLookupPool, LookupQueueFull
 from tests.processes import PATIENCE_S
 
 
@@ -17,17 +17,17 @@ class Held:
     """Look-ups of one thread, which is kept busy until all have come."""
 
     def __init__(self, most):
-        self.lookups, self.done = Lookups(1, most), []
+        self.lookups, self.done = FairLookupPool(1, most), []
         self._free, begun = threading.Event(), threading.Event()
-        self._first = self.lookups.ask("first", lambda: begun.set() or self._free.wait(PATIENCE_S))
+        self._first = self.lookups.submit("first", lambda: begun.set() or self._free.wait(PATIENCE_S))
         assert begun.wait(PATIENCE_S)
 
     def ask(self, share, name):
-        return self.lookups.ask(share, lambda: self.done.append((share, name)))
+        return self.lookups.submit(share, lambda: self.done.append((share, name)))
 
     def go_on(self, answers):
         self._free.set()
-        return [isinstance(answer.exception(60), Crowded) for answer in answers]
+        return [isinstance(answer.exception(60), LookupQueueFull) for answer in answers]
 
 
 def test_each_share_has_its_turn_and_its_oldest_is_the_first():
@@ -46,8 +46,8 @@ def test_where_there_is_no_room_the_newest_of_the_crowd_gives_way():
 
 
 def test_what_fails_fails_for_who_asked_alone():
-    lookups = Lookups(1)
-    failed, done = lookups.ask("a", lambda: 1 / 0), lookups.ask("a", lambda: 7)
+    lookups = FairLookupPool(1)
+    failed, done = lookups.submit("a", lambda: 1 / 0), lookups.submit("a", lambda: 7)
     with pytest.raises(ZeroDivisionError):
         failed.result(PATIENCE_S)
     assert done.result(PATIENCE_S) == 7

@@ -2,16 +2,16 @@ from __future__ import annotations
 
 import random
 
-from evaweb.memo import Kept, steady
+from evaweb.memo import FingerprintCache, rounded_sum
 
 
 def test_what_was_made_is_kept_until_its_fingerprint_changes():
-    kept, made = Kept[int](), iter(range(10))
+    kept, made = FingerprintCache[int](), iter(range(10))
     assert [kept.get("one", at, lambda: next(made)) for at in (1, 1, 2, 2, 1)] == [0, 0, 1, 1, 2]
 
 
 def test_the_least_recently_used_is_forgotten():
-    kept, made = Kept[int](most=2), iter(range(10))
+    kept, made = FingerprintCache[int](most=2), iter(range(10))
     assert [kept.get(key, 0, lambda: next(made)) for key in "abacab"] == [0, 1, 0, 2, 0, 3]
 
 
@@ -25,7 +25,7 @@ def test_the_order_in_which_numbers_are_added_up_changes_no_fingerprint():
         for number in seconds:
             total += number
         plain.add(total)
-        steadied.add(steady(total))
+        steadied.add(rounded_sum(total))
     assert len(plain) > 1
     assert len(steadied) == 1
-    assert steady(None) == 0.0
+    assert rounded_sum(None) == 0.0

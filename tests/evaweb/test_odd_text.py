@@ -12,7 +12,7 @@ from django.test import Client
 from django.urls import NoReverseMatch, get_resolver, reverse
 
 from evaweb.api.api import api
-from evaweb.headers import BARE
+from evaweb.headers import DEFAULT_HEADERS
 from tests.evaweb.crawling import named
 
 pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]
@@ -107,7 +107,7 @@ def odd_addresses(odd):
             yield text
 
 
-HEADERS = {name.decode().title() for name, _ in BARE}
+HEADERS = {name.decode().title() for name, _ in DEFAULT_HEADERS}
 
 
 def faults_of(answer):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evaweb.rarely import Rarely
+from evaweb.rarely import LogThrottle
 
 
 @pytest.fixture
@@ -14,7 +14,7 @@ def now():
 
 @pytest.fixture
 def rarely(now):
-    return Rarely(10.0, most=3, clock=lambda: now[0])
+    return LogThrottle(10.0, most=3, clock=lambda: now[0])
 
 
 def test_each_name_is_due_once_in_its_time_with_how_often_it_came_since(rarely, now):

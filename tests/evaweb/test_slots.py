@@ -9,7 +9,7 @@ import pytest
 from asgiref.sync import ThreadSensitiveContext, sync_to_async
 
 from evaweb import lock_wait, slots
-from evaweb.slots import Slots
+from evaweb.slots import RequestLimiter
 from tests.processes import PATIENCE_S
 
 
@@ -62,7 +62,7 @@ def few(monkeypatch):
 def test_so_many_are_worked_on_so_many_wait_and_the_others_are_told():
     async def scenario():
         application, sent = Application(), []
-        turns = Slots(application)
+        turns = RequestLimiter(application)
 
         async def send(message):
             sent.append(message)
@@ -83,7 +83,7 @@ def test_so_many_are_worked_on_so_many_wait_and_the_others_are_told():
 def test_nobody_has_more_than_a_share_of_the_turns():
     async def scenario():
         application, sent = Application(), []
-        turns = Slots(application)
+        turns = RequestLimiter(application)
 
         async def send(message):
             sent.append(message)
@@ -125,7 +125,7 @@ def test_nobody_has_more_than_a_share_of_the_turns():
 def test_few_exports_are_made_at_once_and_pages_do_not_wait_for_them(export):
     async def scenario():
         application, sent = Application(), []
-        turns = Slots(application)
+        turns = RequestLimiter(application)
 
         async def send(message):
             sent.append(message)
@@ -148,7 +148,7 @@ def test_few_exports_are_made_at_once_and_pages_do_not_wait_for_them(export):
 def test_one_that_hangs_up_while_it_waits_gives_its_place_back():
     async def scenario():
         application = Application()
-        turns = Slots(application)
+        turns = RequestLimiter(application)
         clients = [queue_of() for _ in range(5)]
         tasks = [asyncio.create_task(turns(asked(), client.get, _nowhere)) for client in clients]
         await turn_of_the_loop(lambda: application.at_once == 2)
@@ -178,7 +178,7 @@ def test_a_turn_lasts_as_long_as_its_thread_whoever_hangs_up():
             async with ThreadSensitiveContext():
                 await django_like(sync_to_async(view)(scope, receive, send), receive)
 
-        turns = Slots(application)
+        turns = RequestLimiter(application)
         for _ in range(4):
             client = queue_of({"type": "http.request"})
             task = asyncio.create_task(turns(asked(), client.get, _nowhere))
@@ -229,7 +229,7 @@ def test_nothing_more_is_made_for_who_has_hung_up():
                     await turn_of_the_loop(client.empty)
 
         with pytest.raises(asyncio.CancelledError):
-            await Slots(application)(asked(), client.get, _nowhere)
+            await RequestLimiter(application)(asked(), client.get, _nowhere)
         assert made == [0, 1, 2]
 
     asyncio.run(scenario())
@@ -243,7 +243,7 @@ def test_what_commands_does_not_wait_long_for_the_database():
     async def scenario():
         application = Application()
         application.may_end.set()
-        turns = Slots(application)
+        turns = RequestLimiter(application)
         for scope in (
             asked("/api/v1/stations/b/lease", "POST"),
             asked("/api/v1/stations/b"),

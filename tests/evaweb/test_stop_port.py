@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from evaweb.origins import at_port, is_ours, scheme_of
-from evaweb.stop_port import StopPort, origin_for, told
+from evaweb.origins import is_own_origin, origin_at_port, scheme_of
+from evaweb.stop_port import StopPort, origin_for, read_stop_port
 
 
 @pytest.fixture(autouse=True)
@@ -23,11 +23,11 @@ def test_a_page_of_the_webs_own_port_is_told_as_long_as_it_listens(rf):
     assert origin_for(asked(rf, "lab:8000")) == ""
     listens = StopPort(8001, 8000)
     listens.start()
-    assert told() == listens
+    assert read_stop_port() == listens
     assert origin_for(asked(rf, "lab:8000")) == "http://lab:8001"
     assert origin_for(asked(rf, "[::1]:8000")) == "http://[::1]:8001"
     listens.end()
-    assert (told(), origin_for(asked(rf, "lab:8000"))) == (None, "")
+    assert (read_stop_port(), origin_for(asked(rf, "lab:8000"))) == (None, "")
 
 
 @pytest.mark.parametrize("host", ["lab.example.org", "lab.example.org:443", "lab:8002"])
@@ -46,12 +46,12 @@ def test_a_lab_with_https_never_makes_a_page_call_plain_http(rf, settings):
 @pytest.mark.parametrize("content", [b"", b"[]", b"{}", b'{"port": "x", "web_port": 1}', b"\xff"])
 def test_a_file_that_says_nothing_is_none(folder, content):
     (folder / "stops.json").write_bytes(content)
-    assert told() is None
+    assert read_stop_port() is None
 
 
 def test_port_80_is_not_written():
-    assert at_port("lab", 80, 8001) == "http://lab:8001"
-    assert is_ours("http://lab", "lab:8001", "http", 80)
+    assert origin_at_port("lab", 80, 8001) == "http://lab:8001"
+    assert is_own_origin("http://lab", "lab:8001", "http", 80)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_port_80_is_not_written():
     ],
 )
 def test_ours_are_the_webs_port_of_the_same_host_and_its_own(origin, ours):
-    assert is_ours(origin, "lab:8001", "http", 8000) is ours
+    assert is_own_origin(origin, "lab:8001", "http", 8000) is ours
 
 
 @pytest.mark.parametrize(
@@ -89,11 +89,11 @@ def test_ours_are_the_webs_port_of_the_same_host_and_its_own(origin, ours):
 def test_a_page_has_the_scheme_that_its_proxy_says(settings, scheme, forwarded, origin, ours):
     settings.SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https")
     scope = {"scheme": scheme, "headers": [(b"x-forwarded-proto", value) for value in forwarded]}
-    assert is_ours(origin, "lab", scheme_of(scope)) is ours
+    assert is_own_origin(origin, "lab", scheme_of(scope)) is ours
     settings.SECURE_PROXY_SSL_HEADER = None  # nobody's word
     assert scheme_of(scope) == {"ws": "http", "wss": "https"}[scheme]
     settings.CSRF_TRUSTED_ORIGINS = [origin]
-    assert is_ours(origin, "lab", scheme_of(scope))
+    assert is_own_origin(origin, "lab", scheme_of(scope))
 
 
 def test_a_station_page_may_connect_there_and_knows_the_address(client, ann, live):

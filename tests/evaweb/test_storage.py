@@ -9,7 +9,7 @@ from django.conf import settings
 from django.db import OperationalError, connection
 from django.test import Client
 
-from evaweb.storage import refusal_of
+from evaweb.storage import storage_error_response
 from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db(transaction=True)
@@ -102,5 +102,5 @@ def test_rest_says_so(bench, client, request):
     ],
 )
 def test_only_what_the_storage_refuses_is_told_as_that(fault, status):
-    found = refusal_of(fault)
+    found = storage_error_response(fault)
     assert (found and found[1]) == status

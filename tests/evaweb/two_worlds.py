@@ -19,15 +19,15 @@ from django.urls import reverse
 
 from evaweb.episodes.models import Episode, Tag
 from evaweb.jobs.models import Job
-from evaweb.plans.exchange import exported
+from evaweb.plans.exchange import export_toml
 from evaweb.plans.models import Slot
 from evaweb.results.models import Judgement
 from evaweb.stations.models import Command
 from evaweb.trials.models import Checkpoint, Scene, Trial
 from runtime.recording.export import write_export
 from tests.evaweb.blind_lab import KEYS, NAMES, in_the_other_world
-from tests.evaweb.crawling import _read, everything
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.crawling import _read, crawl_everything
+from tests.evaweb.unguarded import without_triggers
 from tests.runtime.recording.samples import resealed
 
 MEASURED = "/setup/machine/"  # it says how busy and how full the machine is
@@ -36,7 +36,7 @@ OF_A_TRIAL = (Trial, Slot, Command, Episode, Job, Judgement, Tag)  # rows that s
 
 def swap(lab: Any) -> None:
     """Bring the lab into the other world: rows, files, and what its station says."""
-    with unguarded("plans", "trials", "episodes", "results", "stations"):
+    with without_triggers("plans", "trials", "episodes", "results", "stations"):
         for model in OF_A_TRIAL:
             for row in model._default_manager.all():
                 _swap_row(row)
@@ -81,7 +81,7 @@ def read(
 ) -> list[tuple[str, int, str]]:
     """(what was asked, status, answer) of all that somebody can read, without what is drawn anew."""
     with _taken_back():  # what is sent leaves nothing to the other world
-        found = [*everything(lab, client, **asked)]
+        found = [*crawl_everything(lab, client, **asked)]
         if administers:
             found += administration(client, every)
         transaction.set_rollback(True)
@@ -161,7 +161,7 @@ def _sent(client: Client) -> Any:
             "tags": "",
         }
         deleted = reverse("admin:trials_checkpoint_delete", args=[row.pk])
-        text = exported(checkpoints=[row]).replace('description = ""', 'description = "another"')
+        text = export_toml(checkpoints=[row]).replace('description = ""', 'description = "another"')
         for address, content in (
             (reverse("admin:trials_checkpoint_change", args=[row.pk]), form),
             (deleted, {"post": "yes"}),

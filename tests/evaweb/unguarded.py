@@ -12,7 +12,7 @@ from evaweb.append_only import guards, install, removal
 
 
 @contextmanager
-def unguarded(*labels: str) -> Iterator[None]:
+def without_triggers(*labels: str) -> Iterator[None]:
     """The tables of these apps, as for somebody who has the file."""
     declared = [guard for label in labels for guard in guards(apps.get_app_config(label))]
     with connection.cursor() as cursor:

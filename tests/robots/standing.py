@@ -46,7 +46,7 @@ def gap(robot: Robot, arm: Group, q: Float64, links: tuple[str, str]) -> float:
     return float(low.max() * -1 + high.min())
 
 
-def gap_as_said(robot: Robot, links: tuple[str, str], opening: float) -> Iterator[tuple[float, float]]:
+def declared_gap(robot: Robot, links: tuple[str, str], opening: float) -> Iterator[tuple[float, float]]:
     """Of each arm at `ready`, the gripper at number `opening`: how far its fingers are apart and ought to be [m]."""
     for arm in robot.arms:
         assert arm.gripper is not None
@@ -57,7 +57,7 @@ def gap_as_said(robot: Robot, links: tuple[str, str], opening: float) -> Iterato
         yield gap(robot, arm, q, links), float(said)
 
 
-def off_mirror(robot: Robot, pose: str) -> tuple[float, float]:
+def mirror_error(robot: Robot, pose: str) -> tuple[float, float]:
     """How far the right fingertips are from where the left ones are in a mirror: the worst number of place and turn.
 
     The mirror is the scene's yz-plane. A hand opens to both sides alike: mirrored, its x and y point the other way

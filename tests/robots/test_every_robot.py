@@ -13,7 +13,7 @@ import pytest
 import robots
 from robots import load_robot
 from robots.clearance import MARGIN
-from tests.robots.standing import at_ready, extents, from_home_to_ready, gap_as_said, off_mirror, unreached
+from tests.robots.standing import at_ready, declared_gap, extents, from_home_to_ready, mirror_error, unreached
 
 EXTENTS = json.loads(Path(__file__).with_name("extents.json").read_text())  # of the published meshes [m]
 
@@ -60,7 +60,7 @@ def test_the_postures_of_two_arms_are_mirror_images(name: str) -> None:
     mirror = STANDING[name].mirror
     assert (mirror is None) == (len(robot(name).arms) == 1)
     for pose in ("home", "ready") if mirror else ():
-        place, turn = off_mirror(robot(name), pose)
+        place, turn = mirror_error(robot(name), pose)
         assert (place < mirror[0], turn < mirror[1]) == (True, True)
 
 
@@ -68,7 +68,7 @@ def test_the_postures_of_two_arms_are_mirror_images(name: str) -> None:
 def test_jaws_are_as_far_apart_as_the_gripper_says(name: str) -> None:
     of, stands = robot(name), STANDING[name]
     openings = (0.0, 1.0) if of.binary_dims else (0.0, 0.5, 1.0)
-    gaps = [gap for opening in openings for gap in gap_as_said(of, stands.jaws, opening)]
+    gaps = [gap for opening in openings for gap in declared_gap(of, stands.jaws, opening)]
     assert len(gaps) == len(openings) * len(of.arms)
     for apart, said in gaps:
         assert apart == pytest.approx(said, abs=stands.jaws_within)

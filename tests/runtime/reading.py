@@ -19,7 +19,7 @@ Reads = dict[tuple[str, str], set[str]]
 _REFERENCES = {"node", "info", "type", "names", "alias_deps", "plugin_deps"}
 
 
-def reads_of(modules: Mapping[str, Path], root: Path) -> Reads:
+def attribute_reads(modules: Mapping[str, Path], root: Path) -> Reads:
     """Every attribute that `modules` (by name) read of a value whose class is known.
 
     What a validator reads of its own model does not count: to check a key is not to obey it.

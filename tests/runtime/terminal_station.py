@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from runtime.ipc.messages import Ack
-from tests.standing import standing
+from tests.standing import state_flags
 
 STATUS: dict[str, Any] = {
     "boot": "boot-1",
     "station": "bench-1",
     "robot": "toy",
     "transport": "zmq",
-    **standing("ready"),
+    **state_flags("ready"),
     "reason": "set up",
     "allowed": ["setup", "run", "estop"],
     "stage": "idle",
@@ -67,7 +67,7 @@ AIM: dict[str, Any] = {
 
 
 def status(state: str = "ready", **changes: Any) -> dict[str, Any]:
-    return deepcopy(STATUS) | standing(state) | changes
+    return deepcopy(STATUS) | state_flags(state) | changes
 
 
 class Script:

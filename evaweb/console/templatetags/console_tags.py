@@ -15,7 +15,7 @@ register = template.Library()
 @register.inclusion_tag("console/tabs.html", takes_context=True)
 def tab_bar(context: template.Context) -> dict[str, Any]:
     """The tabs that exist, with the one that this address belongs to."""
-    return {"tabs": tabs.of(context["request"]), "request": context["request"]}
+    return {"tabs": tabs.page_tabs(context["request"]), "request": context["request"]}
 
 
 @register.simple_tag

@@ -19,7 +19,7 @@ from django.db.migrations.loader import MigrationLoader
 from django.db.migrations.recorder import MigrationRecorder
 from django.utils import timezone
 
-from evaweb.environment import beside
+from evaweb.environment import database_files
 from evaweb.lab.backups import databases
 from evaweb.lab.backups.errors import BackupError
 from evaweb.lab.backups.file_copies import FileCopies, Listed, copied, digest_of, read_list, write_list
@@ -113,7 +113,7 @@ def _write(draft: Path, before: Backup | None, now: str, tell: Tell) -> None:
     counted = ours.write(draft / ours.file)
     digest, size = digest_of(draft / ours.file)
     tell("files")
-    without = beside(Path(settings.DATABASES["default"]["NAME"])) if ours.engine == "sqlite3" else []
+    without = database_files(Path(settings.DATABASES["default"]["NAME"])) if ours.engine == "sqlite3" else []
     known = (before.path / FILES, {each.path: each for each in before.listed()}) if before else None
     files = FileCopies(Path(settings.DATA_DIR), draft / FILES, known, without)
     (draft / FILES).mkdir()
@@ -259,7 +259,7 @@ def _require_empty(data: Path, draft: Path, ours: databases.Database) -> None:
     ours.require_empty()
     allowed = {draft.name, *_STARTS_WITH}
     if ours.engine == "sqlite3":
-        allowed |= {each.name for each in beside(Path(settings.DATABASES["default"]["NAME"]))}
+        allowed |= {each.name for each in database_files(Path(settings.DATABASES["default"]["NAME"]))}
     if found := sorted(each.name for each in data.iterdir() if each.name not in allowed):
         raise BackupError(
             f"{data} has {', '.join(found[:5])}: a backup is put back into an empty data folder"

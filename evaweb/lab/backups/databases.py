@@ -15,7 +15,7 @@ from typing import Protocol
 from django.conf import settings
 from django.db import connection, transaction
 
-from evaweb.environment import beside
+from evaweb.environment import database_files
 from evaweb.lab.backups.errors import BackupError
 
 Rows = Mapping[str, int]
@@ -116,7 +116,7 @@ class _SQLite:
 
     def restore(self, path: Path) -> None:
         connection.close()
-        for old in beside(self._path):
+        for old in database_files(self._path):
             old.unlink()
         draft = self._path.with_name(f".{self._path.name}.restored")
         shutil.copyfile(path, draft)

@@ -13,7 +13,7 @@ from django.conf import settings
 from django.db import Error
 from django.utils import timezone
 
-from evaweb.blinding import Sight, sight_of
+from evaweb.blinding import Visibility, visibility_for_user
 from evaweb.errors import EvaError
 from evaweb.lab.diagnosis import contents, summary
 from evaweb.lab.diagnosis.scrubbing import Scrubber, known_secrets
@@ -26,7 +26,7 @@ Tell = Callable[[str], None]
 Named = tuple[str, Any]
 
 
-def write(path: Path, sight: Sight, tell: Tell) -> list[str]:
+def write(path: Path, sight: Visibility, tell: Tell) -> list[str]:
     """Write the bundle at `path`, for its user alone, as `sight` may see it; returns what is not in it.
 
     `tell` hears which part is being gathered. It is whole, or not there.
@@ -46,7 +46,9 @@ def write(path: Path, sight: Sight, tell: Tell) -> list[str]:
     return notes
 
 
-def _fill(packed: zipfile.ZipFile, scrubber: Scrubber, sight: Sight, notes: list[str], tell: Tell) -> None:
+def _fill(
+    packed: zipfile.ZipFile, scrubber: Scrubber, sight: Visibility, notes: list[str], tell: Tell
+) -> None:
     parts: dict[str, Any] = {}
     written: list[tuple[str, int]] = []
 
@@ -70,8 +72,8 @@ def _fill(packed: zipfile.ZipFile, scrubber: Scrubber, sight: Sight, notes: list
     put("summary.html", summary.as_html(title, found))
 
 
-def _parts(sight: Sight, notes: list[str], tell: Tell) -> Iterator[Named]:
-    if not sight.clear:
+def _parts(sight: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
+    if not sight.sees_everything:
         notes.append(f"logs, policies of deployments, and what tells of checkpoints: {sight.plans}")
     tell("versions and settings")
     yield "versions.json", contents.versions()
@@ -85,17 +87,17 @@ def _parts(sight: Sight, notes: list[str], tell: Tell) -> Iterator[Named]:
     yield from _guarded("stations", _stations(sight, notes, tell), notes)
 
 
-def _of_database(sight: Sight) -> Iterator[Named]:
+def _of_database(sight: Visibility) -> Iterator[Named]:
     yield "database.json", contents.database()
     yield "jobs.json", contents.jobs(sight)
 
 
-def _deployments(sight: Sight) -> Iterator[Named]:
+def _deployments(sight: Visibility) -> Iterator[Named]:
     for name, tree in contents.deployment_files(sight):
         yield f"deployments/{name}.json", tree
 
 
-def _stations(sight: Sight, notes: list[str], tell: Tell) -> Iterator[Named]:
+def _stations(sight: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
     for station in Station.objects.order_by("name"):
         tell(f"the station {station.name}")
         found = contents.station_parts(station, sight)
@@ -111,9 +113,9 @@ def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Na
         notes.append(f"{what} as far as it could not be read: {error}")
 
 
-def _logs(sight: Sight, notes: list[str]) -> Iterator[tuple[str, str]]:
+def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
     """Names and ends of logs; they name checkpoints and servers, so that who is blind gets none."""
-    if not sight.clear:
+    if not sight.sees_everything:
         return
     room = LONGEST_LOGS
     for path in contents.logs():
@@ -132,12 +134,12 @@ def _logs(sight: Sight, notes: list[str]) -> Iterator[tuple[str, str]]:
         yield f"logs/{path.name}", end.decode("utf-8", "replace")
 
 
-def sight_for(user: Any) -> Sight:
+def sight_for(user: Any) -> Visibility:
     """What the user may see; of a database that does not say, nothing that a plan could hide."""
     try:
-        return sight_of(user)
+        return visibility_for_user(user)
     except Error as error:
-        return Sight(checkpoints=frozenset({0}), plans=f"who is blind cannot be read ({error})")
+        return Visibility(checkpoints=frozenset({0}), plans=f"who is blind cannot be read ({error})")
 
 
 def folder(user: Any) -> Path:

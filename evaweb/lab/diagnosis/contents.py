@@ -20,14 +20,14 @@ from django.db import connection
 from django.db.migrations.executor import MigrationExecutor
 from django.utils import timezone
 
-from evaweb.binary_frames import plain
-from evaweb.blinding import HIDDEN, Sight
+from evaweb.binary_frames import to_json_value
+from evaweb.blinding import HIDDEN, Visibility
 from evaweb.errors import StationGone
 from evaweb.jobs.models import Job
 from evaweb.lab import deployments, machine_check
 from evaweb.stations import redaction
 from evaweb.stations.models import Command, Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.config.loader import ConfigurationError, tree_of
 from runtime.core.git_revision import revision
 
@@ -104,20 +104,20 @@ def database() -> dict[str, Any]:
     }
 
 
-def jobs(sight: Sight) -> list[dict[str, Any]]:
+def jobs(sight: Visibility) -> list[dict[str, Any]]:
     """The newest jobs; what may tell which checkpoint was worked on is covered for who is blind."""
     names = ("id", "kind", "key", "queue", "status", "attempts", "deaths", "progress", "error")
     rows = []
     for job in Job.objects.order_by("-created_at", "-pk")[:_JOBS]:
         row = {name: getattr(job, name) for name in names} | {"result": job.result}
-        if not sight.clear:
+        if not sight.sees_everything:
             row |= {name: HIDDEN if row[name] else "" for name in ("progress", "error")} | {"result": {}}
         times = {name: getattr(job, name) for name in ("created_at", "claimed_at", "finished_at")}
         rows.append(row | {name: at and at.isoformat() for name, at in times.items()})
     return rows
 
 
-def deployment_files(sight: Sight) -> Iterator[tuple[str, dict[str, Any]]]:
+def deployment_files(sight: Visibility) -> Iterator[tuple[str, dict[str, Any]]]:
     """Name and table of each deployment that a station or the data folder has, as it is written, without comments."""
     known = {one.name: one.path for one in deployments.kept()}
     for station in Station.objects.exclude(deployment=""):
@@ -127,14 +127,14 @@ def deployment_files(sight: Sight) -> Iterator[tuple[str, dict[str, Any]]]:
             tree = tree_of(path)
         except ConfigurationError as fault:
             tree = {"unreadable": str(fault)}
-        if not sight.clear and "policy" in tree:
+        if not sight.sees_everything and "policy" in tree:
             tree["policy"] = HIDDEN
         yield name, tree
 
 
-def station_parts(station: Station, sight: Sight) -> Iterator[tuple[str, Any]]:
+def station_parts(station: Station, sight: Visibility) -> Iterator[tuple[str, Any]]:
     """(part, contents) of one station: its state now, its newest events, the newest commands."""
-    wire = wire_to(station.name)
+    wire = connection_to(station.name)
     about = {name: getattr(station, name) for name in ("name", "robot", "simulated", "active", "message")}
     try:
         snapshot: Mapping[str, Any] = wire.status(timeout=_ASK_S)
@@ -142,12 +142,14 @@ def station_parts(station: Station, sight: Sight) -> Iterator[tuple[str, Any]]:
     except StationGone as gone:
         yield "state", {"station": about, "gone": str(gone)}
     else:
-        veiled = not sight.clear and (sight.veils(station.name, snapshot) or sight.veils_events(station.name))
+        veiled = not sight.sees_everything and (
+            sight.redacts_snapshot(station.name, snapshot) or sight.redacts_events(station.name)
+        )
         yield (
             "state",
-            {"station": about, "snapshot": redaction.state(snapshot, sight) if veiled else snapshot},
+            {"station": about, "snapshot": redaction.redact_state(snapshot, sight) if veiled else snapshot},
         )
-        yield "events", redaction.events(events, sight) if veiled else events
+        yield "events", redaction.redact_events(events, sight) if veiled else events
     yield "commands", [_command(row, sight) for row in station.commands.select_related("user")[:_COMMANDS]]
 
 
@@ -157,24 +159,24 @@ def logs() -> list[Path]:
     return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
 
 
-def programs(sight: Sight) -> list[dict[str, Any]]:
+def programs(sight: Visibility) -> list[dict[str, Any]]:
     """Whether the lab runs and, of each program that has a log, how long it has said nothing [s].
 
     Which policy was asked last tells which checkpoint ran: who is blind is told of the lab alone.
     """
     now = time.time()
     rows: list[dict[str, Any]] = [{"program": "lab", "runs": deployments.lab_runs()}]
-    seen = logs() if sight.clear else []
+    seen = logs() if sight.sees_everything else []
     return rows + [{"program": path.stem, "silent_s": round(now - path.stat().st_mtime, 1)} for path in seen]
 
 
-def _command(row: Command, sight: Sight) -> dict[str, Any]:
-    hidden = not sight.clear and sight.veils_events(row.station.name)
+def _command(row: Command, sight: Visibility) -> dict[str, Any]:
+    hidden = not sight.sees_everything and sight.redacts_events(row.station.name)
     return {
         "at": row.issued_at.isoformat(),
         "kind": row.kind,
         "user": row.user.get_username() if row.user else "",
         "status": row.status,
-        "reason": sight.told(row.reason) if hidden else row.reason,
-        "args": {} if hidden else plain(row.args),
+        "reason": sight.redact_text(row.reason) if hidden else row.reason,
+        "args": {} if hidden else to_json_value(row.args),
     }

@@ -21,7 +21,7 @@ from evaweb.trials.models import Score, TrialStatus
 OUTCOMES = {"first", "second", "tie"}
 
 
-def agreement_of(plan: Plan) -> dict[str, Any] | None:
+def rater_agreement(plan: Plan) -> dict[str, Any] | None:
     """Of first and second raters, on success and on each milestone; None without second ratings.
 
     Each second rating is held against the score that stood when it was made: what was corrected since may follow it.
@@ -33,7 +33,7 @@ def agreement_of(plan: Plan) -> dict[str, Any] | None:
     )
     if not rows:
         return None
-    verdicts = [(_stood(row), row) for row in rows]
+    verdicts = [(_score_at(row), row) for row in rows]
     return {
         "trials": len({row.trial_id for row in rows}),
         "ratings": len(rows),
@@ -71,7 +71,7 @@ def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _stood(rating: Rating | Judgement) -> Score:
+def _score_at(rating: Rating | Judgement) -> Score:
     """The newest score of its trial when it was made; the first one where a clock that was set back says none was."""
     scores = list(rating.trial.scores.all())
     return next((score for score in reversed(scores) if score.scored_at <= rating.at), scores[0])
@@ -99,7 +99,7 @@ def _defined(statistic: Callable[..., float], *given: Any) -> float | None:
         return None
 
 
-def judges_of(plan: Plan) -> list[dict[str, Any]] | None:
+def judge_agreement(plan: Plan) -> list[dict[str, Any]] | None:
     """Of each version of each automatic judge and the score that stood then, milestone by milestone; None without any.
 
     No rating of a person is in it, and nothing of it in theirs.
@@ -117,7 +117,7 @@ def _judged(judge: str, version: str, rows: list[Judgement]) -> dict[str, Any]:
     said: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
     for row in rows:
         words = by_words((text, own) for text, *own in row.milestones)
-        for text, reached in _scored(_stood(row)).items():
+        for text, reached in _scored(_score_at(row)).items():
             if text in words:
                 said.setdefault(text, []).append((reached, *words[text]))
     return {
@@ -146,7 +146,7 @@ def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str
     return asdict(calibration(given)) if given else None
 
 
-def comparisons_of(plan: Plan) -> list[Comparison]:
+def preference_comparisons(plan: Plan) -> list[Comparison]:
     """Preferences of people, by checkpoint: all that were said of the same two trials weigh as one.
 
     In random order two trials of a block may be of one checkpoint: they are asked about like others and say nothing.
@@ -159,13 +159,13 @@ def comparisons_of(plan: Plan) -> list[Comparison]:
     return [Comparison(*named, 1 / people[first, second]) for first, second, *named in said]
 
 
-def preferences_of(plan: Plan) -> dict[str, Any] | None:
+def preference_ranking(plan: Plan) -> dict[str, Any] | None:
     """Bradley-Terry-Davidson of the plan's preferences; None where there is none.
 
     Where no finite, unique ranking exists `ranking` is null, `reason` says why, and `groups` can be ranked among
     themselves.
     """
-    given = comparisons_of(plan)
+    given = preference_comparisons(plan)
     if not given:
         return None
     counted = {"n": len(given), "ties": sum(row.outcome == "tie" for row in given)}

@@ -12,22 +12,29 @@ from enum import StrEnum
 from itertools import combinations
 from typing import TypeVar
 
-from evaweb.results.analysis.outcomes import Interruption, Outcome, Pair, by_checkpoint, paired, unbroken
+from evaweb.results.analysis.outcomes import (
+    Interruption,
+    Outcome,
+    Pair,
+    by_checkpoint,
+    pair_by_block,
+    unbroken,
+)
 from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
-from evaweb.statistics.bounded import Mean, bounded_mean
+from evaweb.statistics.bounded import BoundedMean, bounded_mean
 from evaweb.statistics.confidence_sequence import confidence_sequence
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
 from evaweb.statistics.many import holm, letters
 from evaweb.statistics.means import Average, average
 from evaweb.statistics.paired import McNemar, mcnemar, over_conditions
-from evaweb.statistics.permutation import Flips, sign_flips
-from evaweb.statistics.progress import Step, funnel
+from evaweb.statistics.permutation import SignFlipTest, sign_flip_test
+from evaweb.statistics.progress import FunnelStep, funnel
 from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
 from evaweb.statistics.rates import Rate, rate
 from evaweb.statistics.sequential import Evidence, score_evidence, success_evidence
-from evaweb.statistics.success_times import Curve, RestrictedMean, incidence, restricted_mean
-from evaweb.trials.failure_words import NOT_SAID, why_words
+from evaweb.statistics.success_times import Curve, RestrictedMean, cumulative_incidence, restricted_mean
+from evaweb.trials.failure_words import UNSPECIFIED, failure_text
 
 SEED = 20_260  # of all that is drawn: the same data give the same interval
 _RANDOM = "checkpoints came in random order: there are no pairs"
@@ -40,7 +47,7 @@ class Funnel:
 
     scene: str
     labels: tuple[str, ...]
-    steps: tuple[Step, ...]
+    steps: tuple[FunnelStep, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +66,7 @@ class FailureMode:
     @property
     def words(self) -> str:
         """As it is shown."""
-        return why_words(self.phase, self.cause) or NOT_SAID
+        return failure_text(self.phase, self.cause) or UNSPECIFIED
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +85,8 @@ class Arm:
     success: Proportion
     exact: Interval | None
     posterior: Posterior
-    score: Mean
-    macro: Mean
+    score: BoundedMean
+    macro: BoundedMean
     scenes: dict[str, Proportion]
     cells: dict[str, Proportion]
     funnels: tuple[Funnel, ...]
@@ -149,7 +156,7 @@ class Comparison:
     better: float | None
     pairs: int
     paired: McNemar | None
-    scored: Flips | None
+    scored: SignFlipTest | None
     clustered: Difference | None
     stratified: strata.Stratified | None
     within: dict[str, Within]
@@ -159,7 +166,7 @@ class Comparison:
     score_evidence: Evidence | None
     anytime: Interval | None
     score_anytime: Interval | None
-    sooner: Flips | None
+    time_test: SignFlipTest | None
     notes: tuple[str, ...]
 
 
@@ -191,7 +198,7 @@ class Analysis:
         """That of a checkpoint."""
         return next(arm for arm in self.arms if arm.checkpoint == checkpoint)
 
-    def compared(self, first: str, second: str) -> Comparison | None:
+    def comparison_of(self, first: str, second: str) -> Comparison | None:
         """Their comparison, whichever way round it was made; None where there is none."""
         return next((c for c in self.comparisons if {c.first, c.second} == {first, second}), None)
 
@@ -226,7 +233,7 @@ def analyse(
     the evaluation, in the order in which they have their colours, whichever of them are chosen.
     """
     by_design = planned or {}
-    arms, timing = by_checkpoint(outcomes), _Timing.of(outcomes, limits or {})
+    arms, timing = by_checkpoint(outcomes), _TimeHorizon.of(outcomes, limits or {})
     series = list(dict.fromkeys([*checkpoints, *sorted(arms)]))
     ranked = sorted(arms, key=lambda name: (-sum(o.success for o in arms[name]) / len(arms[name]), name))
     couples = [_directed(couple, by_design) for couple in combinations(ranked, 2)]
@@ -284,14 +291,14 @@ def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) 
 
 
 @dataclass(frozen=True, slots=True)
-class _Timing:
+class _TimeHorizon:
     """The horizon of times to success [s], 0 where nothing has a duration, and the limits of scenes [s]."""
 
     until: float
     limits: Mapping[str, float]
 
     @classmethod
-    def of(cls, outcomes: Sequence[Outcome], limits: Mapping[str, float]) -> _Timing:
+    def of(cls, outcomes: Sequence[Outcome], limits: Mapping[str, float]) -> _TimeHorizon:
         longest = max((o.duration for o in outcomes if o.duration is not None), default=0.0)
         return cls(min(limits.values(), default=longest), limits)
 
@@ -305,7 +312,7 @@ class _Timing:
             return None
         return min(outcome.duration, self.limits.get(outcome.scene, outcome.duration))
 
-    def lasted(self, outcome: Outcome) -> float:
+    def time_within_horizon(self, outcome: Outcome) -> float:
         """The same within the horizon, which is what a failure counts for."""
         time = self.time(outcome)
         return self.until if time is None else min(time, self.until)
@@ -343,7 +350,7 @@ def _test(first: Sequence[Outcome], second: Sequence[Outcome]) -> ExactTest:
     return barnard(*_counts(first), *_counts(second))
 
 
-def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption], timing: _Timing) -> Arm:
+def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption], timing: _TimeHorizon) -> Arm:
     successes, n = _counts(trials)
     scenes, cells = _grouped(trials, lambda o: o.scene), _grouped(trials, lambda o: o.condition)
     timed = [o for o in trials if o.duration is not None]
@@ -360,7 +367,7 @@ def _arm(name: str, trials: list[Outcome], interruptions: list[Interruption], ti
         {key: proportion(*_counts(rows)) for key, rows in scenes.items()},
         {key: proportion(*_counts(rows)) for key, rows in cells.items()},
         tuple(_funnel(scene, rows) for scene, rows in scenes.items() if rows[0].milestones),
-        incidence(times, timing.until) if times else None,
+        cumulative_incidence(times, timing.until) if times else None,
         restricted_mean(times, timing.until, seed=SEED) if times else None,
         rate(sum(succeeded), sum(durations)) if timed and sum(durations) > 0 else None,
         _interventions(durations, interruptions),
@@ -401,12 +408,12 @@ def _comparison(
     corrected: float,
     alpha: float,
     verdict: Verdict | None,
-    timing: _Timing,
+    timing: _TimeHorizon,
     in_pairs: bool,
     whole: bool,
 ) -> Comparison:
     notes: list[str] = []
-    pairs = paired(first, second) if in_pairs else []
+    pairs = pair_by_block(first, second) if in_pairs else []
     told = unbroken(pairs) if whole else pairs
     if len(told) < len(pairs):
         notes.append(_later(len(pairs) - len(told)))
@@ -422,9 +429,9 @@ def _comparison(
         probability_better(*counts),
         len(pairs),
         mcnemar([(p.first.success, p.second.success) for p in pairs]) if pairs else None,
-        sign_flips([p.first.score - p.second.score for p in pairs]) if pairs else None,
-        _said(notes, lambda: _clustered(first, second)),
-        _said(notes, lambda: _stratified(first, second)),
+        sign_flip_test([p.first.score - p.second.score for p in pairs]) if pairs else None,
+        _compute_or_note(notes, lambda: _clustered(first, second)),
+        _compute_or_note(notes, lambda: _stratified(first, second)),
         _within(first, second),
         *_by_scene(first, second),
         success_evidence([(p.first.success, p.second.success) for p in told], alpha),
@@ -432,7 +439,7 @@ def _comparison(
         confidence_sequence([float(p.first.success) - p.second.success for p in told], alpha),
         confidence_sequence([p.first.score - p.second.score for p in told], alpha),
         _sooner(pairs, timing),
-        (*notes, *(_waiting(pairs, first, second) if in_pairs else [_RANDOM])),
+        (*notes, *(_unpaired_note(pairs, first, second) if in_pairs else [_RANDOM])),
     )
     return found if verdict is None or verdict.ended else _described(found, verdict.evidence)
 
@@ -455,7 +462,7 @@ def _described(found: Comparison, evidence: str) -> Comparison:
         score_evidence=own_score,
         anytime=None,
         score_anytime=None,
-        sooner=None,
+        time_test=None,
     )
 
 
@@ -473,7 +480,7 @@ def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.S
     if len(set(ours) | set(theirs)) < 2:
         return None  # of one scene there is nothing to stratify
     return strata.mantel_haenszel(
-        [strata.Table(*_counts(ours[key]), *_counts(theirs[key])) for key in shared]
+        [strata.StratumTable(*_counts(ours[key]), *_counts(theirs[key])) for key in shared]
     )
 
 
@@ -487,11 +494,13 @@ STRATA: dict[str, Callable[[Outcome], str]] = {
 
 def _tables(
     first: Sequence[Outcome], second: Sequence[Outcome], key: Callable[[Outcome], str]
-) -> dict[str, strata.Table]:
+) -> dict[str, strata.StratumTable]:
     """Those strata in which both were tried."""
     ours, theirs = _grouped(first, key), _grouped(second, key)
     return {
-        name: strata.Table(*_counts(ours[name]), *_counts(theirs[name])) for name in ours if name in theirs
+        name: strata.StratumTable(*_counts(ours[name]), *_counts(theirs[name]))
+        for name in ours
+        if name in theirs
     }
 
 
@@ -515,14 +524,17 @@ def _by_scene(
     return differences, strata.interaction(list(tables.values()))
 
 
-def _sooner(pairs: Sequence[Pair], timing: _Timing) -> Flips | None:
+def _sooner(pairs: Sequence[Pair], timing: _TimeHorizon) -> SignFlipTest | None:
     known = [p for p in pairs if timing.known(p.first) and timing.known(p.second)]
     if not known:
         return None
-    return sign_flips([timing.lasted(p.first) - timing.lasted(p.second) for p in known], timing.until)
+    return sign_flip_test(
+        [timing.time_within_horizon(p.first) - timing.time_within_horizon(p.second) for p in known],
+        timing.until,
+    )
 
 
-def _waiting(pairs: Sequence[Pair], first: Sequence[Outcome], second: Sequence[Outcome]) -> list[str]:
+def _unpaired_note(pairs: Sequence[Pair], first: Sequence[Outcome], second: Sequence[Outcome]) -> list[str]:
     left = len(first) + len(second) - 2 * len(pairs)
     if not left:
         return []
@@ -557,7 +569,7 @@ def _grouped(trials: Sequence[Outcome], key: Callable[[Outcome], str]) -> dict[s
     return dict(sorted(found.items()))
 
 
-def _said(notes: list[str], compute: Callable[[], T]) -> T | None:
+def _compute_or_note(notes: list[str], compute: Callable[[], T]) -> T | None:
     """Result of `compute`, or None with the reason among the notes."""
     try:
         return compute()

@@ -13,12 +13,12 @@ from typing import Any
 
 from django.db.models import Count, Max, Q, Sum
 
-from evaweb.memo import Kept, steady
-from evaweb.plans.design import compared, findings_of, frozen, planned
+from evaweb.memo import FingerprintCache, rounded_sum
+from evaweb.plans.design import compared, findings_of, frozen_design, planned
 from evaweb.plans.models import Allocation, Plan
 from evaweb.results.analysis.analysis import Analysis, Verdict, analyse
-from evaweb.results.analysis.filters import Chosen
-from evaweb.results.analysis.load_outcomes import interruptions_of_plan, outcomes_of_plan
+from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.analysis.load_outcomes import load_plan_interruptions, load_plan_outcomes
 from evaweb.results.analysis.outcomes import Interruption, Outcome, by_checkpoint
 from evaweb.statistics.designs import ANYTIME
 from evaweb.statistics.proportions import Proportion, proportion
@@ -33,10 +33,10 @@ class Runs:
     interruptions: list[Interruption]
 
 
-_runs: Kept[Runs] = Kept()
-_corrected: Kept[list[Outcome]] = Kept()
-_analyses: Kept[Analysis] = Kept()
-_pages: Kept[dict[str, Any]] = Kept()
+_runs: FingerprintCache[Runs] = FingerprintCache()
+_corrected: FingerprintCache[list[Outcome]] = FingerprintCache()
+_analyses: FingerprintCache[Analysis] = FingerprintCache()
+_pages: FingerprintCache[dict[str, Any]] = FingerprintCache()
 
 
 def fingerprint(plan: Plan) -> Hashable:
@@ -52,28 +52,28 @@ def fingerprint(plan: Plan) -> Hashable:
         measured=Count("episode__smoothness"),
         changed=Max("changed_at"),
     )
-    counted["seconds"] = steady(counted["seconds"])
+    counted["seconds"] = rounded_sum(counted["seconds"])
     names = plan.checkpoints.order_by("pk").values_list("pk", "name")
     scenes = Scene.objects.filter(positions__plan=plan.pk).order_by("pk").distinct().values_list("pk", "name")
     return (plan.state, *counted.values(), *names, *scenes)
 
 
-def runs_of(plan: Plan, at: Hashable = None) -> Runs:
+def cached_runs(plan: Plan, at: Hashable = None) -> Runs:
     """All runs of the plan; `at` is its fingerprint where that is known already."""
     now = at or fingerprint(plan)
     return _runs.get(
-        (plan.pk, plan.digest), now, lambda: Runs(outcomes_of_plan(plan), interruptions_of_plan(plan))
+        (plan.pk, plan.digest), now, lambda: Runs(load_plan_outcomes(plan), load_plan_interruptions(plan))
     )
 
 
-def corrected_of(plan: Plan, only: Chosen) -> dict[str, Proportion]:
+def corrected_of(plan: Plan, only: TrialFilter) -> dict[str, Proportion]:
     """Successes by checkpoint with the scores of now, where those of a revealed plan were corrected since."""
     if not plan.at_reveal:
         return {}
     at = fingerprint(plan)
-    now = _corrected.get((plan.pk, plan.digest), at, lambda: outcomes_of_plan(plan, corrected=True))
+    now = _corrected.get((plan.pk, plan.digest), at, lambda: load_plan_outcomes(plan, corrected=True))
     found = {}
-    before = by_checkpoint(only.apply(runs_of(plan, at).outcomes))
+    before = by_checkpoint(only.apply(cached_runs(plan, at).outcomes))
     for name, rows in by_checkpoint(only.apply(now)).items():
         if [(o.trial, o.success, o.score) for o in rows] != [
             (o.trial, o.success, o.score) for o in before.get(name, [])
@@ -82,10 +82,10 @@ def corrected_of(plan: Plan, only: Chosen) -> dict[str, Proportion]:
     return found
 
 
-def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> Analysis:
+def cached_analysis(plan: Plan, only: TrialFilter | None = None, at: Hashable = None) -> Analysis:
     """Analysis of the plan's trials, or of those that are chosen."""
     now = at or fingerprint(plan)
-    runs, which = runs_of(plan, now), only or Chosen()
+    runs, which = cached_runs(plan, now), only or TrialFilter()
 
     def make() -> Analysis:
         return analyse(
@@ -96,7 +96,7 @@ def analysis_of(plan: Plan, only: Chosen | None = None, at: Hashable = None) -> 
             in_pairs=plan.allocation == Allocation.PAIRED,
             limits=limits_of(plan),
             checkpoints=[row["name"] for row in (plan.document or {}).get("checkpoints", ())],
-            whole=which == Chosen(),
+            whole=which == TrialFilter(),
             recipes=recipes_of(plan),
         )
 
@@ -116,7 +116,7 @@ def recipes_of(plan: Plan) -> dict[str, str]:
 
 def verdicts_of(plan: Plan) -> dict[tuple[str, str], Verdict]:
     """What its design says of each comparison of a plan; those of a draft are open."""
-    found, design = findings_of(plan), frozen(plan.document) if plan.document else None
+    found, design = findings_of(plan), frozen_design(plan.document) if plan.document else None
     if found is None or design is None:
         return dict.fromkeys(planned(plan), Verdict())
     own = design.outcome if design.rule == ANYTIME else ""
@@ -136,12 +136,14 @@ def limits_of(plan: Plan) -> dict[str, float]:
     return {scene["name"]: scene["time_limit_s"] for scene in scenes if scene["time_limit_s"] is not None}
 
 
-def page_of(plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def cached_page(
+    plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]
+) -> dict[str, Any]:
     """Contents of the plan's page of that name, figures included."""
     return _pages.get((plan.pk, plan.digest, name), at, make)
 
 
-def forget() -> None:
+def clear_caches() -> None:
     """Drop what is kept: the next callers wait for it to be made."""
     _runs.clear()
     _corrected.clear()

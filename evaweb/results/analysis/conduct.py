@@ -16,7 +16,7 @@ from django.contrib.admin.models import CHANGE, LogEntry
 from django.db.models import Count, F, Q
 from django.utils import timezone
 
-from evaweb.memo import Kept
+from evaweb.memo import FingerprintCache
 from evaweb.plans.bench_checks import HOLDS
 from evaweb.plans.counting import end_of
 from evaweb.plans.design import Names, compared
@@ -24,9 +24,9 @@ from evaweb.plans.models import Achieved, CameraCheck, Plan
 from evaweb.plans.models import Look as Behind
 from evaweb.plans.selectors import plans_beside
 from evaweb.results.analysis.drift import anchors_of
-from evaweb.results.analysis.integrity import changes_of, with_changes
+from evaweb.results.analysis.integrity import checkpoint_changes, with_changes
 from evaweb.statistics.many import holm
-from evaweb.statistics.permutation import sign_flips
+from evaweb.statistics.permutation import sign_flip_test
 from evaweb.trials.endings import ESTOP, INTERRUPTION
 from evaweb.trials.models import Scene, Score, TrialStatus, VoidRequest
 
@@ -39,11 +39,11 @@ DELAYS = {
 }
 """What is compared between the checkpoints, all in s."""
 _DAY = timedelta(days=1)
-_delays: Kept[list[dict[str, Any]]] = Kept()
+_delays: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class AttemptRecord:
     """An attempt as it was handed out; delays are in s, None where they are not known.
 
     `match` is the least of its bench when last looked at before the run, `override` the reason that was given then.
@@ -83,7 +83,7 @@ class Run:
         return _seconds(self.handed_at, self.started_at)
 
 
-def conduct_of(plan: Plan, runs: Sequence[Run], looks: Iterable[Look]) -> dict[str, Any]:
+def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Look]) -> dict[str, Any]:
     """All of it, `runs` being all attempts and `looks` all looks at their bench.
 
     One query more for each version of the plan before this one.
@@ -124,7 +124,7 @@ def looked_behind(plan: Plan) -> list[dict[str, Any]]:
     ]
 
 
-def runs_of(plan: Plan, looks: Iterable[Look]) -> list[Run]:
+def all_attempts(plan: Plan, looks: Iterable[Look]) -> list[AttemptRecord]:
     """Every attempt in the order in which it was handed out; one query."""
     fields = (
         "number",
@@ -145,7 +145,7 @@ def runs_of(plan: Plan, looks: Iterable[Look]) -> list[Run]:
         *plain, took, policy, kept, recording = row
         latency = _number(policy, "latency_ms", "p50")
         delays = (_number(took, "connect_s"), _number(took, "warm_up_s"), latency and latency / 1000)
-        made = Run(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays)
+        made = AttemptRecord(*plain, *accepted.get(row[fields.index("trial_id")], (None, "")), *delays)
         told_now = made.status == TrialStatus.VOIDED and kept is None  # its reason is a person's
         found.append(
             made if told_now else replace(made, ended=end_of(kept, made.status, made.reason or "", recording))
@@ -204,7 +204,7 @@ def _accepted(looks: Iterable[Look]) -> dict[int, tuple[float | None, str]]:
     }
 
 
-def balance(runs: Iterable[Run], name: str) -> dict[str, Any]:
+def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
     """Trials that count of each operator or station with each checkpoint.
 
     `uneven`: the most trials by which one of them is off its share of a checkpoint's. Checkpoints that were dropped, or
@@ -227,7 +227,7 @@ def balance(runs: Iterable[Run], name: str) -> dict[str, Any]:
     return {"checkpoints": names, "rows": rows, "uneven": uneven}
 
 
-def _checkpoints(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _checkpoints(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
     again = Counter(run.checkpoint for run in runs if run.attempt > 1)
     return [
         {
@@ -237,11 +237,11 @@ def _checkpoints(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
             "operators": sorted(row.operators),
             "stations": sorted(row.stations),
         }
-        for row in changes_of(plan)
+        for row in checkpoint_changes(plan)
     ]
 
 
-def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _voids(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
     """Every void with what became of it: those that were asked for, then those that needed one operator alone."""
     known = {run.trial: run for run in runs}
     asked = VoidRequest.objects.filter(trial__handout__plan=plan).order_by("pk")
@@ -271,7 +271,7 @@ def _voids(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
     ]
 
 
-def _broken_off(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _broken_off(runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
     """Attempts that the e-stop or an interruption ended, or that never ran, and why."""
     return [
         {
@@ -291,7 +291,7 @@ def _broken_off(runs: Sequence[Run]) -> list[dict[str, Any]]:
     ]
 
 
-def _corrections(plan: Plan, runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
     """Every score but the first of its trial, and first scores that came after the reveal; `late`: after it.
 
     `changed`: the "verdict", or with the verdict as it was the "category" of a failure or the "note" alone.
@@ -363,9 +363,9 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
     ]
 
 
-def _deviations(runs: Sequence[Run], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _deviations(runs: Sequence[AttemptRecord], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """From the schedule: what a block should have had in common, and the turn in which trials come."""
-    blocks: dict[int, list[Run]] = defaultdict(list)
+    blocks: dict[int, list[AttemptRecord]] = defaultdict(list)
     for run in runs:
         if run.status != TrialStatus.ABANDONED:
             blocks[run.block].append(run)
@@ -377,8 +377,8 @@ def _deviations(runs: Sequence[Run], given_back: Sequence[dict[str, Any]]) -> di
         "split_operators": [
             b for b, rows in sorted(blocks.items()) if len({run.operator for run in rows}) > 1
         ],
-        "order": [block for block, rows in sorted(blocks.items()) if _disordered(rows)],
-        "out_of_turn": _out_of_turn(runs),
+        "order": [block for block, rows in sorted(blocks.items()) if _is_out_of_order(rows)],
+        "out_of_turn": _out_of_order_codes(runs),
         "span_median_s": median(spans.values()) if spans else None,
         "span_longest_s": spans[longest] if longest is not None else None,
         "span_longest_block": longest,
@@ -387,19 +387,19 @@ def _deviations(runs: Sequence[Run], given_back: Sequence[dict[str, Any]]) -> di
     }
 
 
-def _span(rows: Iterable[Run]) -> float | None:
+def _span(rows: Iterable[AttemptRecord]) -> float | None:
     """Between the first and the last start of the trials of a block that count [s]."""
     starts = [run.started_at for run in rows if run.counts and run.started_at is not None]
     return (max(starts) - min(starts)).total_seconds() if len(starts) > 1 else None
 
 
-def _disordered(rows: Iterable[Run]) -> bool:
+def _is_out_of_order(rows: Iterable[AttemptRecord]) -> bool:
     """True if the trials that count were not run in the order that was drawn."""
     slots = [run.slot for run in rows if run.counts]
     return slots != sorted(slots)
 
 
-def _out_of_turn(runs: Iterable[Run]) -> list[str]:
+def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
     """Codes of first attempts that came after a later one of the schedule at the same station."""
     reached: dict[str, int] = {}
     begun: set[int] = set()
@@ -412,7 +412,7 @@ def _out_of_turn(runs: Iterable[Run]) -> list[str]:
     return found
 
 
-def _cameras(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
+def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     """When somebody confirmed them at the plan's stations while its trials were made, and trials without that."""
     handed = [run.handed_at for run in runs]
     if not handed:
@@ -441,7 +441,7 @@ def _cameras(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
     return {"checks": checks, "unchecked": unchecked}
 
 
-def _bench(plan: Plan, runs: Iterable[Run], looks: Iterable[Look]) -> dict[str, Any]:
+def _bench(plan: Plan, runs: Iterable[AttemptRecord], looks: Iterable[Look]) -> dict[str, Any]:
     """The plan's least match, trials that ran below it, those of which no match is known, and changed references."""
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []
@@ -474,10 +474,10 @@ def _bench(plan: Plan, runs: Iterable[Run], looks: Iterable[Look]) -> dict[str, 
 # --- delays ---------------------------------------------------------------------------------------------------
 
 
-def _compared(plan: Plan, runs: Sequence[Run]) -> dict[str, Any]:
+def _compared(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     """Each delay of each checkpoint, and of the compared ones a test within pairs, corrected for how many there are."""
     names = compared(plan.document or {})
-    gaps = _gaps(runs)
+    gaps = _idle_gaps(runs)
     values = tuple(
         (
             name,
@@ -535,7 +535,7 @@ def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
     first, second = names
     pairs = [found[first] - found[second] for found in blocks if first in found and second in found]
     widest = max(map(abs, pairs), default=0.0)
-    test = sign_flips(pairs, widest) if widest else None
+    test = sign_flip_test(pairs, widest) if widest else None
     return {
         "first": first,
         "second": second,
@@ -545,7 +545,7 @@ def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
     }
 
 
-def _gaps(runs: Iterable[Run]) -> dict[int, float]:
+def _idle_gaps(runs: Iterable[AttemptRecord]) -> dict[int, float]:
     """Of each attempt that ran, by its number, the time since the one before at its station ended [s]."""
     ended: dict[str, datetime] = {}
     found = {}

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from django.db.models import Q
 
 from evaweb.plans.models import Plan, PlanState
-from evaweb.results.analysis.load_outcomes import outcomes_of_plan
-from evaweb.statistics.strata import Table, exact_within
+from evaweb.results.analysis.load_outcomes import load_plan_outcomes
+from evaweb.statistics.strata import StratumTable, exact_within
 
 
 class _Tried(NamedTuple):
@@ -79,7 +79,7 @@ def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
     """Trials of it that count, in the order in which they were handed out; as they were judged at a reveal."""
     return [
         _Tried(plan, (each.station, each.scene, each.position), each.success)
-        for each in outcomes_of_plan(plan)
+        for each in load_plan_outcomes(plan)
         if each.checkpoint == name and each.scene in scenes
     ]
 
@@ -106,5 +106,5 @@ def _differ(before: Sequence[_Tried], since: Sequence[_Tried]) -> float | None:
         sides = [[each.success for each in rows if each.condition == condition] for rows in (before, since)]
         (one, n), (other, m) = ((sum(side), len(side)) for side in sides)
         if n and m:
-            tables.append(Table(one, n, other, m))
+            tables.append(StratumTable(one, n, other, m))
     return exact_within(tables, least=1)

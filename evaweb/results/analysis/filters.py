@@ -14,7 +14,7 @@ Run = TypeVar("Run", Outcome, Interruption)
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class TrialFilter:
     """Scene, position, station and operator by name; "" where it does not matter."""
 
     scene: str = ""
@@ -39,19 +39,19 @@ class Chosen:
         ]
 
 
-def chosen(given: Mapping[str, str], runs: Iterable[Outcome]) -> Chosen:
+def parse_filter(given: Mapping[str, str], runs: Iterable[Outcome]) -> TrialFilter:
     """The filters of an address; EvaError says what there is where one names what the trials do not have."""
-    found = Chosen(
+    found = TrialFilter(
         **{name: given.get(name, "").strip() for name in ("scene", "position", "station", "operator")}
     )
-    known = choices(runs)
+    known = filter_choices(runs)
     for name, value in asdict(found).items():
         if value and value not in known[name]:
             raise EvaError(f"{name} = {value!r:.80}; allowed: {', '.join(known[name]) or 'none yet'}")
     return found
 
 
-def choices(runs: Iterable[Outcome]) -> dict[str, list[str]]:
+def filter_choices(runs: Iterable[Outcome]) -> dict[str, list[str]]:
     """Values that can be chosen of each field."""
     given = list(runs)
     positions = sorted({run.position for run in given})

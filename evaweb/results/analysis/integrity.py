@@ -17,7 +17,7 @@ VERDICT, CATEGORY, NOTE = "verdict", "category", "note"
 
 
 @dataclass
-class Changes:
+class CheckpointChanges:
     """Of one checkpoint: attempts, and those that do not count.
 
     Voided trials are told apart by what their score said before (`voided_unscored`: there was none); of `asked`
@@ -51,15 +51,15 @@ class Changes:
         return self.voided_successes + self.voided_failures + self.voided_unscored
 
 
-def changes_of(plan: Plan) -> list[Changes]:
+def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
     """Those of each checkpoint, in the order of their names; as many queries whatever the number of trials."""
-    found: dict[str, Changes] = {}
+    found: dict[str, CheckpointChanges] = {}
     trials = Trial.objects.filter(handout__plan=plan).order_by("checkpoint__name")
     ends = ("ended_by", "status", "reason", "episode__status", "episode__frames")
     for name, status, success, operator, station, *end, frames in trials.values_list(
         "checkpoint__name", "status", "verdict__success", "operator__username", "station__name", *ends
     ):
-        row = found.setdefault(name, Changes(name))
+        row = found.setdefault(name, CheckpointChanges(name))
         row.attempts += 1
         row.counted += status == TrialStatus.SCORED
         row.voided_successes += status == TrialStatus.VOIDED and success is True

@@ -32,7 +32,7 @@ _FIELDS = _RUN | {
 }
 
 
-def outcomes_of_plan(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
+def load_plan_outcomes(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
     """Those of a plan that count, in the order in which they were handed out.
 
     Of a revealed plan as they were judged at the reveal; `corrected`: as they are now. Why a trial failed is what is
@@ -45,14 +45,14 @@ def outcomes_of_plan(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
     return _outcomes(trials, {trial: str(block) for trial, block in blocks.items()}, order, until)
 
 
-def interruptions_of_plan(plan: Plan) -> list[Interruption]:
+def load_plan_interruptions(plan: Plan) -> list[Interruption]:
     """Runs of a plan that were broken off and not scored."""
     broken = Trial.objects.filter(handout__plan=plan, status=TrialStatus.INTERRUPTED).order_by("pk")
     rows = broken.values_list(*_RUN.values())
     return [Interruption(**dict(zip(_RUN, row, strict=True))) for row in rows]
 
 
-def outcomes_of(trials: QuerySet[Trial]) -> list[Outcome]:
+def load_outcomes(trials: QuerySet[Trial]) -> list[Outcome]:
     """Those of any trials that count, in the order in which they were started.
 
     Trials of the same number at the same position met the same conditions as far as was meant.

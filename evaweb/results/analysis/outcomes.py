@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from evaweb.trials.failure_words import why_words
+from evaweb.trials.failure_words import failure_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Outcome:
     @property
     def why(self) -> str:
         """Phase and cause of a failure, as far as they were said."""
-        return why_words(self.failure_phase, self.failure)
+        return failure_text(self.failure_phase, self.failure)
 
     @property
     def condition(self) -> str:
@@ -75,7 +75,7 @@ class Pair:
     second: Outcome
 
 
-def paired(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
+def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
     """Both checkpoints' trials, block by block: those of a plan as scheduled, others as they were completed.
 
     A block in which one of them is missing waits. Of several trials in one block, only the last ones count.

@@ -10,7 +10,7 @@ from evaweb import computing
 from evaweb.errors import EvaError
 from evaweb.plans.models import Comparing
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import Course, Outlook, outlook
+from evaweb.statistics.courses import DesignPower, Outlook, outlook
 from evaweb.statistics.designs import RULES
 from evaweb.statistics.planning import detectable
 from runtime.core.sentences import Pattern
@@ -134,7 +134,7 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
     }
 
 
-def told(q: Question, rule: str, found: Course | None, *, alone: bool) -> dict[str, Any]:
+def told(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
     """A design that has the power: its trials at worst and on average, with hours at the robots; None: none has it."""
     if found is None:
         return {"rule": rule, "pairs": None}

@@ -20,7 +20,7 @@ from evaweb.results.analysis.planner import Question, told
 from evaweb.statistics import score_courses
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import Course, course, pairs_needed
+from evaweb.statistics.courses import DesignPower, design_power, pairs_needed
 from evaweb.statistics.designs import ANYTIME, RULES
 from evaweb.statistics.score_courses import Scores, score_course, score_pairs_needed
 
@@ -63,21 +63,21 @@ class Asked:
         found = {max(2, round(end * step / _STEPS)) for step in range(1, _STEPS + 1)}
         return sorted(found | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
 
-    def at(self, rule: str, pairs: int) -> Course:
+    def at(self, rule: str, pairs: int) -> DesignPower:
         """Course of a design of so many pairs, its looks at the same shares of the trials."""
         if self.scores is not None:
             return _computed(score_course, rule, pairs, self.scores, self.alpha)
         looks = self.looks if rule == self.rule else ()
         scaled = tuple(sorted({max(1, round(look * pairs / self.pairs)) for look in looks}))
         new, control = self.question.better, self.question.rate
-        return _computed(course, rule, pairs, new, control, self.alpha, self.margin, scaled)
+        return _computed(design_power, rule, pairs, new, control, self.alpha, self.margin, scaled)
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
     """What is computed so far: courses by design in ascending numbers, and what each design needs."""
 
-    curves: dict[str, tuple[Course, ...]] = field(default_factory=dict)
+    curves: dict[str, tuple[DesignPower, ...]] = field(default_factory=dict)
     needs: dict[str, dict[str, Any]] = field(default_factory=dict)
     done: int = 0
     of: int = 1
@@ -88,7 +88,7 @@ class Figures:
         """Whether nothing more comes."""
         return bool(self.fault) or self.done == self.of
 
-    def planned(self, asked: Asked) -> dict[str, Course]:
+    def planned(self, asked: Asked) -> dict[str, DesignPower]:
         """The courses at the planned number of trials, by design."""
         found = ((rule, one) for rule, curve in self.curves.items() for one in curve)
         return {rule: one for rule, one in found if one.pairs == asked.pairs}

@@ -9,7 +9,7 @@ from typing import Any
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan
 from evaweb.plans.selectors import plans_beside
-from evaweb.results.analysis.caching import runs_of
+from evaweb.results.analysis.caching import cached_runs
 from evaweb.results.analysis.outcomes import Outcome, by_checkpoint
 from evaweb.stations.models import Station
 from evaweb.statistics.proportions import Proportion, proportion
@@ -37,7 +37,7 @@ def set_beside(real: Plan, simulated: Plan) -> dict[str, Any]:
 
     Trials are matched by checkpoint, scene and position, the first with the first.
     """
-    ours, theirs = (by_checkpoint(runs_of(plan).outcomes) for plan in (real, simulated))
+    ours, theirs = (by_checkpoint(cached_runs(plan).outcomes) for plan in (real, simulated))
     shared = sorted(set(ours) & set(theirs))
     rates = [(name, _rate(ours[name]), _rate(theirs[name])) for name in shared]
     of_real, of_simulated = (

@@ -29,7 +29,7 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class MilestonePrompt:
     """A milestone in its words, and until when it counts [s], None where it always does."""
 
     text: str
@@ -37,7 +37,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Still:
+class StillImage:
     """A picture of `camera`, a number and no name, `at` [s] after the start of the run; a JPEG of pixels alone."""
 
     camera: str
@@ -46,7 +46,7 @@ class Still:
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class TrialCase:
     """One trial as a judge is shown it; nothing here tells its code, checkpoint, score, plan, operator or files.
 
     `truth` has for each step whether the bench itself says that it was reached, None where it says nothing.
@@ -54,13 +54,13 @@ class Case:
 
     instruction: str
     criterion: str
-    steps: tuple[Step, ...]
-    stills: tuple[Still, ...] = ()
+    steps: tuple[MilestonePrompt, ...]
+    stills: tuple[StillImage, ...] = ()
     truth: tuple[bool | None, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class MilestoneJudgement:
     """Of one milestone: whether it was reached, and how probable that is, 0 to 1; both None for no verdict."""
 
     reached: bool | None = None
@@ -78,10 +78,10 @@ class Said:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class CaseJudgement:
     """One word on each milestone, in their order; `model` is what the server says has answered."""
 
-    milestones: tuple[Said, ...]
+    milestones: tuple[MilestoneJudgement, ...]
     model: str = ""
 
 
@@ -92,8 +92,8 @@ class Judge(Protocol):
     def version(self) -> str:
         """Another one where the same case could be judged otherwise."""
 
-    def words(self, case: Case) -> str:
+    def prompt_text(self, case: TrialCase) -> str:
         """All that it is told in words, "" for nothing."""
 
-    def judge(self, case: Case) -> Verdict:
+    def judge(self, case: TrialCase) -> CaseJudgement:
         """Raises NoVerdict; whatever else it raises is a fault of the judge, and the trial is shown to it again."""

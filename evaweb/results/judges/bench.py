@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from evaweb.results.judges.base import Case, NoVerdict, Said, Setup, Verdict
+from evaweb.results.judges.base import CaseJudgement, MilestoneJudgement, NoVerdict, Setup, TrialCase
 
 SEES: Literal["pictures", "truth"] = "truth"
 SERVED = False
@@ -15,15 +15,20 @@ class BenchTruth:
 
     version = "bench 1"
 
-    def words(self, case: Case) -> str:
+    def words(self, case: TrialCase) -> str:
         """It is asked nothing."""
         return ""
 
-    def judge(self, case: Case) -> Verdict:
+    def judge(self, case: TrialCase) -> CaseJudgement:
         """Whether the bench says that each was reached, within its time."""
         if all(known is None for known in case.truth):
             raise NoVerdict("the bench reports none of its milestones")
-        return Verdict(tuple(Said() if known is None else Said(known, float(known)) for known in case.truth))
+        return CaseJudgement(
+            tuple(
+                MilestoneJudgement() if known is None else MilestoneJudgement(known, float(known))
+                for known in case.truth
+            )
+        )
 
 
 def build(setup: Setup) -> BenchTruth:

@@ -23,7 +23,14 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from evaweb.errors import EvaError
-from evaweb.results.judges.base import Case, NoVerdict, Said, Setup, Still, Verdict
+from evaweb.results.judges.base import (
+    CaseJudgement,
+    MilestoneJudgement,
+    NoVerdict,
+    Setup,
+    StillImage,
+    TrialCase,
+)
 from runtime.core.sentences import Pattern, fixed
 
 _ADDRESS_PORT_0_ALLOWED_1 = Pattern(
@@ -136,7 +143,7 @@ class _Completion(BaseModel):
     model: str | None = None
 
 
-class Chat:
+class ChatJudge:
     """Asks once, waits so long and no longer, and takes nothing but what was asked for."""
 
     def __init__(self, setup: Setup) -> None:
@@ -152,14 +159,14 @@ class Chat:
         """With the model that is asked."""
         return f"chat 1, {self._setup.model}"
 
-    def words(self, case: Case) -> str:
+    def words(self, case: TrialCase) -> str:
         """What stands around the pictures."""
         return json.dumps([_HOW, _question(case)], ensure_ascii=False)
 
-    def judge(self, case: Case) -> Verdict:
+    def judge(self, case: TrialCase) -> CaseJudgement:
         """What the server says; NoVerdict with the reason otherwise, EvaError where its key is not there."""
         key = self._key()
-        content = self._posted(json.dumps(_request(case, self._setup.model)).encode(), key)
+        content = self._post(json.dumps(_request(case, self._setup.model)).encode(), key)
         try:
             found = _read(content, len(case.steps))
         except NoVerdict as none:
@@ -177,7 +184,7 @@ class Chat:
             raise EvaError(_MODEL_CONTAINS_WHAT_VARIABLE_HOLDS(name=name))
         return key
 
-    def _posted(self, body: bytes, key: str) -> bytes:
+    def _post(self, body: bytes, key: str) -> bytes:
         at, wait = self._endpoint, self._setup.patience_s
         headers = {"Content-Type": "application/json", "Accept": "application/json", "Connection": "close"}
         headers |= {"Authorization": f"Bearer {key}"} if key else {}
@@ -192,9 +199,9 @@ class Chat:
                 answer = connection.getresponse()
                 content = answer.read(LARGEST_ANSWER + 1) if answer.status == 200 else b""
             except (OSError, http.client.HTTPException, UnicodeError) as error:
-                raise NoVerdict(_unheard(error, deadline)) from None
+                raise NoVerdict(_no_answer(error, deadline)) from None
             if deadline.over:  # what is cut off may look like an end
-                raise NoVerdict(_unheard(TimeoutError(), deadline))
+                raise NoVerdict(_no_answer(TimeoutError(), deadline))
         if 300 <= answer.status < 400:
             raise NoVerdict(f"the server sends on to elsewhere (HTTP {answer.status}), which is not followed")
         if answer.status != 200:
@@ -243,7 +250,7 @@ class _Deadline:
                 socket.socket.shutdown(self._socket, socket.SHUT_RDWR)  # not TLS's own, which would wait
 
 
-def _unheard(error: Exception, deadline: _Deadline) -> str:
+def _no_answer(error: Exception, deadline: _Deadline) -> str:
     if deadline.over or isinstance(error, TimeoutError):
         return f"no answer within {deadline.wait:g} s"
     if isinstance(error, ssl.SSLCertVerificationError):
@@ -255,7 +262,7 @@ def _unheard(error: Exception, deadline: _Deadline) -> str:
     return f"the server does not speak HTTP as is usual: {type(error).__name__}"
 
 
-def _question(case: Case) -> str:
+def _question(case: TrialCase) -> str:
     within = (f" (within {step.limit_s:g} s)" if step.limit_s is not None else "" for step in case.steps)
     lines = [
         f"{n}. {step.text}{limit}" for n, (step, limit) in enumerate(zip(case.steps, within, strict=True), 1)
@@ -264,7 +271,7 @@ def _question(case: Case) -> str:
     return "\n".join([f"The robot was told: {case.instruction}", *success, "Milestones:", *lines])
 
 
-def _request(case: Case, model: str) -> dict[str, Any]:
+def _request(case: TrialCase, model: str) -> dict[str, Any]:
     shown = [part for still in case.stills for part in _parts(still)]
     return {
         "model": model,
@@ -277,7 +284,7 @@ def _request(case: Case, model: str) -> dict[str, Any]:
     }
 
 
-def _parts(still: Still) -> list[dict[str, Any]]:
+def _parts(still: StillImage) -> list[dict[str, Any]]:
     url = f"data:image/jpeg;base64,{base64.b64encode(still.jpeg).decode()}"
     return [
         {"type": "text", "text": f"{still.camera}, {still.at:.1f} s"},
@@ -285,7 +292,7 @@ def _parts(still: Still) -> list[dict[str, Any]]:
     ]
 
 
-def _read(content: bytes, n: int) -> Verdict:
+def _read(content: bytes, n: int) -> CaseJudgement:
     """The verdict on `n` milestones in what a server answered; NoVerdict."""
     try:
         completion = _Completion.model_validate_json(content)
@@ -303,7 +310,7 @@ def _read(content: bytes, n: int) -> Verdict:
     numbers = sorted(line.number for line in lines)
     if numbers != list(range(1, n + 1)):
         raise NoVerdict(f"it spoke of the milestones {numbers!r:.60}; asked were 1 to {n}")
-    return Verdict(
+    return CaseJudgement(
         tuple(_said(line) for line in sorted(lines, key=lambda line: line.number)),
         completion.model or "",
     )
@@ -314,10 +321,10 @@ def _without(key: str, text: str) -> str:
     return text.replace(key, "...") if key else text
 
 
-def _said(line: _Line) -> Said:
+def _said(line: _Line) -> MilestoneJudgement:
     reached = {"reached": True, "not reached": False, "no verdict": None}[line.verdict]
     try:
-        return Said(reached, line.probability)
+        return MilestoneJudgement(reached, line.probability)
     except ValueError as error:
         raise NoVerdict(f"milestone {line.number}: {error}") from None
 
@@ -329,6 +336,6 @@ def _wrong(error: ValidationError) -> str:
     return f"{place}: {first['msg']}" if place else str(first["msg"])
 
 
-def build(setup: Setup) -> Chat:
+def build(setup: Setup) -> ChatJudge:
     """EvaError where address, model or the name of the key cannot be."""
-    return Chat(setup)
+    return ChatJudge(setup)

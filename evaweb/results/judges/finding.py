@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from evaweb.errors import EvaError
-from evaweb.results.judges.base import Case, Judge, NoVerdict, Setup, Verdict
+from evaweb.results.judges.base import CaseJudgement, Judge, NoVerdict, Setup, TrialCase
 from runtime.core.plugins import variants
 from runtime.core.sentences import Pattern
 
@@ -23,7 +23,7 @@ _JUDGE_KIND_ALLOWED = Pattern(
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class UsableJudge:
     """A judge that can be asked; `pictures` where it is shown these, else the bench's truth."""
 
     name: str
@@ -32,12 +32,12 @@ class Found:
     pictures: bool
     served: bool
 
-    def words(self, case: Case) -> str:
+    def words(self, case: TrialCase) -> str:
         """All that it is told in words; EvaError that names the judge."""
         with _named(self.name):
-            return self.judge.words(case)
+            return self.judge.prompt_text(case)
 
-    def asked(self, case: Case) -> Verdict:
+    def judge_case(self, case: TrialCase) -> CaseJudgement:
         """Its verdict, one word for each milestone; NoVerdict, else EvaError that names the judge."""
         with _named(self.name, NoVerdict):
             verdict = self.judge.judge(case)
@@ -50,7 +50,7 @@ class Found:
         return verdict
 
 
-def built(name: str, kind: str, setup: Setup) -> Found:
+def build_judge(name: str, kind: str, setup: Setup) -> UsableJudge:
     """The judge `name`, of that kind; EvaError where the kind or the set-up cannot be."""
     kinds = variants("evaweb.results.judges")
     if kind not in kinds:
@@ -58,7 +58,7 @@ def built(name: str, kind: str, setup: Setup) -> Found:
     with _named(name):
         module: ModuleType = kinds[kind]
         judge = module.build(setup)
-        return Found(name, judge.version, judge, module.SEES == "pictures", module.SERVED)
+        return UsableJudge(name, judge.version, judge, module.SEES == "pictures", module.SERVED)
 
 
 @contextmanager

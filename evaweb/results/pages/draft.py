@@ -10,7 +10,7 @@ from typing import Any
 
 from django.contrib.auth.models import User
 
-from evaweb.blinding import Sight
+from evaweb.blinding import Visibility
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import planned
 from evaweb.plans.draft_checks import Remark, covered, problems, thoughts
@@ -78,7 +78,7 @@ class Size:
 
 
 def state_page(
-    plan: Plan, sight: Sight, *, faults: Mapping[str, str], agreed: bool, cycle_s: float
+    plan: Plan, sight: Visibility, *, faults: Mapping[str, str], agreed: bool, cycle_s: float
 ) -> dict[str, Any]:
     """What of the page follows from the draft: steps, schedule, checks, and whether it can be frozen.
 
@@ -204,7 +204,7 @@ def _preview(plan: Plan, size: Size) -> dict[str, Any]:
     }
 
 
-def choices_page(plan: Plan, sight: Sight, values: Values) -> dict[str, Any]:
+def choices_page(plan: Plan, sight: Visibility, values: Values) -> dict[str, Any]:
     """What can be chosen, and what of it is."""
     chosen = set(values["checkpoints"])
     offered = list(checkpoint_list(all_of_them=True, sight=sight))
@@ -241,7 +241,7 @@ def _end(name: str, value: str) -> tuple[str, str, Any, str]:
     return name, field.verbose_name, field.choices, value
 
 
-def told(name: str, value: Any, sight: Sight) -> str:
+def told(name: str, value: Any, sight: Visibility) -> str:
     """A value of a draft in words."""
     if value in (None, "", []):
         return "nothing"

@@ -9,21 +9,21 @@ from typing import Any
 
 from evaweb.errors import EvaError
 from evaweb.plans.counting import declared_failures
-from evaweb.plans.design import frozen
+from evaweb.plans.design import frozen_design
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
-from evaweb.results.analysis.filters import Chosen, choices
-from evaweb.results.analysis.integrity import changes_of
-from evaweb.results.analysis.outcomes import by_checkpoint, paired
+from evaweb.results.analysis.filters import TrialFilter, filter_choices
+from evaweb.results.analysis.integrity import checkpoint_changes
+from evaweb.results.analysis.outcomes import by_checkpoint, pair_by_block
 from evaweb.results.presentation.addresses import compare_address, trials_address
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.drawings.svg import Drawing
 from evaweb.results.presentation.facts import (
     comparison_facts,
     comparison_sentence,
-    missed_words,
     primaries_of,
+    undetectable_text,
 )
 from evaweb.results.presentation.headline import headline, with_planned_letters
 from evaweb.results.presentation.listings import (
@@ -36,7 +36,7 @@ from evaweb.results.presentation.listings import (
 )
 from evaweb.results.presentation.wording import anytime_words, evidence_words
 from evaweb.statistics.designs import Design
-from evaweb.trials.failures import in_order
+from evaweb.trials.failures import ordered_terms
 from runtime.core.sentences import Pattern
 
 _NO_COMPARISON_THERE_TRIALS = Pattern(
@@ -52,31 +52,33 @@ _VIEW_ALLOWED = Pattern("results.pages.pages.view_allowed", "view = {view!r:.80}
 VIEWS = ("table", "grid")
 
 
-def summary_page(plan: Plan, only: Chosen) -> dict[str, Any]:
+def summary_page(plan: Plan, only: TrialFilter) -> dict[str, Any]:
     """Everything that the plan's page shows of its results."""
-    at, order = caching.fingerprint(plan), in_order()
+    at, order = caching.fingerprint(plan), ordered_terms()
     name = ("summary", only, *order.values())  # the lab's order of words is in no fingerprint of trials
-    return caching.page_of(plan, name, at, lambda: _summary(plan, only, at, order))
+    return caching.cached_page(plan, name, at, lambda: _summary(plan, only, at, order))
 
 
-def _summary(plan: Plan, only: Chosen, at: Hashable, order: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
-    outcomes = caching.runs_of(plan, at).outcomes
-    analysis = with_planned_letters(plan, caching.analysis_of(plan, only, at))
+def _summary(
+    plan: Plan, only: TrialFilter, at: Hashable, order: Mapping[str, tuple[str, ...]]
+) -> dict[str, Any]:
+    outcomes = caching.cached_runs(plan, at).outcomes
+    analysis = with_planned_letters(plan, caching.cached_analysis(plan, only, at))
     primaries = primaries_of(plan, analysis)
     facts = [comparison_facts(plan, analysis, found) for found in primaries]
     scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
     return {
         "analysis": analysis,
         "only": only,
-        "choices": choices(outcomes),
+        "choices": filter_choices(outcomes),
         "headline": facts[0]["headline"] if facts else None,
         "primaries": facts,
         "table": arm_rows(plan, analysis, only),
         "intervals": _intervals(plan, "Success rates", analysis, only),
-        "violins": rates.violins(analysis.arms, analysis.letters) if analysis.arms else None,
+        "violins": rates.draw_violins(analysis.arms, analysis.letters) if analysis.arms else None,
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
-        "success_times": courses.success_times(analysis.arms),
-        "grid": conditions.grid(analysis.arms, _grid_links(plan, analysis, only)),
+        "success_times": courses.draw_success_times(analysis.arms),
+        "grid": conditions.draw_grid(analysis.arms, _grid_links(plan, analysis, only)),
         "declared": declared_failures(plan).keys() & {row.trial for row in only.apply(outcomes)},
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
         "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
@@ -85,40 +87,40 @@ def _summary(plan: Plan, only: Chosen, at: Hashable, order: Mapping[str, tuple[s
             for found in analysis.comparisons
             if found not in primaries
         ],
-        "missed": [missed_words(analysis)] if analysis.arms else [],
-        "changes": changes_of(plan),
+        "missed": [undetectable_text(analysis)] if analysis.arms else [],
+        "changes": checkpoint_changes(plan),
     }
 
 
-def comparison_page(plan: Plan, only: Chosen, first: str, second: str) -> dict[str, Any]:
+def comparison_page(plan: Plan, only: TrialFilter, first: str, second: str) -> dict[str, Any]:
     """Two checkpoints side by side, condition by condition; EvaError says which there are."""
     at = caching.fingerprint(plan)
-    return caching.page_of(
+    return caching.cached_page(
         plan, ("comparison", only, first, second), at, lambda: _compared(plan, only, first, second, at)
     )
 
 
-def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -> dict[str, Any]:
-    analysis = with_planned_letters(plan, caching.analysis_of(plan, only, at))
+def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashable) -> dict[str, Any]:
+    analysis = with_planned_letters(plan, caching.cached_analysis(plan, only, at))
     names = [arm.checkpoint for arm in analysis.arms]
     primaries = primaries_of(plan, analysis)
     if not first and not second and primaries:
         first, second = primaries[0].first, primaries[0].second
-    found = analysis.compared(first, second)
+    found = analysis.comparison_of(first, second)
     if found is None:
         raise EvaError(
             _NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=", ".join(names) or "none")
         )
     arms = (analysis.arm(found.first), analysis.arm(found.second))
-    runs = by_checkpoint(only.apply(caching.runs_of(plan, at).outcomes))
+    runs = by_checkpoint(only.apply(caching.cached_runs(plan, at).outcomes))
     return {
         "analysis": analysis,
         "only": only,
         "found": found,
         "names": names,
         "facts": comparison_facts(plan, analysis, found),
-        "difference": rates.difference(found),
-        "intervals": rates.intervals(
+        "difference": rates.draw_difference(found),
+        "intervals": rates.draw_intervals(
             "Success rates",
             [
                 (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
@@ -126,18 +128,18 @@ def _compared(plan: Plan, only: Chosen, first: str, second: str, at: Hashable) -
             ],
             {arm.checkpoint: arm.series for arm in arms},
         ),
-        "violins": rates.violins(arms, analysis.letters),
+        "violins": rates.draw_violins(arms, analysis.letters),
         "funnels": [
             drawn
             for scene in sorted({*arms[0].scenes, *arms[1].scenes})
             if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
         ],
-        "success_times": courses.success_times(arms),
+        "success_times": courses.draw_success_times(arms),
         "evidence": found.evidence
-        and courses.evidence(
+        and courses.draw_evidence(
             found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
         ),
-        "paired": list(enumerate(paired(runs.get(found.first, []), runs.get(found.second, [])), 1)),
+        "paired": list(enumerate(pair_by_block(runs.get(found.first, []), runs.get(found.second, [])), 1)),
     }
 
 
@@ -175,18 +177,18 @@ def pairs_shown(page: Mapping[str, Any], how: PairView) -> dict[str, Any]:
 def evidence_page(plan: Plan) -> dict[str, Any]:
     """The meter of the plan's comparison, whether its rule says to stop, and what would be gained by going on."""
     at = caching.fingerprint(plan)
-    return caching.page_of(plan, "evidence", at, lambda: _evidence(plan, at))
+    return caching.cached_page(plan, "evidence", at, lambda: _evidence(plan, at))
 
 
 def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
-    analysis = caching.analysis_of(plan, None, at)
-    found, design = primaries_of(plan, analysis), frozen(plan.document) if plan.document else None
+    analysis = caching.cached_analysis(plan, None, at)
+    found, design = primaries_of(plan, analysis), frozen_design(plan.document) if plan.document else None
     if not found or design is None:
         return {"meters": [], "compared": design is not None}
     return {
         "headline": headline(plan),
         "meters": [_meter(analysis, one, design) for one in found],
-        "missed": missed_words(analysis),
+        "missed": undetectable_text(analysis),
     }
 
 
@@ -197,7 +199,7 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
         "found": found,
         "foreseen": design.blocks,
         "by": [
-            (what, courses.evidence(evidence, *names, design.blocks, drawn), evidence_words(evidence))
+            (what, courses.draw_evidence(evidence, *names, design.blocks, drawn), evidence_words(evidence))
             for what, evidence in (
                 ("By success and failure", found.evidence),
                 ("By scores, partial credit included", found.score_evidence),
@@ -212,16 +214,16 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
     }
 
 
-def _intervals(plan: Plan, title: str, analysis: Analysis, only: Chosen) -> Drawing | None:
+def _intervals(plan: Plan, title: str, analysis: Analysis, only: TrialFilter) -> Drawing | None:
     rows = [
         (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
         for arm in analysis.arms
     ]
     order = {arm.checkpoint: arm.series for arm in analysis.arms}
-    return rates.intervals(title, rows, order) if rows else None
+    return rates.draw_intervals(title, rows, order) if rows else None
 
 
-def _funnel(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> Drawing | None:
+def _funnel(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> Drawing | None:
     found = [
         (arm.series, arm.checkpoint, funnel)
         for arm in analysis.arms
@@ -235,10 +237,10 @@ def _funnel(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> Drawing
         for _, name, funnel in found
         for at, label in enumerate(funnel.labels)
     }
-    return courses.funnel(scene, found, links)
+    return courses.draw_funnel(scene, found, links)
 
 
-def _grid_links(plan: Plan, analysis: Analysis, only: Chosen) -> dict[tuple[str, str], str]:
+def _grid_links(plan: Plan, analysis: Analysis, only: TrialFilter) -> dict[tuple[str, str], str]:
     links = {}
     for arm in analysis.arms:
         for condition in arm.cells:

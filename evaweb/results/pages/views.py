@@ -14,29 +14,34 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.errors import EvaError
 from evaweb.lists import Listing
 from evaweb.plans import services
-from evaweb.plans.blinding_rules import look, may_look
+from evaweb.plans.blinding_rules import can_unblind, record_unblinding
 from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
-from evaweb.results.analysis.filters import chosen
+from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
+from evaweb.results.analysis.filters import parse_filter
 from evaweb.results.analysis.simulated import is_simulated, set_beside, simulated_plans
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
 from evaweb.results.presentation.citing import HEAD, Citation, citation
 from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_words
-from evaweb.results.ratings.automatic import judge_ask, judges_ready
-from evaweb.results.ratings.unblinding import has_results, require_seen, sealing, why_sealed
+from evaweb.results.ratings.automatic import judges_ready, request_judging
+from evaweb.results.ratings.unblinding import (
+    has_results,
+    require_visible_results,
+    sealed_reason,
+    sealing_plans,
+)
 from evaweb.results.reports.reporting import write_report
 from evaweb.roles import Role, role_of
 from evaweb.trials.models import Trial
-from evaweb.trials.voids import voids_waiting
+from evaweb.trials.voids import open_void_requests
 
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
@@ -66,18 +71,18 @@ def plans(request: HttpRequest) -> HttpResponseBase:
 @require_GET
 def plan(request: HttpRequest, name: str, version: int | None = None) -> HttpResponse:
     """Results of the plan; where they are sealed, or not there yet, its progress."""
-    return _plan_page(request, _found(name, version))
+    return _plan_page(request, _get_plan(name, version))
 
 
 @require_GET
 def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Two checkpoints of it side by side."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
     try:
-        only = chosen(request.GET, caching.runs_of(found).outcomes)
+        only = parse_filter(request.GET, caching.cached_runs(found).outcomes)
         context = pages.comparison_page(
             found, only, request.GET.get("first", ""), request.GET.get("second", "")
         )
@@ -90,7 +95,7 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """The evidence so far, for users who may look; with HX-Request the meter alone, to be put into the page."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
@@ -102,7 +107,7 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
     """The trials that a number was made from."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
@@ -128,8 +133,8 @@ def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
 @require_GET
 def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """The offline report as one archive."""
-    found = _found(name, version)
-    require_seen(found, request.user)
+    found = _get_plan(name, version)
+    require_visible_results(found, request.user)
     title = f"{found.name}-v{found.version}"
     with TemporaryDirectory() as folder:
         write_report(found, Path(folder) / title, most_pictures=MOST_PICTURES)
@@ -145,7 +150,7 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """How its trials were made, and what the headline would be under each doubt."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
@@ -163,11 +168,11 @@ def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """Evaluations of its checkpoints on simulated benches, beside it."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
-    others = [row for row in simulated_plans(found) if not why_sealed(row, request.user)]
+    others = [row for row in simulated_plans(found) if not sealed_reason(row, request.user)]
     context = {
         "beside": [set_beside(found, row) for row in others],
         "real": is_simulated(found),
@@ -179,7 +184,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
 @require_GET
 def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
     """The result as it is copied; of a revealed plan at the address that stays."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
@@ -203,28 +208,28 @@ def frozen(request: HttpRequest, digest: str) -> HttpResponse:
 def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
     """The same as a file: "txt", "tex" or "svg"."""
     found = selectors.plan_at_reveal(digest)
-    require_seen(found, request.user)
+    require_visible_results(found, request.user)
     title = f"{found.name}-v{found.version}-{digest[:8]}.{form}"
     return HttpResponse(
-        citation(found).whole(form),
+        citation(found).render(form),
         content_type=f"{_FORMS[form]}; charset=utf-8",
         headers={"Content-Disposition": f'attachment; filename="{title}"'},
     )
 
 
 @require_POST
-def act(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
+def plan_action(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
     """Freeze, amend, close or reveal it, look behind the blind, or have it judged: by its owner, with what is due."""
-    found = _found(name, version)
+    found = _get_plan(name, version)
     user: Any = request.user
     reason = request.POST.get("reason", "")
     acts: Mapping[str, Callable[[], object]] = {
-        "freeze": lambda: services.plan_freeze(user=user, plan=found, seen=request.POST.get("seen", "")),
-        "amend": lambda: services.plan_amend(user=user, plan=found, reason=reason),
-        "close": lambda: services.plan_close(user=user, plan=found, reason=reason),
-        "reveal": lambda: services.plan_reveal(user=user, plan=found),
-        "look": lambda: look(found, user),
-        "judge": lambda: judge_ask(user=user, plan=found, name=request.POST.get("judge", "")),
+        "freeze": lambda: services.freeze_plan(user=user, plan=found, seen=request.POST.get("seen", "")),
+        "amend": lambda: services.amend_plan(user=user, plan=found, reason=reason),
+        "close": lambda: services.close_plan(user=user, plan=found, reason=reason),
+        "reveal": lambda: services.reveal_plan(user=user, plan=found),
+        "look": lambda: record_unblinding(found, user),
+        "judge": lambda: request_judging(user=user, plan=found, name=request.POST.get("judge", "")),
     }
     try:
         made = acts[what]()
@@ -256,7 +261,7 @@ def _citation_page(request: HttpRequest, cited: Citation) -> HttpResponse:
     return render(request, "results/cite.html", context)
 
 
-def _found(name: str, version: int | None) -> Plan:
+def _get_plan(name: str, version: int | None) -> Plan:
     return selectors.plan_get(name=name, version=version)
 
 
@@ -267,13 +272,13 @@ def _plan_page(
     if sealed:
         return sealed
     try:
-        only = chosen(request.GET, caching.runs_of(found).outcomes)
+        only = parse_filter(request.GET, caching.cached_runs(found).outcomes)
     except EvaError as problem:
-        only, fault = chosen({}, ()), fault or problem
+        only, fault = parse_filter({}, ()), fault or problem
     judged = {
-        "agreement": agreement_of(found),
-        "judges": judges_of(found),
-        "preferences": preferences_of(found),
+        "agreement": rater_agreement(found),
+        "judges": judge_agreement(found),
+        "preferences": preference_ranking(found),
     }
     record = integrity_document(found)
     context = {
@@ -292,16 +297,17 @@ def _sealed_page(
     request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse | None:
     """Page in place of results that this user does not see, or that there cannot be; None where they do."""
-    why = why_sealed(found, request.user, sight_for(request)) if has_results(found) else ""
+    why = sealed_reason(found, request.user, visibility_for_request(request)) if has_results(found) else ""
     if has_results(found) and not why:
         return None
     context = {
         **_common(request, found),
         "why": why,
         "others": [
-            (plan, may_look(plan, request.user)) for plan in sealing(found, request.user, sight_for(request))
+            (plan, can_unblind(plan, request.user))
+            for plan in sealing_plans(found, request.user, visibility_for_request(request))
         ],
-        "may_look": found.sealed and may_look(found, request.user),
+        "may_look": found.sealed and can_unblind(found, request.user),
         "fault": fault,
         "typed": typed,
     }
@@ -317,7 +323,7 @@ def _common(request: HttpRequest, found: Plan) -> dict[str, Any]:
         "events": found.events.select_related("by"),
         "key": bytes(found.key or b"").hex() if found.state == PlanState.REVEALED else "",
         "may_manage": managed,
-        "voids": voids_waiting(Trial.objects.filter(handout__plan=found)),
+        "voids": open_void_requests(Trial.objects.filter(handout__plan=found)),
         "judges_ready": judges_ready() if managed and has_results(found) else [],
         "here": "plans",
         "home": reverse("result-plan", args=[found.name, found.version]),

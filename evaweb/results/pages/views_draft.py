@@ -12,7 +12,7 @@ from django.urls import reverse
 from django.utils import timezone
 from django.views.decorators.http import require_GET, require_http_methods
 
-from evaweb.blinding import sight_for
+from evaweb.blinding import visibility_for_request
 from evaweb.errors import EvaError
 from evaweb.plans.draft_form import read
 from evaweb.plans.drafting import Values, digest_of, values_of
@@ -103,7 +103,7 @@ def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
     if plan.state != PlanState.DRAFT:
         return redirect("result-plan", name=plan.name, version=plan.version)
     require_editor(plan, request.user)  # type: ignore[arg-type]
-    sight = sight_for(request)
+    sight = visibility_for_request(request)
     values, assumed = values_of(plan, sight), _assumed(request.GET)
     context = {
         **draft.choices_page(plan, sight, values),
@@ -119,7 +119,7 @@ def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
     user: Any = request.user
-    sight = sight_for(request)
+    sight = visibility_for_request(request)
     before = values_of(plan, sight)
     wanted, faults = read(
         request.POST,

@@ -10,12 +10,12 @@ from django.shortcuts import redirect, render
 from django.views.decorators.http import require_http_methods
 
 from evaweb.episodes.models import Episode
-from evaweb.episodes.selectors import stage_of
+from evaweb.episodes.selectors import playback_stage
 from evaweb.errors import EvaError
 from evaweb.plans.models import Handout
 from evaweb.results.models import Preference
 from evaweb.results.ratings import judging
-from evaweb.results.ratings.video_available import seen
+from evaweb.results.ratings.video_available import is_watchable
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
 from evaweb.trials import failures
@@ -42,7 +42,7 @@ def rate(request: HttpRequest) -> HttpResponse:
         else:
             return redirect("rate")
     user: Any = request.user
-    offer = judging.to_rate(user)
+    offer = judging.next_to_rate(user)
     handout = offer.found
     milestones = list(handout.trial.scene.milestones.order_by("order")) if handout else []
     typed = request.POST if handout and request.POST.get("code") == handout.code else QueryDict()
@@ -56,7 +56,7 @@ def rate(request: HttpRequest) -> HttpResponse:
         "milestones": [(milestone, str(milestone.pk) in ticked) for milestone in milestones],
         "implied": any(milestone.required for milestone in milestones),
         "fails": failing(handout.trial) if handout else "",
-        "failures": failures.offered(typed),
+        "failures": failures.failure_choices(typed),
         "unable": _unable(user, [view]),
         "fault": fault,
         "typed": typed,
@@ -77,7 +77,7 @@ def prefer(request: HttpRequest) -> HttpResponse:
         else:
             return redirect("prefer")
     user: Any = request.user
-    offer = judging.to_prefer(user)
+    offer = judging.next_to_compare(user)
     pair = offer.found
     codes = (pair.first.code, pair.second.code) if pair else ()
     views = [_view(pair.first), _view(pair.second)] if pair else []
@@ -102,7 +102,7 @@ def _rated(request: HttpRequest) -> None:
     ticked = set(request.POST.getlist("milestone"))
     keys = handout.trial.scene.milestones.values_list("pk", flat=True) if handout else ()
     user: Any = request.user
-    judging.rate(
+    judging.save_rating(
         user=user,
         plan=plan,
         code=code,
@@ -114,7 +114,7 @@ def _rated(request: HttpRequest) -> None:
 
 def _preferred(request: HttpRequest) -> None:
     user: Any = request.user
-    judging.prefer(
+    judging.save_preference(
         user=user,
         plan=plan_get(name=request.POST.get("plan", ""), version=_version(request)),
         **{name: request.POST.get(name, "") for name in ("first", "second", "outcome", "why")},
@@ -133,8 +133,8 @@ def _view(handout: Handout | None) -> dict[str, Any] | None:
     episode: Episode | None = handout.trial.episode if handout else None
     if handout is None or episode is None:
         return None
-    stage = stage_of(episode=episode)
-    return {"code": handout.code, "episode": episode, "stage": stage, "seen": seen(episode)}
+    stage = playback_stage(episode=episode)
+    return {"code": handout.code, "episode": episode, "stage": stage, "seen": is_watchable(episode)}
 
 
 def _unable(user: Any, views: Sequence[dict[str, Any] | None]) -> str:

@@ -10,13 +10,13 @@ from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
 from evaweb import computing
-from evaweb.blinding import Sight, sight_for
+from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.errors import EvaError
 from evaweb.plans.models import Comparing, PlanState
 from evaweb.refusals import retrying
 from evaweb.results import selectors
 from evaweb.results.analysis.planner import Question, question_of, table_of
-from evaweb.results.ratings.unblinding import why_sealed
+from evaweb.results.ratings.unblinding import sealed_reason
 from evaweb.roles import Role, role_of
 
 RUNNING = 12  # plans on one page; all of them are in the list
@@ -68,21 +68,22 @@ def planner(request: HttpRequest) -> HttpResponse:
 
 
 def _lab(request: HttpRequest) -> dict[str, Any]:
-    sight = sight_for(request)
+    sight = visibility_for_request(request)
     running = selectors.plan_rows(selectors.plan_list(PlanState.FROZEN)[:RUNNING])
     ended = selectors.plan_rows(
         selectors.plan_list().exclude(state__in=(PlanState.FROZEN, PlanState.DRAFT))[:5]
     )
     return {
         "running": running,
-        "ended": [(row, why_sealed(row.plan, request.user, sight)) for row in ended],
-        "stations": [(now, _label(sight, now.trial)) for now in selectors.stations_now()],
+        "ended": [(row, sealed_reason(row.plan, request.user, sight)) for row in ended],
+        "stations": [(now, _label(sight, now.trial)) for now in selectors.station_activity()],
         "recent": [
-            (trial, sight.label(trial), sight.hides(trial)) for trial in selectors.trials_recent(RECENT)
+            (trial, sight.checkpoint_label(trial), sight.hides(trial))
+            for trial in selectors.recent_trials(RECENT)
         ],
         "here": "lab",
     }
 
 
-def _label(sight: Sight, trial: Any) -> str:
-    return sight.label(trial) if trial is not None else ""
+def _label(sight: Visibility, trial: Any) -> str:
+    return sight.checkpoint_label(trial) if trial is not None else ""

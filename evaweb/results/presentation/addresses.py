@@ -10,20 +10,20 @@ from django.urls import reverse
 
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.analysis import Comparison
-from evaweb.results.analysis.filters import Chosen
-from evaweb.results.selectors import Question
+from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.selectors import TrialQuery
 
 
-def trials_address(plan: Plan, only: Chosen, **more: str) -> str:
+def trials_address(plan: Plan, only: TrialFilter, **more: str) -> str:
     """Address of the list of those trials."""
-    question = Question(
+    question = TrialQuery(
         scene=only.scene, position=only.position, station=only.station, operator=only.operator
     )
     address = reverse("result-plan-trials", args=[plan.name, plan.version])
     return f"{address}?{replace(question, **more).query}"
 
 
-def compare_address(plan: Plan, found: Comparison, only: Chosen) -> str:
+def compare_address(plan: Plan, found: Comparison, only: TrialFilter) -> str:
     """Address of the page with both side by side."""
     query = urlencode({"first": found.first, "second": found.second})
     address = reverse("result-compare", args=[plan.name, plan.version])

@@ -13,11 +13,11 @@ from evaweb.errors import Conflict
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import (
     arms_of,
-    at_the_reveal,
     blocks_kept,
     compared,
     counted_now,
-    frozen,
+    frozen_design,
+    reveal_record,
     same_blocks,
 )
 from evaweb.plans.models import Plan, PlanState
@@ -26,7 +26,7 @@ from evaweb.results.presentation.drawings.svg import Drawing, printable
 from evaweb.results.presentation.headline import alpha_words, letters_of, rule_words, sentence_of
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.setting import setting_now
-from evaweb.results.presentation.wording import ends, rate_words
+from evaweb.results.presentation.wording import format_interval, rate_words
 from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Block, Design, looks_at
 from evaweb.statistics.proportions import Proportion, proportion
 from runtime.core.sentences import Pattern
@@ -46,7 +46,7 @@ _NAMES_MM, _AXIS_MM, _STEP_MM = 45, 60, 6
 
 
 @dataclass(frozen=True, slots=True)
-class Cited:
+class CitedRow:
     """A row of the table; `success` and `score` (0 to 1) are None where the reveal did not keep them."""
 
     checkpoint: str
@@ -61,7 +61,7 @@ class Cited:
         rate = "not kept"
         if known is not None:
             rate = (
-                f"{100 * known.rate:.0f} % [{ends(known.interval)}]"
+                f"{100 * known.rate:.0f} % [{format_interval(known.interval)}]"
                 if known.rate is not None and known.interval
                 else "–"
             )
@@ -171,22 +171,22 @@ class Citation:
         ]
 
     @cached_property
-    def rows(self) -> list[Cited]:
+    def rows(self) -> list[CitedRow]:
         """The table, in the order of the frozen plan."""
         if "arms" in self.kept:
             return [
-                Cited(row["checkpoint"], row["n"], proportion(row["successes"], row["n"]), row["score"])
+                CitedRow(row["checkpoint"], row["n"], proportion(row["successes"], row["n"]), row["score"])
                 for row in self.kept["arms"]
             ]
         return [self._of_pairs(i, name) for i, name in enumerate(arms_of(compared(self.plan.document or {})))]
 
-    def _of_pairs(self, i: int, name: str) -> Cited:
+    def _of_pairs(self, i: int, name: str) -> CitedRow:
         """Of a reveal that kept the pairs alone."""
         values = [value for block in self.blocks for arm, value in block if arm == i]
         n = len(values)
         if self.found.outcome != SUCCESS:
-            return Cited(name, n, None, sum(values) / n if n else None)
-        return Cited(name, n, proportion(int(sum(values)), n), None)
+            return CitedRow(name, n, None, sum(values) / n if n else None)
+        return CitedRow(name, n, proportion(int(sum(values)), n), None)
 
     @cached_property
     def known(self) -> list[tuple[str, Proportion]]:
@@ -217,18 +217,18 @@ class Citation:
         return {"sentence": sentence, "table": _latex_table(rows), "figure": _latex_figure(self.known)}
 
     @cached_property
-    def drawn(self) -> Drawing:
+    def figure_html(self) -> Drawing:
         """The figure as a page shows it."""
         names = [row["name"] for row in (self.plan.document or {})["checkpoints"]]
         order = {name: i for i, name in enumerate(names)}
-        return rates.intervals("Success rates", [(name, found, "") for name, found in self.known], order)
+        return rates.draw_intervals("Success rates", [(name, found, "") for name, found in self.known], order)
 
     @cached_property
     def svg(self) -> str:
         """Figure with sentence, design and source, black on white, needing nothing beside it."""
-        return printable(self.drawn, above=[self.sentence], below=self.lines[1:])
+        return printable(self.figure_html, above=[self.sentence], below=self.lines[1:])
 
-    def whole(self, form: str) -> str:
+    def render(self, form: str) -> str:
         """All of it as a file: "txt", "tex" or "svg"."""
         if form == "svg":
             return '<?xml version="1.0" encoding="UTF-8"?>\n' + self.svg
@@ -293,12 +293,12 @@ def citation(plan: Plan) -> Citation:
 
     Conflict where trials are still made, or no comparison was planned.
     """
-    found = frozen(plan.document) if plan.document else None
+    found = frozen_design(plan.document) if plan.document else None
     if found is None:
         raise Conflict(_HAS_NO_COMPARISON_THERE_NO(plan=plan))
     if plan.state not in (PlanState.CLOSED, PlanState.REVEALED):
         raise Conflict(_RESULT_CITED_ONCE_PLAN_CLOSED(plan=plan, state=plan.get_state_display()))
-    kept = plan.at_reveal or at_the_reveal(plan) or {}
+    kept = plan.at_reveal or reveal_record(plan) or {}
     return Citation(plan, found, kept, plan.at_reveal["digest"] if plan.at_reveal else "")
 
 

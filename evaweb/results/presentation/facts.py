@@ -9,18 +9,18 @@ from typing import Any
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PrimaryOutcome, StoppingRule
 from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
-from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.wording import (
     anytime_words,
+    difference_sentence,
     evidence_words,
-    missed,
+    format_points,
     p_words,
-    points,
     probability,
-    verdict,
+    undetectable_gain_sentence,
 )
 
 _DIFFERENCE = "How much better?"
@@ -31,7 +31,7 @@ _EXCHANGEABLE = "sign flips within pairs, exact: are both exchangeable?"
 
 
 @dataclass(frozen=True, slots=True)
-class Fact:
+class ComparisonFact:
     """A question that a comparison answers: how, and what came out. `own`: by the plan's own interval."""
 
     question: str
@@ -42,14 +42,14 @@ class Fact:
 
 def primaries_of(plan: Plan, analysis: Analysis) -> list[Comparison]:
     """The comparisons that the plan is about, as far as both have trials."""
-    found = (analysis.compared(*names) for names in compared(plan.document or {}))
+    found = (analysis.comparison_of(*names) for names in compared(plan.document or {}))
     return [one for one in found if one is not None]
 
 
 def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
     """It in one sentence."""
     one, other = analysis.arm(found.first).success, analysis.arm(found.second).success
-    return verdict(found, one, other, analysis.alpha)
+    return difference_sentence(found, one, other, analysis.alpha)
 
 
 def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
@@ -65,14 +65,18 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
         "names": f"{found.first} and {found.second}",
         "facts": [
             replace(fact, own=fact.question == own)
-            for fact in (*_of_the_rates(plan, analysis, found), *_of_the_evidence(found), *_beyond(found))
+            for fact in (
+                *_of_the_rates(plan, analysis, found),
+                *_of_the_evidence(found),
+                *_later_facts(found),
+            )
         ],
         "standing": found.standing.name.lower(),
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
-        "missed": missed_words(analysis, found),
-        "address": compare_address(plan, found, Chosen()),
-        "difference": rates.difference(found),
+        "missed": undetectable_text(analysis, found),
+        "address": compare_address(plan, found, TrialFilter()),
+        "difference": rates.draw_difference(found),
     }
 
 
@@ -84,36 +88,38 @@ def _own_interval(plan: Plan) -> str:
     return _DIFFERENCE if plan.stopping == StoppingRule.NONE and not by_score else ""
 
 
-def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator[Fact]:
+def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator[ComparisonFact]:
     fixed = "n as planned" if plan.stopping == StoppingRule.NONE else "as if n had been fixed"
-    yield Fact(_DIFFERENCE, "Newcombe, 95 %", points(found.difference))
+    yield ComparisonFact(_DIFFERENCE, "Newcombe, 95 %", format_points(found.difference))
     if found.test and found.corrected is not None:
         corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
         chance = f"{p_words(found.test.p)}{corrected}"
-        yield Fact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
+        yield ComparisonFact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
     if found.paired:
         split = (
             f"only {found.first} {found.paired.first_only}, only {found.second} {found.paired.second_only}"
         )
         of_pairs = f"{p_words(found.paired.p)} of {found.pairs} pairs ({split})"
-        yield Fact("The same, pair by pair?", "McNemar, exact", of_pairs)
+        yield ComparisonFact("The same, pair by pair?", "McNemar, exact", of_pairs)
     if found.scored:
         gain = f"{100 * found.scored.value:+.0f} points".replace("-", "−")
         of_scores = f"{gain} of the score, {p_words(found.scored.p)} of {found.pairs} pairs"
-        yield Fact("With partial credit, n as planned?", _EXCHANGEABLE, of_scores)
+        yield ComparisonFact("With partial credit, n as planned?", _EXCHANGEABLE, of_scores)
     if found.clustered:
-        yield Fact(
-            "Other initial conditions?", "conditions as a sample, Gaffke, 95 %", points(found.clustered)
+        yield ComparisonFact(
+            "Other initial conditions?",
+            "conditions as a sample, Gaffke, 95 %",
+            format_points(found.clustered),
         )
 
 
-def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
+def _of_the_evidence(found: Comparison) -> Iterator[ComparisonFact]:
     if found.evidence:
-        yield Fact(
+        yield ComparisonFact(
             "Enough evidence to stop?", f"e-process, alpha {found.alpha:.2g}", evidence_words(found.evidence)
         )
     if found.score_evidence:
-        yield Fact(
+        yield ComparisonFact(
             "With partial credit, at any time?",
             "betting e-process on scores",
             evidence_words(found.score_evidence),
@@ -127,42 +133,46 @@ def _of_the_evidence(found: Comparison) -> Iterator[Fact]:
         )
     ):
         how = f"confidence sequence, {100 * (1 - found.alpha):.3g} %"
-        yield Fact(question, how, anytime_words(interval, found.pairs))
+        yield ComparisonFact(question, how, anytime_words(interval, found.pairs))
 
 
-def _beyond(found: Comparison) -> Iterator[Fact]:
+def _later_facts(found: Comparison) -> Iterator[ComparisonFact]:
     if found.stratified:
         odds = found.stratified.odds_ratio
         ratio = "without bound" if odds is None else f"{odds:.2g}"
         points_over = f"{100 * found.stratified.stratified:+.0f} points".replace("-", "−")
         chance = probability(found.stratified.p)
-        yield Fact("Over scenes?", "Mantel-Haenszel", f"{points_over}, odds ratio {ratio}, p = {chance}")
+        yield ComparisonFact(
+            "Over scenes?", "Mantel-Haenszel", f"{points_over}, odds ratio {ratio}, p = {chance}"
+        )
     for name, within in found.within.items():
         over = f"{p_words(within.p)} over {within.strata} {name}s"
-        yield Fact(f"The same within {name}s?", "exact, conditional", over)
+        yield ComparisonFact(f"The same within {name}s?", "exact, conditional", over)
     if found.scenes:
-        by_scene = "; ".join(f"{name} {points(difference)}" for name, difference in found.scenes.items())
+        by_scene = "; ".join(
+            f"{name} {format_points(difference)}" for name, difference in found.scenes.items()
+        )
         chance = "too many ways to count" if found.interaction is None else p_words(found.interaction)
         told = by_scene if found.standing is Standing.OPEN else f"{chance}: {by_scene}"
-        yield Fact("Does it depend on the scene?", "interaction, Zelen, exact", told)
-    if found.sooner:
-        ahead = found.first if found.sooner.value < 0 else found.second
-        by = f"{abs(found.sooner.value):.1f} s"
-        lead = f"{ahead} by {by}, failures counted in full" if found.sooner.value else "neither"
-        of_times = f"{lead}, {p_words(found.sooner.p)} of {found.sooner.pairs} pairs"
-        yield Fact("Which is faster?", _EXCHANGEABLE, of_times)
+        yield ComparisonFact("Does it depend on the scene?", "interaction, Zelen, exact", told)
+    if found.time_test:
+        ahead = found.first if found.time_test.value < 0 else found.second
+        by = f"{abs(found.time_test.value):.1f} s"
+        lead = f"{ahead} by {by}, failures counted in full" if found.time_test.value else "neither"
+        of_times = f"{lead}, {p_words(found.time_test.p)} of {found.time_test.pairs} pairs"
+        yield ComparisonFact("Which is faster?", _EXCHANGEABLE, of_times)
     if found.better is not None:
         believed = f"{found.first} is better with probability {_chance(found.better)}"
-        yield Fact("Bayesian view", "uniform priors", believed)
+        yield ComparisonFact("Bayesian view", "uniform priors", believed)
 
 
-def missed_words(analysis: Analysis, found: Comparison | None = None) -> str:
+def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> str:
     """What these trials could not have detected, at a planned comparison's share of alpha."""
     arms = [arm for arm in analysis.arms if found is None or arm.checkpoint in (found.first, found.second)]
     n = min(arm.success.n for arm in arms)
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)
     compared = analysis.comparisons if found is None else (found,)
-    return missed(n, rate, max((one.alpha for one in compared), default=analysis.alpha))
+    return undetectable_gain_sentence(n, rate, max((one.alpha for one in compared), default=analysis.alpha))
 
 
 def _chance(p: float) -> str:

@@ -11,16 +11,16 @@ from evaweb.plans.design import (
     Tried,
     arms_of,
     compared,
-    frozen,
+    current_pairs,
+    frozen_design,
     kept_blocks,
     same_blocks,
-    told_reason,
-    tried,
+    visible_close_reason,
 )
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.presentation.setting import setting_of
-from evaweb.results.presentation.wording import p_words, points
+from evaweb.results.presentation.wording import format_points, p_words
 from evaweb.statistics.designs import (
     FIXED,
     SUCCESS,
@@ -29,8 +29,8 @@ from evaweb.statistics.designs import (
     Design,
     Findings,
     alone,
-    conclude,
     estimated,
+    evaluate_design,
     findings,
     unbeaten,
 )
@@ -100,10 +100,10 @@ class Headline:
 
 def headline(plan: Plan) -> Headline | None:
     """That of a frozen plan; None where it has no comparison."""
-    found = frozen(plan.document) if plan.document else None
+    found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return None
-    now = tried(plan)
+    now = current_pairs(plan)
     kept = kept_blocks(plan)
     at_reveal = now.counted if kept is None else kept
     return Headline(
@@ -222,10 +222,10 @@ def _sentence(
         made = f"{one.blocks} of {found.blocks} {found.unit}"
         if plan.state == PlanState.FROZEN:
             return f"{first} and {second} are not compared yet: {made} are made, and the design goes on"
-        if told_reason(plan, sealed=True):  # the design had ended, with other scores than these
+        if visible_close_reason(plan, sealed=True):  # the design had ended, with other scores than these
             return f"{first} and {second} would not be compared yet after {made}: the design would go on"
         return f"{first} and {second} were not compared: closed after {made}, before the design ended"
-    sides = [[v for block in blocks[: one.at] for arm, v in block if arm == side] for side in pair]
+    sides = [[v for block in blocks[: one.ended_at_pair] for arm, v in block if arm == side] for side in pair]
     if one.winner == "second":  # the better one is named first
         sides.reverse()
     counts = _counts(found, one, *sides)
@@ -233,7 +233,7 @@ def _sentence(
         claim = f"{first} is {'' if one.winner else 'not shown to be '}not worse than {second}"
         return f"{claim} by {100 * found.margin:g} points or more: {counts}"
     if one.winner is None and not one.dropped and not _could_tell(plan, found, pair, blocks):
-        return f"Undecided: {one.at} {found.unit} cannot tell {first} and {second} apart: {counts}"
+        return f"Undecided: {one.ended_at_pair} {found.unit} cannot tell {first} and {second} apart: {counts}"
     if one.winner is None:
         why = ", when one of them was dropped" if one.dropped else ""
         return f"No significant difference between {first} and {second}: {counts}{why}"
@@ -261,9 +261,9 @@ def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Seque
     words = f"{sum(ours):.0f}/{n} against {sum(theirs):.0f}/{m}"
     if one.p is not None:  # of a fixed number: an interval of the difference means what it says
         if n and m:
-            words += f", difference {points(newcombe(int(sum(ours)), n, int(sum(theirs)), m))}"
+            words += f", difference {format_points(newcombe(int(sum(ours)), n, int(sum(theirs)), m))}"
         words += f", {p_words(one.p)}"
-    return f"{words}, after {one.at} of {found.blocks} {found.unit}"
+    return f"{words}, after {one.ended_at_pair} of {found.blocks} {found.unit}"
 
 
 def _other(plan: Plan, found: Design, blocks: Sequence[Block], at_reveal: Sequence[Block]) -> str:
@@ -279,11 +279,11 @@ def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[s
         if said is None:
             continue
         if one.winner == "second":
-            first, second, said = second, first, said.reversed
+            first, second, said = second, first, said.swapped
         yield (
-            f"{first} is ahead of {second} by {points(said)}, corrected for stopping early (median unbiased over all "
-            "ways in which the design can end; where it ends early this is still mostly too large, the raw difference "
-            "more so)"
+            f"{first} is ahead of {second} by {format_points(said)}, corrected for stopping early (median unbiased "
+            "over all ways in which the design can end; where it ends early this is still mostly too large, the raw "
+            "difference more so)"
         )
 
 
@@ -304,7 +304,7 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
         blocks = now.against(*(pair if one.winner == "first" else pair[::-1])) if one.winner else now.counted
         if blocks != now.counted:
             # Other outcomes would have dropped others, of which there are no trials: by itself, as it was decided.
-            single, both = alone(found, pair, blocks[: one.at]) if found.drops else (found, blocks)
+            single, both = alone(found, pair, blocks[: one.ended_at_pair]) if found.drops else (found, blocks)
             sentence, other = told_alone(plan, single, number, both)
             told.append(WorstCase(sentence, other.winner == one.winner))
     return told
@@ -333,7 +333,7 @@ def told_alone(plan: Plan, single: Design, number: int, blocks: Sequence[Block])
     """What the comparison of this number says by itself of these blocks, by the design `single`."""
     names = compared(plan.document or {})[number]
     pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
-    one = conclude(single, blocks, pair)
+    one = evaluate_design(single, blocks, pair)
     return _sentence(plan, single, one, pair, names, blocks), one
 
 
@@ -341,10 +341,10 @@ def _versions(plan: Plan) -> tuple[str, ...]:
     """What each version before this one came to, the newest first: each had all of its alpha."""
     told, version = [], plan.amends
     while version is not None:
-        found = frozen(version.document) if version.document else None
+        found = frozen_design(version.document) if version.document else None
         if found is not None:
             kept = kept_blocks(version)
-            sentence = sentence_of(version, found, tried(version).counted if kept is None else kept)
+            sentence = sentence_of(version, found, current_pairs(version).counted if kept is None else kept)
             told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
         version = version.amends
     return tuple(told)

@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.conduct import conduct_of, looks_of, runs_of
+from evaweb.results.analysis.conduct import all_attempts, looks_of, plan_conduct
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT
 from evaweb.results.presentation.wording import p_words
-from evaweb.results.presentation.would_be import would_be
+from evaweb.results.presentation.would_be import headline_alternatives
 from evaweb.trials.endings import ENDINGS, ESTOP, INTERRUPTION
 
 _RARE = 0.05  # probability at or below which an anchor is said to drift
@@ -19,9 +19,9 @@ _RARE = 0.05  # probability at or below which an anchor is said to drift
 def integrity_document(plan: Plan) -> dict[str, Any]:
     """What the record says, what the headline would be under each doubt, and `remarks` that sum both up."""
     looks = looks_of(plan)
-    runs = runs_of(plan, looks)
+    runs = all_attempts(plan, looks)
     matches = {run.trial: run.match for run in runs if run.match is not None}
-    found = {**conduct_of(plan, runs, looks), "headline": would_be(plan, matches)}
+    found = {**plan_conduct(plan, runs, looks), "headline": headline_alternatives(plan, matches)}
     return {**found, "remarks": list(_remarks(found))}
 
 

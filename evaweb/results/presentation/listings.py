@@ -13,16 +13,16 @@ from evaweb.lists import SEARCH, UNSEEN, Column, Filter
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis, Arm
-from evaweb.results.analysis.filters import Chosen, choices
+from evaweb.results.analysis.filters import TrialFilter, filter_choices
 from evaweb.results.analysis.outcomes import Outcome, Pair
 from evaweb.results.presentation.addresses import beside_address, trials_address
 from evaweb.results.presentation.drawings import conditions
-from evaweb.results.presentation.wording import ends
-from evaweb.results.ratings.video_available import seen
-from evaweb.results.selectors import Question
-from evaweb.statistics.bounded import Mean
+from evaweb.results.presentation.wording import format_interval
+from evaweb.results.ratings.video_available import is_watchable
+from evaweb.results.selectors import TrialQuery
+from evaweb.statistics.bounded import BoundedMean
 from evaweb.statistics.proportions import Proportion
-from evaweb.trials.failure_words import NOT_SAID
+from evaweb.trials.failure_words import UNSPECIFIED
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.figures import average_words
 from evaweb.trials.models import Trial, TrialStatus
@@ -39,7 +39,7 @@ class Row:
     address: str
 
 
-def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any]]:
+def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str, Any]]:
     """The table of checkpoints, best first, each with what scores that were corrected after the reveal make of it."""
     corrected = caching.corrected_of(plan, only)
     return [
@@ -49,7 +49,7 @@ def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any
             "letters": analysis.letters.get(arm.checkpoint, ""),
             "address": trials_address(plan, only, checkpoint=arm.checkpoint),
             "successes": trials_address(plan, only, checkpoint=arm.checkpoint, success="yes"),
-            "exact": ends(arm.exact) if arm.exact else "",
+            "exact": format_interval(arm.exact) if arm.exact else "",
             "score": _mean(arm.score),
             "macro": _mean(arm.macro),
             "time": _time(arm),
@@ -63,7 +63,7 @@ def arm_rows(plan: Plan, analysis: Analysis, only: Chosen) -> list[dict[str, Any
     ]
 
 
-def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: Chosen) -> list[Row]:
+def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> list[Row]:
     """Each checkpoint on one scene."""
     return [
         Row(
@@ -105,16 +105,16 @@ def _failure_table(
         """Of one phase and cause; None for all."""
         chosen = [m for m in arm.failures if phase in (None, m.phase) and cause in (None, m.cause)]
         named = {"failure_phase": phase, "failure": cause}
-        where = {field: words or NOT_SAID for field, words in named.items() if words is not None}
+        where = {field: words or UNSPECIFIED for field, words in named.items() if words is not None}
         return Cell(sum(m.count for m in chosen), address(checkpoint=arm.checkpoint, **where))
 
-    rows = [(cause or NOT_SAID, [cell(phase, cause) for phase in (*phases, None)]) for cause in causes]
+    rows = [(cause or UNSPECIFIED, [cell(phase, cause) for phase in (*phases, None)]) for cause in causes]
     links = {(mode.phase, mode.cause): cell(mode.phase, mode.cause).address for mode in arm.failures}
     return {
         "checkpoint": arm.checkpoint,
         "n": arm.success.n,
-        "pareto": conditions.pareto(arm, links),
-        "head": [phase or NOT_SAID for phase in phases],
+        "pareto": conditions.draw_pareto(arm, links),
+        "head": [phase or UNSPECIFIED for phase in phases],
         "rows": [*rows, ("all", [cell(phase, None) for phase in (*phases, None)])],
     }
 
@@ -134,7 +134,7 @@ class Side:
     @property
     def video(self) -> str:
         """Address of the first camera's; "" where there are no pictures on this machine."""
-        if not seen(self.episode):
+        if not is_watchable(self.episode):
             return ""
         return reverse("episode-video", args=[self.episode.uuid, self.episode.cameras[0]])
 
@@ -181,13 +181,13 @@ def trial_row(trial: Trial) -> dict[str, Any]:
 
 def trial_filters(plan: Plan) -> list[Filter]:
     """What the list of its trials is narrowed by; Question says what it does not know."""
-    runs = caching.runs_of(plan).outcomes
+    runs = caching.cached_runs(plan).outcomes
     failed = [run for run in runs if not run.success]
     values = {
-        **choices(runs),
+        **filter_choices(runs),
         "checkpoint": sorted({run.checkpoint for run in runs}),
         "success": ["yes", "no"],
-        **{field: sorted({getattr(run, field) or NOT_SAID for run in failed}) for field in FIELDS},
+        **{field: sorted({getattr(run, field) or UNSPECIFIED for run in failed}) for field in FIELDS},
     }
     labels = {"failure_phase": "Phase", "failure": "Failure"}
     names = ("checkpoint", "scene", "position", "success", "failure_phase", "failure", "station", "operator")
@@ -210,10 +210,10 @@ def trial_filters(plan: Plan) -> list[Filter]:
     ]
 
 
-def question_of(chosen: Mapping[str, str]) -> Question:
+def question_of(chosen: Mapping[str, str]) -> TrialQuery:
     """The trials that are meant by what is chosen: those that count where no status is."""
     status = chosen["status"] or TrialStatus.SCORED.value
-    return Question(**{**chosen, "status": "" if status == EVERY else status})
+    return TrialQuery(**{**chosen, "status": "" if status == EVERY else status})
 
 
 EVERY = "every"
@@ -274,8 +274,8 @@ PLAN_COLUMNS = (
 )
 
 
-def _mean(found: Mean) -> str:
-    return f"{100 * found.value:.0f} % [{ends(found.interval)}]"
+def _mean(found: BoundedMean) -> str:
+    return f"{100 * found.value:.0f} % [{format_interval(found.interval)}]"
 
 
 def _time(arm: Arm) -> str:

@@ -14,17 +14,17 @@ def rate_words(found: Proportion) -> str:
     """ "46/50, 92 % [81, 97]"; a percentage never stands without n and interval."""
     if found.rate is None or found.interval is None:
         return "no trial"
-    return f"{found.successes}/{found.n}, {100 * found.rate:.0f} % [{ends(found.interval)}]"
+    return f"{found.successes}/{found.n}, {100 * found.rate:.0f} % [{format_interval(found.interval)}]"
 
 
-def ends(interval: Interval, factor: float = 100) -> str:
+def format_interval(interval: Interval, factor: float = 100) -> str:
     """Both ends in percent."""
     return f"{_signed(factor * interval.low)}, {_signed(factor * interval.high)}"
 
 
-def points(found: Difference) -> str:
+def format_points(found: Difference) -> str:
     """ "36 points [19, 51]"."""
-    return f"{_signed(100 * found.value)} points [{ends(found.interval)}]"
+    return f"{_signed(100 * found.value)} points [{format_interval(found.interval)}]"
 
 
 def probability(p: float) -> str:
@@ -37,7 +37,7 @@ def p_words(p: float) -> str:
     return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
 
 
-def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
+def difference_sentence(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
     """The comparison in one sentence, with its evidence; says only what the corrected exact test says.
 
     One that is planned is not decided here: ValueError.
@@ -46,18 +46,18 @@ def verdict(found: Comparison, one: Proportion, other: Proportion, alpha: float)
         raise ValueError(f"{found.first} and {found.second}: their design decides, which has not ended")
     difference = found.difference
     if found.corrected > alpha:
-        counts = (
-            f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(difference)}"
-        )
+        counts = f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {format_points(difference)}"
         return f"No significant difference between {found.first} and {found.second}: {counts}"
     better, worse = found.first, found.second
     if difference.value < 0:
-        better, worse, one, other, difference = worse, better, other, one, difference.reversed
-    counts = f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {points(difference)}"
+        better, worse, one, other, difference = worse, better, other, one, difference.swapped
+    counts = (
+        f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {format_points(difference)}"
+    )
     return f"{better} succeeded more often than {worse}: {counts}"
 
 
-def missed(n: int, rate: float | None, alpha: float) -> str:
+def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
     """Sentence on the gain that so many trials of each arm could not have detected, from that rate."""
     if rate is None or n < 1:
         return "Without trials nothing could be detected."
@@ -84,7 +84,11 @@ def evidence_words(found: Evidence) -> str:
 
 def anytime_words(found: Interval | None, pairs: int) -> str:
     """ "[−3, 55] points, of 40 pairs"."""
-    return f"[{ends(found)}] points, of {pairs} pairs" if found else "no one difference fits all pairs"
+    return (
+        f"[{format_interval(found)}] points, of {pairs} pairs"
+        if found
+        else "no one difference fits all pairs"
+    )
 
 
 def _power(log_e: float) -> str:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from evaweb.memo import Kept
+from evaweb.memo import FingerprintCache
 from evaweb.plans.counting import declared_failures
-from evaweb.plans.design import Attempt, arms_of, attempts_of, blocks_of, compared, frozen, kept_blocks
+from evaweb.plans.design import Attempt, arms_of, attempts_of, blocks_of, compared, frozen_design, kept_blocks
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.headline import in_the_worst_case, sentence_of, told_alone
 from evaweb.statistics.designs import (
@@ -19,16 +19,16 @@ from evaweb.statistics.designs import (
     Design,
     Findings,
     alone,
-    conclude,
     design,
+    evaluate_design,
     findings,
     of_so_many,
 )
 
-_kept: Kept[list[dict[str, Any]]] = Kept()
+_kept: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 
 
-def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
+def headline_alternatives(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     """As it was decided, then each other way to count: what, the blocks that it leaves, the sentence, and whether the
     same checkpoints are ahead by the design. None without a comparison.
 
@@ -37,16 +37,18 @@ def would_be(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
     random order, by one test of all of it; where the design did not end nothing is left out, for nothing was concluded.
     `matches` is the least match of each trial's bench, where known.
     """
-    found = frozen(plan.document) if plan.document else None
+    found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return []
     attempts = attempts_of(plan)
     kept = kept_blocks(plan)
     at = (tuple(attempts), None if kept is None else tuple(kept), tuple(sorted(matches.items())), plan.state)
-    return _kept.get((plan.pk, plan.digest), at, lambda: list(_ways(plan, found, attempts, matches, kept)))
+    return _kept.get(
+        (plan.pk, plan.digest), at, lambda: list(_alternatives(plan, found, attempts, matches, kept))
+    )
 
 
-def _ways(
+def _alternatives(
     plan: Plan,
     found: Design,
     attempts: Sequence[Attempt],
@@ -152,13 +154,15 @@ def _stepped(found: Design, left: _Left) -> _Left:
     if not found.holm:
         return left
     stepped, count = list(left), len(left)
-    tests = {n: conclude(by, blocks, by.comparisons[0]).p for n, (by, blocks) in enumerate(left) if blocks}
+    tests = {
+        n: evaluate_design(by, blocks, by.comparisons[0]).p for n, (by, blocks) in enumerate(left) if blocks
+    }
     if None in tests.values():
         return left
     for done, number in enumerate(sorted(tests, key=lambda n: tests[n] or 0.0)):
         by, blocks = left[number]
         by = replace(by, alpha=found.alpha / (count - done))
         stepped[number] = by, blocks
-        if conclude(by, blocks, by.comparisons[0]).winner is None:
+        if evaluate_design(by, blocks, by.comparisons[0]).winner is None:
             break
     return stepped

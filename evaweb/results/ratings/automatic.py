@@ -20,16 +20,16 @@ from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState
-from evaweb.results.judges.base import Case, NoVerdict, Said, Step
-from evaweb.results.judges.finding import Found, built
+from evaweb.results.judges.base import MilestoneJudgement, MilestonePrompt, NoVerdict, TrialCase
+from evaweb.results.judges.finding import UsableJudge, build_judge
 from evaweb.results.models import AutomaticJudge, Judgement
 from evaweb.results.ratings.record import RATINGS, JudgementLine
-from evaweb.results.ratings.stills import stills_of
-from evaweb.results.ratings.video_available import seen
-from evaweb.roles import Role, require
+from evaweb.results.ratings.stills import trial_stills
+from evaweb.results.ratings.video_available import is_watchable
+from evaweb.roles import Role, require_role
 from evaweb.trials.models import Milestone, Trial, TrialStatus
-from evaweb.trials.record import file_of
-from evaweb.trials.services import checked
+from evaweb.trials.record import journal_uuid
+from evaweb.trials.services import run_checks
 from evaweb.trials.verdicts import reached_in_truth
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
@@ -65,10 +65,10 @@ LONGEST_REASON, LONGEST_MODEL = 300, 200  # characters of what a server may have
 
 def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
     """Let it be sent pictures at the address that it has now; who allowed it is kept."""
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     if not judge.address:
         raise Conflict(_JUDGE_HAS_NO_ADDRESS_THERE(judge=judge))
-    built(judge.name, judge.kind, judge.setup)
+    build_judge(judge.name, judge.kind, judge.setup)
     judge.allowed_address, judge.allowed_by, judge.allowed_at = judge.address, user, timezone.now()
     judge.save(update_fields=["allowed_address", "allowed_by", "allowed_at"])
     log.info("judge %s: %a allows %s", judge, user.get_username(), judge.address)
@@ -76,7 +76,7 @@ def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
 
 def judge_forbid(*, user: User, judge: AutomaticJudge) -> None:
     """Send nothing to it any more; what it is being asked just now is still answered."""
-    require(user, Role.ADMIN)
+    require_role(user, Role.ADMIN)
     judge.allowed_address, judge.allowed_by, judge.allowed_at = "", None, None
     judge.save(update_fields=["allowed_address", "allowed_by", "allowed_at"])
     log.info("judge %s: %a allows it no longer", judge, user.get_username())
@@ -97,12 +97,12 @@ def judges_ready() -> list[AutomaticJudge]:
     return found
 
 
-def judge_ask(*, user: User, plan: Plan, name: str) -> Job:
+def request_judging(*, user: User, plan: Plan, name: str) -> Job:
     """Have the worker show all scored trials of the plan to a judge; its owner, or an administrator.
 
     Before the reveal too: what it says is hidden until then.
     """
-    role = require(user, Role.OPERATOR)
+    role = require_role(user, Role.OPERATOR)
     if role is not Role.ADMIN and plan.owner_id != user.pk:
         raise NotAllowed(_OWNER_ADMINISTRATOR_ASKS_JUDGE(plan=plan, user=plan.owner.get_username()))
     if plan.state == PlanState.DRAFT:
@@ -113,10 +113,10 @@ def judge_ask(*, user: User, plan: Plan, name: str) -> Job:
         PlanEvent.objects.create(
             plan=plan, by=user, what="judge asked", text=f"the judge {judge} ({judge.kind})"
         )
-        return judge_wanted(plan=plan, judge=judge.name)
+        return enqueue_judging(plan=plan, judge=judge.name)
 
 
-def judge_wanted(*, plan: Plan, judge: str) -> Job:
+def enqueue_judging(*, plan: Plan, judge: str) -> Job:
     """The job that shows its trials to a judge, where there is none yet."""
     return enqueue(kind=KIND, key=f"{KIND}:{plan.pk}:{judge}", args={"plan": plan.pk, "judge": judge})
 
@@ -129,9 +129,9 @@ def _judge(name: str) -> AutomaticJudge:
     return found
 
 
-def _ready(judge: AutomaticJudge) -> Found:
+def _ready(judge: AutomaticJudge) -> UsableJudge:
     """The judge, to be asked; EvaError where it cannot be, or must not: its address was never allowed."""
-    found = built(judge.name, judge.kind, judge.setup)
+    found = build_judge(judge.name, judge.kind, judge.setup)
     if found.served and judge.allowed_address != judge.address:
         raise NotAllowed(_JUDGE_ADDRESS_NOT_ALLOWED_ADMINISTRATOR(judge=judge))
     return found
@@ -140,7 +140,7 @@ def _ready(judge: AutomaticJudge) -> Found:
 # --- being judged ------------------------------------------------------------------------------------------
 
 
-def judge_next(*, plan: Plan, name: str) -> bool:
+def judge_next_trial(*, plan: Plan, name: str) -> bool:
     """Show the next trial to the judge and keep what it says; False where there is none that can be shown.
 
     Nothing is held while it is asked. EvaError where the judge itself fails, and nothing is kept.
@@ -149,10 +149,10 @@ def judge_next(*, plan: Plan, name: str) -> bool:
     handout = next(_showable(plan, found), None)
     if handout is None:
         return False
-    checked("judged", handout.trial, None)
+    run_checks("judged", handout.trial, None)
     judgement = Judgement(trial=handout.trial, judge=found.name, version=found.version)
     milestones = list(handout.trial.scene.milestones.order_by("order"))
-    said = [Said()] * len(milestones)
+    said = [MilestoneJudgement()] * len(milestones)
     try:
         case = _case(handout.trial, milestones, found)
         words = found.words(case)
@@ -162,7 +162,7 @@ def judge_next(*, plan: Plan, name: str) -> bool:
         ]
         if found.pictures and not case.stills:
             raise NoVerdict("there is no picture of it")
-        verdict = found.asked(case)
+        verdict = found.judge_case(case)
         judgement.model, said = _short(verdict.model, LONGEST_MODEL), list(verdict.milestones)
     except RecordingError:
         log.warning("judge %s: pictures of trial %s cannot be read", name, handout.trial_id, exc_info=True)
@@ -172,7 +172,7 @@ def judge_next(*, plan: Plan, name: str) -> bool:
     judgement.milestones = [
         [row.text, one.reached, one.probability] for row, one in zip(milestones, said, strict=True)
     ]
-    _keep(judgement)
+    _store_judgement(judgement)
     return True
 
 
@@ -181,14 +181,14 @@ def _short(said: str, longest: int) -> str:
     return " ".join(said.replace("\x00", "").encode("utf-8", "replace").decode().split())[:longest]
 
 
-def left(*, plan: Plan, name: str) -> tuple[int, list[str]]:
+def unjudged_trials(*, plan: Plan, name: str) -> tuple[int, list[str]]:
     """How many scored trials the judge has not been shown, and the codes of those without pictures on this machine."""
     found = _ready(_judge(name))
     waiting = list(_waiting(plan, found))
-    return len(waiting), [row.code for row in waiting if not _can_be_shown(row, found)]
+    return len(waiting), [row.code for row in waiting if not _has_evidence(row, found)]
 
 
-def _waiting(plan: Plan, found: Found) -> Iterator[Handout]:
+def _waiting(plan: Plan, found: UsableJudge) -> Iterator[Handout]:
     """Those that count, have milestones, and were not shown to it, in the order in which they were handed out."""
     shown = Judgement.objects.filter(trial=OuterRef("trial"), judge=found.name, version=found.version)
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).exclude(Exists(shown))
@@ -196,32 +196,32 @@ def _waiting(plan: Plan, found: Found) -> Iterator[Handout]:
     yield from rows.select_related("trial__scene", "trial__episode").order_by("number")
 
 
-def _showable(plan: Plan, found: Found) -> Iterator[Handout]:
-    return (handout for handout in _waiting(plan, found) if _can_be_shown(handout, found))
+def _showable(plan: Plan, found: UsableJudge) -> Iterator[Handout]:
+    return (handout for handout in _waiting(plan, found) if _has_evidence(handout, found))
 
 
-def _can_be_shown(handout: Handout, found: Found) -> bool:
-    return not found.pictures or seen(handout.trial.episode)
+def _has_evidence(handout: Handout, found: UsableJudge) -> bool:
+    return not found.pictures or is_watchable(handout.trial.episode)
 
 
-def _case(trial: Trial, milestones: Sequence[Milestone], found: Found) -> Case:
+def _case(trial: Trial, milestones: Sequence[Milestone], found: UsableJudge) -> TrialCase:
     """What the judge may know of a trial."""
-    return Case(
+    return TrialCase(
         trial.instruction,
         trial.scene.criterion,
-        tuple(Step(row.text, row.time_limit_s) for row in milestones),
-        stills_of(trial.episode) if found.pictures and trial.episode is not None else (),
+        tuple(MilestonePrompt(row.text, row.time_limit_s) for row in milestones),
+        trial_stills(trial.episode) if found.pictures and trial.episode is not None else (),
         () if found.pictures else tuple(reached_in_truth(trial.truth or {}, row) for row in milestones),
     )
 
 
 @transaction.atomic
-def _keep(judgement: Judgement) -> None:
+def _store_judgement(judgement: Judgement) -> None:
     """On the disk, then as a row, unless another worker was sooner or the trial counts no longer."""
     trial = Trial.objects.select_for_update().get(pk=judgement.trial_id)
     named = {name: getattr(judgement, name) for name in ("trial_id", "judge", "version")}
     if trial.status != TrialStatus.SCORED or Judgement.objects.filter(**named).exists():
         return
     judgement.at = timezone.now()
-    RATINGS.append(file_of(trial), JudgementLine.written(judgement))
+    RATINGS.append(journal_uuid(trial), JudgementLine.written(judgement))
     judgement.save()

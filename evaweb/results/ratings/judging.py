@@ -15,20 +15,20 @@ from django.db.models import Exists, OuterRef, QuerySet
 
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.journal import text
+from evaweb.journal import clean_text
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.models import Handout, Plan, PlanState
-from evaweb.plans.seeded_draws import Chance
+from evaweb.plans.seeded_draws import SeededDraws
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
-from evaweb.results.ratings.video_available import coming, require_seen_on_video, seen
+from evaweb.results.ratings.video_available import is_watchable, may_become_watchable, require_video
 from evaweb.reviews.selectors import still_judges
-from evaweb.roles import Role, require, role_of
+from evaweb.roles import Role, require_role, role_of
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
-from evaweb.trials.record import file_of
-from evaweb.trials.services import checked, declare_check, failing
-from evaweb.trials.verdicts import LONGEST_NOTE, verdict
+from evaweb.trials.record import journal_uuid
+from evaweb.trials.services import failing, register_check, run_checks
+from evaweb.trials.verdicts import LONGEST_NOTE, score_outcome
 from runtime.core.sentences import Pattern, fixed
 
 _TRIAL_RATED_BY_SECOND_PERSON = Pattern(
@@ -77,7 +77,7 @@ T = TypeVar("T")
 _NAMED = 200  # pairs in one question to the database
 
 
-class Offer(NamedTuple, Generic[T]):
+class NextItem(NamedTuple, Generic[T]):
     """Next item for one rater, None for nothing; `left` for this rater in all.
 
     `passed`: codes of trials that come before it, of which there are no pictures on this machine.
@@ -97,21 +97,21 @@ class Pair:
     second: Handout
 
 
-def sample_of(plan: Plan) -> list[int]:
+def rating_sample(plan: Plan) -> list[int]:
     """The places in the schedule whose trials are rated again, in the order in which they are; drawn by the key."""
     n = plan.slots.count()
-    drawn = Chance(bytes(plan.key or b""), "second rater").shuffled(range(n))
+    drawn = SeededDraws(bytes(plan.key or b""), "second rater").shuffled(range(n))
     return drawn[: math.ceil(plan.second_rater_share * n)]
 
 
-def to_rate(user: User) -> Offer[Handout]:
+def next_to_rate(user: User) -> NextItem[Handout]:
     """The next trial that this user may rate again, of those of which there are pictures."""
     mine: list[Handout] = []
     for plan in Plan.objects.filter(state__in=_STATES, second_rater_share__gt=0).order_by("pk"):
         if has_looked_at_the_same(plan, user):
             continue
         open_ones = {handout.slot.index: handout for handout in _unrated(plan, user)}
-        mine += [open_ones[index] for index in sample_of(plan) if index in open_ones]
+        mine += [open_ones[index] for index in rating_sample(plan) if index in open_ones]
     return _offered(mine, len(mine), lambda handout: (handout,))
 
 
@@ -126,7 +126,7 @@ def _rated_first(what: str, trial: Trial, user: User) -> None:
         raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
 
 
-declare_check(_rated_first)
+register_check(_rated_first)
 
 
 @still_judges
@@ -144,22 +144,22 @@ def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
     handout = _unrated(plan, user).filter(trial=trial).first()
     if handout is None or not handout.trial.episode.cameras or has_looked_at_the_same(plan, user):
         return False  # nobody will ask this user
-    return handout.slot.index in sample_of(plan)
+    return handout.slot.index in rating_sample(plan)
 
 
-def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> Offer[T]:
+def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> NextItem[T]:
     """The first of which all pictures are there, else the first of which they may come; what lies before is passed.
 
     No more of what is `waiting` is read than has to be.
     """
-    for there, each in zip((seen, coming), tee(waiting), strict=True):
+    for there, each in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
         passed: list[str] = []
         for one in each:
             lacking = [handout.code for handout in of(one) if not there(handout.trial.episode)]
             if not lacking:
-                return Offer(one, count, tuple(dict.fromkeys(passed)))
+                return NextItem(one, count, tuple(dict.fromkeys(passed)))
             passed += lacking
-    return Offer(None, count, tuple(dict.fromkeys(passed)))
+    return NextItem(None, count, tuple(dict.fromkeys(passed)))
 
 
 def _unrated(plan: Plan, user: User) -> QuerySet[Handout]:
@@ -172,7 +172,7 @@ def _unrated(plan: Plan, user: User) -> QuerySet[Handout]:
 
 
 @transaction.atomic
-def rate(
+def save_rating(
     *,
     user: User,
     plan: Plan,
@@ -184,37 +184,37 @@ def rate(
     note: str = "",
 ) -> Rating:
     """Keep what a rater, not the operator of the trial of that code, saw on its video: on the disk, then as a row."""
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     handout = _handout(plan, code)
     trial = handout.trial
-    if handout.slot.index not in sample_of(plan) or trial.status != TrialStatus.SCORED:
+    if handout.slot.index not in rating_sample(plan) or trial.status != TrialStatus.SCORED:
         raise Conflict(_TRIAL_NOT_ONE_THOSE_RATED(code=code, plan=plan))
     if trial.operator_id == user.pk or trial.scores.filter(rater=user).exists():
         raise NotAllowed(_YOU_RAN_SCORED_TRIAL_SOMEONE(code=code))
-    checked("judged", trial, user)
+    run_checks("judged", trial, user)
     twice = f"you have rated trial {code} already"
     fails = bool(failing(trial))
-    found = verdict(list(trial.scene.milestones.order_by("order")), milestones, success, fails=fails)
+    found = score_outcome(list(trial.scene.milestones.order_by("order")), milestones, success, fails=fails)
     said = {
         "success": found.success,
         "score": found.score,
         "milestones": [[row[0].text, row[1]] for row in found.reached],
-        **failures.stripped(failure_phase=failure_phase, failure=failure),
-        "note": text("note", note, LONGEST_NOTE),
+        **failures.clean_failure(failure_phase=failure_phase, failure=failure),
+        "note": clean_text("note", note, LONGEST_NOTE),
     }
     before = Rating.objects.filter(trial=trial, rater=user).first()
     if before is not None:
-        return _once_more(before, said, twice)
+        return _is_repeat(before, said, twice)
     if has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_SECOND(plan=plan))
     failures.check_failure(trial.scene, said, success=found.success)
-    require_seen_on_video(handout)
+    require_video(handout)
     rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
-    RATINGS.append(file_of(trial), RatingLine.written(rating))
+    RATINGS.append(journal_uuid(trial), RatingLine.written(rating))
     return _once(rating, twice)
 
 
-def to_prefer(user: User, plans: Iterable[Plan] | None = None) -> Offer[Pair]:
+def next_to_compare(user: User, plans: Iterable[Plan] | None = None) -> NextItem[Pair]:
     """The next two trials that this user has not compared, of those of which there are pictures."""
     fresh: list[tuple[Plan, list[tuple[int, int]]]] = []
     for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
@@ -253,15 +253,15 @@ def _named(plan: Plan, pairs: Sequence[tuple[int, int]]) -> list[Pair]:
 
 
 @transaction.atomic
-def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why: str) -> Preference:
+def save_preference(*, user: User, plan: Plan, first: str, second: str, outcome: str, why: str) -> Preference:
     """Keep which of the trials of these codes was the better one; the first is the one that was run first.
 
     On the disk, then as a row.
     """
-    require(user, Role.OPERATOR)
+    require_role(user, Role.OPERATOR)
     if outcome not in Preference.Outcome.values:
         raise EvaError(_OUTCOME_ALLOWED(outcome=outcome, values=", ".join(Preference.Outcome.values)))
-    reason = text("why", why, LONGEST_NOTE)
+    reason = clean_text("why", why, LONGEST_NOTE)
     if not reason:
         raise EvaError(_WHY_EMPTY_SAY_SENTENCE_OTHERS)
     one, other = _handout(plan, first), _handout(plan, second)
@@ -271,12 +271,12 @@ def prefer(*, user: User, plan: Plan, first: str, second: str, outcome: str, why
     said = {"outcome": outcome, "why": reason}
     before = Preference.objects.filter(first=one.trial, second=other.trial, rater=user).first()
     if before is not None:
-        return _once_more(before, said, twice)
+        return _is_repeat(before, said, twice)
     if has_looked_at_the_same(plan, user):
         raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_RATER(plan=plan))
-    require_seen_on_video(one, other)
+    require_video(one, other)
     row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)
-    RATINGS.append(file_of(other.trial), PreferenceLine.written(row))
+    RATINGS.append(journal_uuid(other.trial), PreferenceLine.written(row))
     return _once(row, twice)
 
 
@@ -290,7 +290,7 @@ def _handout(plan: Plan, code: str) -> Handout:
     return found
 
 
-def _once_more(before: T, said: Mapping[str, Any], twice: str) -> T:
+def _is_repeat(before: T, said: Mapping[str, Any], twice: str) -> T:
     """The earlier answer, where it is given again word by word because the reply was lost; else Conflict."""
     if any(getattr(before, name) != value for name, value in said.items()):
         raise Conflict(_OTHERWISE_WHAT_SAID_STANDS(twice=twice))

@@ -11,7 +11,7 @@ from uuid import UUID
 
 from pydantic import Field, StrictBool
 
-from evaweb.journal import From, Journal, Line, Moment, Person
+from evaweb.journal import Journal, Line, Moment, Person, RowPath
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.trials.record import Name, TrialRecord
 
@@ -22,7 +22,7 @@ class RatingLine(Line):
     kind: Literal["rating"] = "rating"
     uuid: UUID
     trial: TrialRecord
-    rater: Annotated[Person, From("rater__username")]
+    rater: Annotated[Person, RowPath("rater__username")]
     at: Moment
     success: StrictBool
     score: Annotated[float, Field(ge=0, le=1)]
@@ -35,7 +35,7 @@ class RatingLine(Line):
     @classmethod
     def written(cls, row: Rating, **given: Any) -> dict[str, Any]:
         """The line of a rating that is about to be saved."""
-        return super().written(row, trial=TrialRecord.asked(row.trial), **given)
+        return super().written(row, trial=TrialRecord.for_manifest(row.trial), **given)
 
 
 class PreferenceLine(Line):
@@ -43,11 +43,11 @@ class PreferenceLine(Line):
 
     kind: Literal["preference"] = "preference"
     uuid: UUID
-    plan: Annotated[Name, From("plan__name")]
-    version: Annotated[int, Field(ge=1, lt=2**31), From("plan__version")]
+    plan: Annotated[Name, RowPath("plan__name")]
+    version: Annotated[int, Field(ge=1, lt=2**31), RowPath("plan__version")]
     first: TrialRecord
     second: TrialRecord
-    rater: Annotated[Person, From("rater__username")]
+    rater: Annotated[Person, RowPath("rater__username")]
     at: Moment
     outcome: Preference.Outcome
     why: str
@@ -56,7 +56,7 @@ class PreferenceLine(Line):
     @classmethod
     def written(cls, row: Preference, **given: Any) -> dict[str, Any]:
         """The line of a preference that is about to be saved."""
-        pair = {name: TrialRecord.asked(getattr(row, name)) for name in ("first", "second")}
+        pair = {name: TrialRecord.for_manifest(getattr(row, name)) for name in ("first", "second")}
         return super().written(row, **pair, **given)
 
 
@@ -82,7 +82,7 @@ class JudgementLine(Line):
     @classmethod
     def written(cls, row: Judgement, **given: Any) -> dict[str, Any]:
         """The line of a judgement that is about to be saved."""
-        return super().written(row, trial=TrialRecord.asked(row.trial), **given)
+        return super().written(row, trial=TrialRecord.for_manifest(row.trial), **given)
 
 
 RATINGS: Journal[RatingLine | PreferenceLine | JudgementLine] = Journal(

@@ -6,7 +6,7 @@ import logging
 
 from django.db import DataError, IntegrityError, transaction
 
-from evaweb.episodes.reconcile import Kept, restores
+from evaweb.episodes.reconcile import RestorableRun, register_restorer
 from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.results.models import Judgement, Preference, Rating
@@ -22,8 +22,8 @@ _JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE = Pattern(
 )
 
 
-@restores
-def restore(kept: Kept) -> int:
+@register_restorer
+def restore(kept: RestorableRun) -> int:
     """Make the rows that are not there; how many that were. The trials themselves were restored before."""
     made = 0
     for line in kept.lines:
@@ -35,7 +35,7 @@ def restore(kept: Kept) -> int:
             elif isinstance(line, JudgementLine):
                 made += _judgement(line)
         except (EvaError, DataError, IntegrityError) as error:
-            kept.say(f"run {kept.uuid}: its {line.kind} {line.uuid}: {error}")
+            kept.report_problem(f"run {kept.uuid}: its {line.kind} {line.uuid}: {error}")
     return made
 
 
@@ -43,7 +43,7 @@ def restore(kept: Kept) -> int:
 def _rating(line: RatingLine) -> bool:
     if Rating.objects.filter(uuid=line.uuid).exists():
         return False
-    trial, said = _trial(line.trial), line.values()
+    trial, said = _trial(line.trial), line.to_row_values()
     if Rating.objects.filter(trial=trial, rater=said["rater"]).exists():
         return False  # written twice: the database took one of them
     Rating.objects.create(trial=trial, **said)
@@ -54,7 +54,7 @@ def _rating(line: RatingLine) -> bool:
 def _preference(line: PreferenceLine) -> bool:
     if Preference.objects.filter(uuid=line.uuid).exists():
         return False
-    first, second, said = _trial(line.first), _trial(line.second), line.values()
+    first, second, said = _trial(line.first), _trial(line.second), line.to_row_values()
     if Preference.objects.filter(first=first, second=second, rater=said["rater"]).exists():
         return False
     plan = Plan.objects.filter(name=line.plan, version=line.version).first()
@@ -68,7 +68,7 @@ def _preference(line: PreferenceLine) -> bool:
 def _judgement(line: JudgementLine) -> bool:
     if Judgement.objects.filter(uuid=line.uuid).exists():
         return False
-    trial, said = _trial(line.trial), line.values()
+    trial, said = _trial(line.trial), line.to_row_values()
     if Judgement.objects.filter(trial=trial, judge=line.judge, version=line.version).exists():
         return False
     Judgement.objects.create(trial=trial, **said)

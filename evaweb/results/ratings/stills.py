@@ -5,7 +5,7 @@ from __future__ import annotations
 from evaweb.episodes.models import Episode
 from evaweb.episodes.preview import jpeg_of
 from evaweb.episodes.videos import video_file
-from evaweb.results.judges.base import Still
+from evaweb.results.judges.base import StillImage
 from runtime.datasets.pictures import VideoFrames
 
 CAMERAS = 4  # the first of the recording
@@ -13,7 +13,7 @@ OF_EACH = 8  # evenly over the run, with the first and the last that there are
 WIDTH = 512  # pixels at most
 
 
-def stills_of(episode: Episode) -> tuple[Still, ...]:
+def trial_stills(episode: Episode) -> tuple[StillImage, ...]:
     """Camera after camera in the order of time, of those that have a video; RecordingError where one is damaged."""
     found = []
     for number, camera in enumerate(episode.cameras[:CAMERAS], 1):
@@ -25,7 +25,7 @@ def stills_of(episode: Episode) -> tuple[Still, ...]:
             for index in sample(len(pictures)):
                 pixels = pictures[index]
                 jpeg = jpeg_of(pixels, min(WIDTH, pixels.shape[1]))
-                found.append(Still(f"camera {number}", round(times[index] - times[0], 3), jpeg))
+                found.append(StillImage(f"camera {number}", round(times[index] - times[0], 3), jpeg))
     return tuple(found)
 
 

@@ -4,38 +4,38 @@ from __future__ import annotations
 
 from typing import Any
 
-from evaweb.blinding import Sight, masked, sight_of
+from evaweb.blinding import Visibility, plan_titles, visibility_for_user
 from evaweb.errors import NotAllowed
-from evaweb.plans.blinding_rules import sealed_for
+from evaweb.plans.blinding_rules import is_sealed_for
 from evaweb.plans.models import Plan, PlanState
 
 
-def why_sealed(plan: Plan, user: Any, sight: Sight | None = None) -> str:
+def sealed_reason(plan: Plan, user: Any, sight: Visibility | None = None) -> str:
     """Why this user sees no result of the plan, "" where they do."""
-    if sealed_for(plan, user):
+    if is_sealed_for(plan, user):
         return f"{plan} is blind until it is revealed"
-    others = sealing(plan, user, sight)
+    others = sealing_plans(plan, user, sight)
     if not others:
         return ""
-    names = masked(others)
+    names = plan_titles(others)
     which = names if len(others) == 1 else f"one or more of {names}"
     return f"checkpoints of {plan} are compared blind in {which}: what it found is shown after that reveal"
 
 
-def sealing(plan: Plan, user: Any, sight: Sight | None = None) -> list[Plan]:
+def sealing_plans(plan: Plan, user: Any, sight: Visibility | None = None) -> list[Plan]:
     """Other plans, blind for this user, because of which they see no result of this one; none where that is shown.
 
     All that are blind for them, not only those that share a checkpoint: which do would tell what those compare.
     """
-    seen = sight or sight_of(user)
-    if sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=seen.checkpoints).exists():
+    seen = sight or visibility_for_user(user)
+    if is_sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=seen.checkpoints).exists():
         return []
     return list(Plan.objects.filter(pk__in=seen.keys).select_related("owner").order_by("title", "-version"))
 
 
-def require_seen(plan: Plan, user: Any) -> None:
+def require_visible_results(plan: Plan, user: Any) -> None:
     """NotAllowed where the user is not to see results of the plan, or where there cannot be any."""
-    why = why_sealed(plan, user)
+    why = sealed_reason(plan, user)
     if why:
         raise NotAllowed(why)
 

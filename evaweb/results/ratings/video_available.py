@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.selectors import stage_of
+from evaweb.episodes.selectors import playback_stage
 from evaweb.errors import Conflict
 from evaweb.plans.models import Handout
 from runtime.core.sentences import Pattern
@@ -15,7 +15,7 @@ _WITHOUT_PICTURES_NOBODY_CAN_JUDGE = Pattern(
 )
 
 
-def seen(episode: Episode | None) -> bool:
+def is_watchable(episode: Episode | None) -> bool:
     """True if it can be watched now."""
     return (
         episode is not None
@@ -25,7 +25,7 @@ def seen(episode: Episode | None) -> bool:
     )
 
 
-def coming(episode: Episode | None) -> bool:
+def may_become_watchable(episode: Episode | None) -> bool:
     """True if pictures of it may be made yet: its folder is on this disk, or on its way."""
     return (
         episode is not None
@@ -34,9 +34,9 @@ def coming(episode: Episode | None) -> bool:
     )
 
 
-def require_seen_on_video(*handouts: Handout) -> None:
+def require_video(*handouts: Handout) -> None:
     """Conflict names the trials of which there are no pictures, each with the reason."""
-    blind = [handout for handout in handouts if not seen(handout.trial.episode)]
+    blind = [handout for handout in handouts if not is_watchable(handout.trial.episode)]
     if blind:
         told = "; ".join(f"{handout.code}: {_why(handout.trial.episode)}" for handout in blind)
         raise Conflict(_WITHOUT_PICTURES_NOBODY_CAN_JUDGE(told=told))
@@ -47,4 +47,4 @@ def _why(episode: Episode | None) -> str:
         return "it was not recorded"
     if not episode.cameras:
         return "it was recorded without a camera"
-    return stage_of(episode=episode).sentence or "there is no preview of it"
+    return playback_stage(episode=episode).sentence or "there is no preview of it"

@@ -25,13 +25,13 @@ _FIELDS = (
 )
 
 
-def laid_out(plan: Plan) -> Iterator[list[dict[str, Any]]]:
+def layout_rows(plan: Plan) -> Iterator[list[dict[str, Any]]]:
     """A row for each camera of each attempt that was asked to run."""
     rows = Achieved.objects.filter(trial__evaluation=plan.evaluation_id).order_by("trial_id", "pk")
     yield [dict(zip(COLUMNS, row, strict=True)) for row in rows.values_list(*_FIELDS)]
 
 
-def as_text(pages: Iterable[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
+def with_json_regions(pages: Iterable[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
     """The same with regions as JSON, "" where there are none."""
     for rows in pages:
         yield [{**row, "regions": json.dumps(row["regions"]) if row["regions"] else ""} for row in rows]
@@ -39,12 +39,12 @@ def as_text(pages: Iterable[list[dict[str, Any]]]) -> Iterator[list[dict[str, An
 
 def write_pictures(plan: Plan, folder: Path, most: int | None) -> int:
     """Each picture once, by its SHA-256, at most so many bytes of them; how many were left out or are lost."""
-    rows = [row for page in laid_out(plan) for row in page]
+    rows = [row for page in layout_rows(plan) for row in page]
     names = dict.fromkeys(row[which] for row in rows for which in ("picture", "reference") if row[which])
     left, written = 0, 0
     for name in names:
         try:
-            jpeg = pictures.kept(name)
+            jpeg = pictures.load_image(name)
         except NotFound:
             left += 1
             continue

@@ -30,7 +30,7 @@ def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
     """All of it."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     return [
-        _beforehand(plan, trials),
+        _preregistration(plan, trials),
         _criteria(plan),
         _versions(plan),
         _order(plan),
@@ -51,11 +51,11 @@ def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
     ]
 
 
-def _yes(kept: bool) -> str:
+def _yes_or_no(kept: bool) -> str:
     return "yes" if kept else "no"
 
 
-def _beforehand(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
+def _preregistration(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     begun = trials.aggregate(first=Min("prepared_at"))["first"]
     before = bool(plan.frozen_at and (begun is None or plan.frozen_at <= begun))
     names = compared(plan.document or {})
@@ -129,7 +129,7 @@ def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     voided = trials.filter(status=TrialStatus.VOIDED)
     late = voided.filter(voided_at__gte=plan.kept_at).count() if plan.kept_at else 0
     words = f"{voided.count()} voided in this version, each with a reason, {late} of them after the reveal"
-    return Item("No trial of this version voided after the reveal", _yes(late == 0), words)
+    return Item("No trial of this version voided after the reveal", _yes_or_no(late == 0), words)
 
 
 def _corrections(plan: Plan) -> Item:
@@ -156,7 +156,7 @@ def _versions(plan: Plan) -> Item:
     words = f"version {plan.version}; {before} frozen before it"
     if before:
         words += f", each with all of its alpha; their {left} attempts are not in these data"
-    return Item("One version of the plan", _yes(before == 0), words)
+    return Item("One version of the plan", _yes_or_no(before == 0), words)
 
 
 def _second_rater(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
@@ -211,4 +211,4 @@ def _spread(trials) -> Item:  # type: ignore[no-untyped-def]
     words = "{conditions} initial conditions, {stations} stations, {operators} operators, {days} days".format(
         **counted
     )
-    return Item("Tried under different conditions", _yes(counted["conditions"] > 1), words)
+    return Item("Tried under different conditions", _yes_or_no(counted["conditions"] > 1), words)

@@ -11,7 +11,7 @@ from typing import Any
 
 from evaweb.results.analysis.analysis import Analysis, Arm, Comparison, Standing
 from evaweb.statistics.base import Interval
-from evaweb.statistics.bounded import Mean
+from evaweb.statistics.bounded import BoundedMean
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
@@ -125,8 +125,8 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
             "success": _ends(found.anytime),
             "score": _ends(found.score_anytime),
         },
-        "sooner": found.sooner
-        and {"pairs": found.sooner.pairs, "value_s": found.sooner.value, "p": found.sooner.p},
+        "sooner": found.time_test
+        and {"pairs": found.time_test.pairs, "value_s": found.time_test.value, "p": found.time_test.p},
     }
 
 
@@ -144,7 +144,7 @@ def _ends(interval: Interval | None) -> list[float] | None:
     return None if interval is None else [interval.low, interval.high]
 
 
-def _mean(found: Mean) -> dict[str, Any]:
+def _mean(found: BoundedMean) -> dict[str, Any]:
     return {"value": found.value, "gaffke": _ends(found.interval)}
 
 

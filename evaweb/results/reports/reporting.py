@@ -16,13 +16,13 @@ from django.utils import timezone
 
 from evaweb.errors import EvaError
 from evaweb.plans.counting import ENDS, declared_failures
-from evaweb.plans.design import blocks_that_count, compared, frozen
+from evaweb.plans.design import blocks_that_count, compared, frozen_design
 from evaweb.plans.models import CountsAs, Plan, PlanState
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, judges_of, preferences_of
+from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
 from evaweb.results.analysis.analysis import Analysis
-from evaweb.results.analysis.filters import Chosen
-from evaweb.results.analysis.integrity import changes_of
+from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, courses, rates
 from evaweb.results.presentation.headline import headline, with_planned_letters
@@ -34,8 +34,8 @@ from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.tables import COLUMNS, JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.statistics.designs import estimated, findings
 from evaweb.statistics.difference import Difference
-from evaweb.tabular_export import csv_lines
-from evaweb.trials.failures import in_order
+from evaweb.tabular_export import iter_csv
+from evaweb.trials.failures import ordered_terms
 from runtime.core.sentences import Pattern
 
 _NOT_EMPTY_NAME_NEW_FOLDER = Pattern(
@@ -68,19 +68,19 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
         raise EvaError(_NOT_EMPTY_NAME_NEW_FOLDER(out=out))
     if plan.state == PlanState.DRAFT:
         raise EvaError(_DRAFT_THERE_NOTHING_REPORT_BEFORE(plan=plan))
-    analysis = with_planned_letters(plan, caching.analysis_of(plan))
+    analysis = with_planned_letters(plan, caching.cached_analysis(plan))
     data = out / "data"
     data.mkdir(parents=True, exist_ok=True)
     _json(data / "plan.json", plan.document or {})
-    _json(data / "seal.json", seal_of(plan))
-    _json(data / "numbers.json", numbers_of(plan, analysis))
+    _json(data / "seal.json", plan_seal(plan))
+    _json(data / "numbers.json", report_numbers(plan, analysis))
     record = integrity_document(plan)
     _json(data / "integrity.json", record)
     _csv(data / "trials.csv", list(COLUMNS), outcome_pages(plan))
     _csv(data / "scores.csv", SCORE_COLUMNS, score_pages(plan))
     for name, (columns, rows) in JUDGED.items():
         _csv(data / f"{name}.csv", columns, iter([rows(plan)]))
-    _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.as_text(laid_out.laid_out(plan)))
+    _csv(data / "laid_out.csv", laid_out.COLUMNS, laid_out.with_json_regions(laid_out.layout_rows(plan)))
     left = laid_out.write_pictures(plan, data / "pictures", most_pictures)
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
     (out / "recompute" / "page.css").write_text(_styles(), "utf-8")
@@ -89,29 +89,29 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     context = {
         **report_context(plan, analysis),
         **told,
-        "benches": _benches(plan, data / "pictures"),
+        "benches": _bench_images(plan, data / "pictures"),
         "left": left,
     }
     page.write_text(render_to_string("results/report.html", context), "utf-8")
     return page
 
 
-def numbers_of(plan: Plan, analysis: Analysis) -> dict[str, Any]:
+def report_numbers(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     """Every number of the report, and only such as the program computes again."""
-    preferred = preferences_of(plan)
+    preferred = preference_ranking(plan)
     words = ("reason", "groups")
     return {
         **analysis_document(analysis),
         "planned": planned_document(plan),
-        "agreement": agreement_of(plan),
-        "judges": judges_of(plan),
+        "agreement": rater_agreement(plan),
+        "judges": judge_agreement(plan),
         "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
     }
 
 
 def planned_document(plan: Plan) -> list[dict[str, Any]]:
     """What the plan's design says of each of its comparisons."""
-    found = frozen(plan.document) if plan.document else None
+    found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return []
     blocks = blocks_that_count(plan)
@@ -120,7 +120,7 @@ def planned_document(plan: Plan) -> list[dict[str, Any]]:
             "first": names[0],
             "second": names[1],
             "blocks": one.blocks,
-            "at": one.at,
+            "at": one.ended_at_pair,
             "winner": {"first": names[0], "second": names[1], None: None}[one.winner],
             "p": one.p,
             "estimate": _estimate(estimated(found, blocks, pair, one)),
@@ -135,7 +135,7 @@ def _estimate(found: Difference | None) -> list[float] | None:
     return None if found is None else [found.value, found.interval.low, found.interval.high]
 
 
-def seal_of(plan: Plan) -> dict[str, Any]:
+def plan_seal(plan: Plan) -> dict[str, Any]:
     """Digest and commitment, and the key once it was revealed."""
     shown = plan.state == PlanState.REVEALED or plan.at_reveal is not None
     return {
@@ -152,31 +152,33 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
     order = {arm.checkpoint: arm.series for arm in arms}
     primaries = facts.primaries_of(plan, analysis)
     scenes = sorted({name for arm in arms for name in arm.scenes})
-    runs = caching.runs_of(plan)
+    runs = caching.cached_runs(plan)
     return {
         "plan": plan,
         "document": plan.document,
-        "seal": seal_of(plan),
+        "seal": plan_seal(plan),
         "analysis": analysis,
         "styles": _styles(),
         "made": timezone.now(),
         "setting": setting_of(plan),
         "ends": _ends(plan.document or {}),
-        "changes": changes_of(plan),
+        "changes": checkpoint_changes(plan),
         "headline": headline(plan),
         "primaries": [facts.comparison_facts(plan, analysis, found) for found in primaries],
-        "table": listings.arm_rows(plan, analysis, Chosen()),
+        "table": listings.arm_rows(plan, analysis, TrialFilter()),
         "others": [
             (found, facts.comparison_sentence(analysis, found))
             for found in analysis.comparisons
             if found not in primaries
         ],
-        "intervals": rates.intervals("Success rates", [(a.checkpoint, a.success, "") for a in arms], order)
+        "intervals": rates.draw_intervals(
+            "Success rates", [(a.checkpoint, a.success, "") for a in arms], order
+        )
         if arms
         else None,
-        "violins": rates.violins(arms, analysis.letters) if arms else None,
+        "violins": rates.draw_violins(arms, analysis.letters) if arms else None,
         "funnels": [
-            courses.funnel(
+            courses.draw_funnel(
                 scene,
                 [(a.series, a.checkpoint, f) for a in arms for f in a.funnels if f.scene == scene],
                 {},
@@ -184,11 +186,11 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
             for scene in scenes
             if any(f.scene == scene for a in arms for f in a.funnels)
         ],
-        "success_times": courses.success_times(arms),
-        "grid": conditions.grid(arms, {}),
-        "failures": listings.failure_tables(analysis, in_order(), lambda **named: ""),
+        "success_times": courses.draw_success_times(arms),
+        "grid": conditions.draw_grid(arms, {}),
+        "failures": listings.failure_tables(analysis, ordered_terms(), lambda **named: ""),
         "evidence": [
-            courses.evidence(
+            courses.draw_evidence(
                 found.evidence,
                 found.first,
                 found.second,
@@ -197,9 +199,9 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
             for found in primaries
             if found.pairs and found.evidence
         ],
-        "agreement": agreement_of(plan),
-        "judges": judges_of(plan),
-        "preferences": preferences_of(plan),
+        "agreement": rater_agreement(plan),
+        "judges": judge_agreement(plan),
+        "preferences": preference_ranking(plan),
         "checklist": checklist(plan, analysis),
         "runs": runs.outcomes,
         "declared": declared_failures(plan),
@@ -212,11 +214,11 @@ def _ends(document: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(words, CountsAs(said[name]).label) for name, words in ENDS.items() if name in said]
 
 
-def _benches(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
+def _bench_images(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
     """Of each trial what its cameras showed, as far as the pictures are in the report."""
     there = {path.stem for path in folder.glob("*.jpg")}
     found: dict[int, list[dict[str, Any]]] = defaultdict(list)
-    for row in (row for page in laid_out.laid_out(plan) for row in page):
+    for row in (row for page in laid_out.layout_rows(plan) for row in page):
         if row["picture"] in there:
             known = row["reference"] if row["reference"] in there else ""
             found[row["trial"]].append({**row, "reference": known})
@@ -244,4 +246,4 @@ def _time(value: datetime) -> str:
 
 def _csv(path: Path, columns: Sequence[str], rows: Iterator[list[dict[str, Any]]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
-        file.writelines(csv_lines(columns, rows))
+        file.writelines(iter_csv(columns, rows))

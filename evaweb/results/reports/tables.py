@@ -12,7 +12,7 @@ from django.db.models import QuerySet
 
 from evaweb.plans.counting import end_of
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation.headline import headline
 from evaweb.tabular_export import in_pages
@@ -76,7 +76,7 @@ PAGE = 1000
 
 
 def outcome_pages(
-    plan: Plan, which: Chosen | None = None, size: int = PAGE
+    plan: Plan, which: TrialFilter | None = None, size: int = PAGE
 ) -> Iterator[list[dict[str, Any]]]:
     """All attempts that are meant, in the order in which they were handed out, a page at a time."""
     rows, last, said = _attempts(plan, which), 0, _headline(plan)
@@ -85,7 +85,7 @@ def outcome_pages(
         last = page[-1]["order"]
 
 
-def outcome_page(plan: Plan, which: Chosen | None, offset: int, limit: int) -> dict[str, Any]:
+def outcome_page(plan: Plan, which: TrialFilter | None, offset: int, limit: int) -> dict[str, Any]:
     """Some of them, and how many there are."""
     rows = _attempts(plan, which)
     return {
@@ -96,8 +96,8 @@ def outcome_page(plan: Plan, which: Chosen | None, offset: int, limit: int) -> d
     }
 
 
-def _attempts(plan: Plan, which: Chosen | None) -> QuerySet[Trial]:
-    only = which or Chosen()
+def _attempts(plan: Plan, which: TrialFilter | None) -> QuerySet[Trial]:
+    only = which or TrialFilter()
     wanted = {
         "scene__name": only.scene,
         "position__number": only.position,

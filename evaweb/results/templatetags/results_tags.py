@@ -11,9 +11,9 @@ from django.urls import reverse
 from django.utils.html import format_html, format_html_join
 from django.utils.safestring import SafeString
 
-from evaweb.plans.design import told_reason
+from evaweb.plans.design import visible_close_reason
 from evaweb.plans.models import Plan, PlanState, StoppingRule
-from evaweb.results.analysis.filters import Chosen
+from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.analysis.outcomes import Outcome
 from evaweb.results.presentation import wording
 from evaweb.statistics.difference import Difference
@@ -50,7 +50,7 @@ def rate_words(found: Proportion) -> str:
 @register.filter
 def difference_words(found: Difference) -> str:
     """Points with their interval."""
-    return wording.points(found)
+    return wording.format_points(found)
 
 
 @register.filter
@@ -79,7 +79,7 @@ def twice_over(alpha: float) -> str:
 
 
 @register.filter
-def chosen_items(only: Chosen) -> list[tuple[str, str]]:
+def chosen_items(only: TrialFilter) -> list[tuple[str, str]]:
     """Chosen filters, name and value."""
     return [(name, value) for name, value in asdict(only).items() if value]
 
@@ -93,11 +93,11 @@ def of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
 @register.simple_tag
 def closed_because(plan: Plan, sealed: bool) -> str:
     """Why it was closed, as far as the reader may know."""
-    return told_reason(plan, sealed)
+    return visible_close_reason(plan, sealed)
 
 
 @register.simple_tag
-def export_links(plan: Plan, only: Chosen) -> SafeString:
+def export_links(plan: Plan, only: TrialFilter) -> SafeString:
     """To the plan's trials as tables, and to its report."""
     address = reverse("api:plan-outcomes", args=[plan.name, plan.version])
     query = f"&{only.query}" if only.query else ""

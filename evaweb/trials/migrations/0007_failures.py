@@ -2,7 +2,7 @@ import django.core.validators
 import django.db.models.functions.text
 from django.db import migrations, models
 
-from evaweb.append_only import laid_aside
+from evaweb.append_only import triggers_suspended
 
 # level, words, key: what a lab begins with, in this order.
 TERMS = (
@@ -34,7 +34,7 @@ class Migration(migrations.Migration):
     ]
 
     operations = [
-        migrations.RunPython(laid_aside, migrations.RunPython.noop),
+        migrations.RunPython(triggers_suspended, migrations.RunPython.noop),
         migrations.AddField(
             model_name="scene",
             name="failure_required",
@@ -119,5 +119,5 @@ class Migration(migrations.Migration):
                 "emptied.",
             ),
         ),
-        migrations.RunPython(make_terms, laid_aside),
+        migrations.RunPython(make_terms, triggers_suspended),
     ]

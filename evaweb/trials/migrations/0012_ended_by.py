@@ -1,6 +1,6 @@
 from django.db import migrations, models
 
-from evaweb.append_only import laid_aside
+from evaweb.append_only import triggers_suspended
 
 
 class Migration(migrations.Migration):
@@ -19,5 +19,5 @@ class Migration(migrations.Migration):
                 null=True,
             ),
         ),
-        migrations.RunPython(migrations.RunPython.noop, laid_aside),  # backwards this comes first
+        migrations.RunPython(migrations.RunPython.noop, triggers_suspended),  # backwards this comes first
     ]

@@ -19,7 +19,7 @@ register = template.Library()
 @register.filter
 def percent(share: float | str | None) -> str:
     """A share as whole percent; a dash where it is not known (templates say "" for that)."""
-    return figures.percent(share) if isinstance(share, float | int) else "–"
+    return figures.format_percent(share) if isinstance(share, float | int) else "–"
 
 
 @register.filter
@@ -52,7 +52,7 @@ def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
 @register.filter
 def interval(found: Proportion) -> str:
     """The ends of the interval in whole percent."""
-    return figures.interval(found)
+    return figures.format_interval(found)
 
 
 @register.filter

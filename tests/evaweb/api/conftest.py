@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from django.test import Client
 
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from tests.evaweb.trials import builders
 
 
@@ -45,10 +45,10 @@ def _data_dir(settings, tmp_path):
 @pytest.fixture
 def rest(bench):
     """With the operator's token."""
-    return Rest(token_create(user=bench.operator, name="tests"))
+    return Rest(create_token(user=bench.operator, name="tests"))
 
 
 @pytest.fixture
 def viewer(bench):
     """With a viewer's token."""
-    return Rest(token_create(user=builders.user("vic", "viewer"), name="tests"))
+    return Rest(create_token(user=builders.user("vic", "viewer"), name="tests"))

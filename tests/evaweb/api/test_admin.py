@@ -3,8 +3,8 @@ from django.contrib.auth.models import User
 from django.test import Client
 
 from evaweb.api.models import Token
-from evaweb.api.tokens import token_create
-from evaweb.roles import Role, grant, role_of
+from evaweb.api.tokens import create_token
+from evaweb.roles import Role, role_of, set_role
 from tests.evaweb.trials import builders
 
 
@@ -82,12 +82,12 @@ def test_the_list_shows_and_filters_roles(admin):
 
 def test_a_superuser_who_is_given_a_role_has_that_role_alone(db):
     boss = User.objects.create_superuser("boss")
-    grant(user=boss, role=Role.VIEWER)
+    set_role(user=boss, role=Role.VIEWER)
     assert role_of(User.objects.get()) is Role.VIEWER
 
 
 def test_tokens_are_revoked_and_not_made_there(admin, root):
-    token_create(user=root, name="export")
+    create_token(user=root, name="export")
     assert admin.get("/admin/api/token/").status_code == 200
     assert admin.get("/admin/api/token/add/").status_code == 403
     found = Token.objects.get()

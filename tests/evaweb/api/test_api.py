@@ -7,7 +7,7 @@ from django.db import OperationalError
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.api.snapshot import snapshot
+from evaweb.api.snapshot import openapi_snapshot
 from tests.evaweb.api.conftest import Rest
 
 READS = [
@@ -25,7 +25,7 @@ READS = [
 
 def test_the_snapshot_in_docs_is_the_interface_as_it_is(settings):
     kept = (Path(settings.BASE_DIR) / "docs" / "openapi.json").read_text("utf-8")
-    assert json.loads(kept) == json.loads(snapshot()), (
+    assert json.loads(kept) == json.loads(openapi_snapshot()), (
         "run manage.py openapi_snapshot and read the difference"
     )
 

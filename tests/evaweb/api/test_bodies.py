@@ -9,7 +9,7 @@ import pytest
 from django.test import Client
 
 from evaweb.api.management.commands.openapi_snapshot import PLACE  # a test holds it to what the interface is
-from evaweb.posts import post_at
+from evaweb.posts import body_limit_for
 from evaweb.roles import Role
 from evaweb.stations.models import Command
 from runtime.core import bounded_documents as bounded
@@ -55,7 +55,7 @@ def unparsed(monkeypatch):
 def test_of_a_viewer_and_of_a_stranger_nothing_is_parsed(viewer, unparsed):
     assert len(SHUT) > 15
     for path in SHUT:
-        assert post_at(path).role is Role.OPERATOR, path
+        assert body_limit_for(path).role is Role.OPERATOR, path
         assert posted(None, path, MANY)[0] == 401, path
         status, answer = posted(viewer, path, MANY)
         assert (status, "vic is a viewer" in answer["error"]) == (403, True), path
@@ -68,7 +68,7 @@ def test_who_is_no_operator_any_more_can_give_a_station_up(viewer, bench, wire):
 
 @pytest.mark.parametrize("path", SHUT)
 def test_so_many_values_and_so_many_bytes_are_read(rest, path, monkeypatch):
-    post = post_at(path)
+    post = body_limit_for(path)
     status, answer = posted(rest, path, MANY[: post.largest - 3] + b"[]]")
     assert (status, answer["error"]) == (
         400,

@@ -24,7 +24,7 @@ from tests.evaweb.collect.conftest import (
     session,
     station,
 )
-from tests.evaweb.trials.builders import Wire
+from tests.evaweb.trials.builders import FakeConnection
 
 __all__ = ["at", "data", "demonstrate", "recorded", "session", "station"]
 pytestmark = pytest.mark.django_db
@@ -42,7 +42,7 @@ def post(browser: Client, path: str, **content: Any) -> Any:
 
 
 def test_a_session_is_opened_listed_and_closed(
-    browser: Client, at: Wire, data: Path, station: Station
+    browser: Client, at: FakeConnection, data: Path, station: Station
 ) -> None:
     made = post(browser, "stations/bench/sessions", task="stack the cups", target=3)
     assert (made.status_code, made.json()["dataset"], made.json()["operator"]) == (201, "cups", "ann")
@@ -88,7 +88,7 @@ def test_a_job_that_failed_is_tried_again_and_no_other(browser: Client, vera: Us
 
 
 def test_a_command_for_a_session_is_one_of_its_station(
-    browser: Client, session: CollectSession, at: Wire, station: Station
+    browser: Client, session: CollectSession, at: FakeConnection, station: Station
 ) -> None:
     run = post(
         browser, "stations/bench/commands", uuid=str(uuid4()), kind="run", session=str(session.pk), **PAGE

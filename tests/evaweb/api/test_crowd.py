@@ -16,7 +16,7 @@ from threading import Event, Thread
 import pytest
 
 from tests.evaweb.console.test_serve import MANAGE, served
-from tests.evaweb.stand_in import StandIn
+from tests.evaweb.stand_in import FakeStation
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.slow
@@ -58,7 +58,7 @@ def sessions(folder, port):
 
 @pytest.fixture
 def bench(folder):
-    made = StandIn(folder, BENCH)
+    made = FakeStation(folder, BENCH)
     yield made
     made.end()
 

@@ -19,16 +19,16 @@ from django.utils import timezone
 from evaweb import audit
 from evaweb import credentials as module
 from evaweb.api.models import Token
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.asgi import application
 from evaweb.credentials import credentials
-from evaweb.lookups import Lookups
-from evaweb.rarely import Rarely
+from evaweb.lookups import FairLookupPool
+from evaweb.rarely import LogThrottle
 from evaweb.stations import leases
 from evaweb.stations.models import Command
 from runtime.ipc.session_state import SessionState
 from tests import presses
-from tests.evaweb.noted import settled
+from tests.evaweb.noted import wait_for_stop_records
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.django_db(transaction=True)
@@ -39,30 +39,30 @@ NAME, CSRF = lab.SESSION_COOKIE_NAME, lab.CSRF_COOKIE_NAME
 def _data_dir():
     """Stand-ins leave their endpoints where the settings of all tests say; nothing is left to be written there."""
     yield
-    settled()
+    wait_for_stop_records()
 
 
 @pytest.fixture(autouse=True)
 def _nobody_was_refused_before(monkeypatch):
-    monkeypatch.setattr(audit, "_refused", Rarely(60.0, 10))
+    monkeypatch.setattr(audit, "_refused", LogThrottle(60.0, 10))
 
 
 @pytest.fixture
 def token(ann):
-    return token_create(user=ann, name="tests")
+    return create_token(user=ann, name="tests")
 
 
 @pytest.fixture
 def away(monkeypatch):
     """The database of credentials; `set` makes it go away."""
-    gone, look = threading.Event(), credentials.look
+    gone, look = threading.Event(), credentials.look_up
 
     def looked(kind, secret):
         if gone.is_set():
             raise OperationalError("gone")
         return look(kind, secret)
 
-    monkeypatch.setattr(credentials, "look", looked)
+    monkeypatch.setattr(credentials, "look_up", looked)
     return gone
 
 
@@ -235,10 +235,10 @@ def test_who_has_no_turn_presses_unverified_stops_nothing_else_and_whoever_is_re
 ):
     """The database answers, and others from that address are before them."""
     assert post(f"{live.name}/estop", token=token)[0] == 200
-    full, begun, turn = Lookups(1, most=1), threading.Event(), threading.Event()
-    full.ask("127.0.0.1", lambda: begun.set() or turn.wait(PATIENCE_S))
+    full, begun, turn = FairLookupPool(1, most=1), threading.Event(), threading.Event()
+    full.submit("127.0.0.1", lambda: begun.set() or turn.wait(PATIENCE_S))
     assert begun.wait(PATIENCE_S)
-    full.ask("127.0.0.1", lambda: None)
+    full.submit("127.0.0.1", lambda: None)
     monkeypatch.setattr(credentials, "_strangers", full)
     body = {"uuid": str(uuid4()), "kind": "halt", "page": "p1"}
     status, answer, told = asked("POST", f"{live.name}/{what}", body, token="eva_unknown")
@@ -278,7 +278,7 @@ def test_whatever_goes_wrong_with_a_press_is_said_with_the_hardware_stop(live, t
     def broken(**named):
         raise OSError(36, "File name too long")
 
-    monkeypatch.setattr("evaweb.stations.stops.press", broken)
+    monkeypatch.setattr("evaweb.stations.stops.press_estop", broken)
     status, answer = post(f"{live.name}/estop", token=token)
     assert (status, answer) == (500, {"error": "USE THE HARDWARE STOP: OSError"})
 
@@ -327,7 +327,7 @@ def test_a_token_that_was_withdrawn_counts_no_more_once_the_database_is_back(
 
 
 def test_a_viewers_stop_is_refused_before_anything_is_done_and_the_press_is_not(live, vera, runtime):
-    token = token_create(user=vera, name="tests")
+    token = create_token(user=vera, name="tests")
     connections.close_all()
     for kind in ("stop", "halt"):
         status, answer = post(
@@ -340,7 +340,7 @@ def test_a_viewers_stop_is_refused_before_anything_is_done_and_the_press_is_not(
 
 
 def test_a_press_among_the_commands_is_one_however_much_else_is_said(live, vera, runtime):
-    token, long = token_create(user=vera, name="tests"), {"kind": "estop", "args": {"x": "y" * 100_000}}
+    token, long = create_token(user=vera, name="tests"), {"kind": "estop", "args": {"x": "y" * 100_000}}
     connections.close_all()
     assert post(f"{live.name}/commands", long, token=token)[0] == 200
     assert (runtime.commands, len(runtime.pressed)) == ([], 1)

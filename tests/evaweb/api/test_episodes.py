@@ -11,16 +11,16 @@ from evaweb.episodes import services, verifying
 from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from runtime.recording.scrub import verify_episode
 from tests.runtime.recording.test_export import recorded
 
 
 @pytest.fixture
 def episode(bench, tmp_path, monkeypatch):
-    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     folder = recorded(tmp_path, station=bench.station.name, mode="step")
-    found = services.episode_closed(station=bench.station, data={"uuid": folder.name})
+    found = services.record_closed(station=bench.station, data={"uuid": folder.name})
     Job.objects.all().delete()
     return found
 
@@ -52,7 +52,7 @@ def test_damage_is_told_with_its_rows_and_can_be_asked_for(rest, episode, tmp_pa
     assert rest.get("episodes", damaged=True)[1]["total"] == 0
     path = tmp_path / f"episodes/{episode.uuid}/ticks.arrow"
     path.write_bytes(path.read_bytes()[:-100])
-    verifying.found(verify_episode(path.parent))
+    verifying.record_verification(verify_episode(path.parent))
     _, found = rest.get("episodes", damaged=True)
     (damage,) = found["items"][0]["damage"]
     assert (damage["file"], damage["text"][:16]) == ("ticks.arrow", "ticks.arrow has ")
@@ -70,7 +70,7 @@ def test_a_table_is_asked_for_made_and_downloaded(rest, viewer, episode):
     assert viewer.post(path)[0] == 403
     status, job = rest.post(path)
     assert (status, job["kind"], job["status"]) == (202, "export", "queued")
-    assert work("cpu") == 1
+    assert run_queue("cpu") == 1
     answer, content = download(viewer, episode)
     assert answer["Content-Type"] == "application/vnd.apache.parquet"
     assert answer["Content-Disposition"].startswith("attachment")

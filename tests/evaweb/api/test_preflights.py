@@ -11,7 +11,7 @@ pytestmark = pytest.mark.django_db
 @pytest.fixture
 def runtime(bench, monkeypatch):
     made = Runtime()
-    monkeypatch.setattr("evaweb.preflights.services.wire_to", lambda name: made)
+    monkeypatch.setattr("evaweb.preflights.services.connection_to", lambda name: made)
     return made
 
 

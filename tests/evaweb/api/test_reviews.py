@@ -3,7 +3,7 @@
 import pytest
 
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from tests.evaweb.api.test_episodes import episode
 
 __all__ = ["episode"]
@@ -18,7 +18,7 @@ def test_an_episode_is_checked_and_its_flags_are_read(rest, viewer, episode):
     assert viewer.post(path)[0] == 403
     status, job = rest.post(path)
     assert (status, job["kind"]) == (202, "quality")
-    work("cpu")
+    run_queue("cpu")
     assert Job.objects.get(kind="quality").error == ""
     status, report = viewer.get(path)
     assert status == 200

@@ -6,7 +6,7 @@ from uuid import uuid4
 import pytest
 from django.test import Client
 
-from evaweb.roles import Role, grant
+from evaweb.roles import Role, set_role
 from evaweb.stations.models import Command
 from evaweb.trials.tables import _kinds
 from runtime.core.bounded_documents import MAX_DEPTH
@@ -56,7 +56,7 @@ def test_the_station_is_told_the_role_and_what_an_administrator_wrote(rest, benc
 
 
 def test_an_administrator_may_give_a_table_and_the_station_sees_to_what_it_names(rest, bench, wire):
-    grant(user=bench.operator, role=Role.ADMIN)
+    set_role(user=bench.operator, role=Role.ADMIN)
     assert command(rest, "setup", args={"policy": {"kind": "mock"}})[0] == 200
     assert [(heard.role, heard.vouched) for heard in wire.heard] == [("admin", [])]
 

@@ -6,7 +6,7 @@ from django.contrib.auth.models import User
 from django.db import OperationalError, connection
 from django.test import Client
 
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.errors import StationGone
 from evaweb.stations import commands
 from evaweb.stations.models import Command, Lease, Station
@@ -149,8 +149,8 @@ def test_an_e_stop_works_without_the_database(rest, bench, wire, monkeypatch):
     def locked(row):
         raise OperationalError("database is locked")
 
-    monkeypatch.setattr(commands, "_written", locked)
-    monkeypatch.setattr(commands.unwritten, "look", lambda: None)
+    monkeypatch.setattr(commands, "_stored_row", locked)
+    monkeypatch.setattr(commands.unwritten, "start_writing", lambda: None)
     status, answer = rest.post("stations/bench-1/estop")
     assert (status, answer["status"]) == (200, "accepted")
     assert [given.kind for given in wire.heard] == ["estop"]
@@ -169,11 +169,11 @@ def locked(transactional_db):
 @pytest.mark.parametrize("kind", ["estop", "stop"])
 def test_who_stops_with_a_token_is_not_kept_by_a_locked_database(locked, bench, wire, kind):
     User.objects.update(is_superuser=True)
-    rest = Rest(token_create(user=bench.operator, name="never used"))
+    rest = Rest(create_token(user=bench.operator, name="never used"))
     identity = str(uuid4())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(commands.unwritten, "look", lambda: None)
-        patch.setattr(commands.notes, "note", commands.unwritten.keep)
+        patch.setattr(commands.unwritten, "start_writing", lambda: None)
+        patch.setattr(commands.notes, "record", commands.unwritten.store)
         locked()
         if kind == "estop":
             answer = rest.post("stations/bench-1/estop", uuid=identity)
@@ -183,7 +183,7 @@ def test_who_stops_with_a_token_is_not_kept_by_a_locked_database(locked, bench, 
     assert [given.kind for given in wire.heard] == [kind]
     assert not Command.objects.exists()
     locked("ROLLBACK")
-    assert commands.unwritten.attempt() is False
+    assert commands.unwritten.write_all() is False
     assert (str(Command.objects.get().uuid), Command.objects.get().status) == (identity, "accepted")
 
 
@@ -194,11 +194,11 @@ def test_an_e_stop_is_written_down_later_where_the_database_does_not_say_which_s
         raise OperationalError("the server closed the connection unexpectedly")
 
     with monkeypatch.context() as patch:
-        patch.setattr(commands, "_written", away)
-        patch.setattr(commands.unwritten, "look", lambda: None)
+        patch.setattr(commands, "_stored_row", away)
+        patch.setattr(commands.unwritten, "start_writing", lambda: None)
         status, answer = rest.post("stations/bench-1/estop", why="smoke")
     assert (status, answer["status"]) == (200, "accepted")
-    commands.unwritten.attempt()
+    commands.unwritten.write_all()
     row = Command.objects.get()
     assert (row.station, row.user, row.args) == (bench.station, bench.operator, {"why": "smoke"})
 

@@ -13,19 +13,19 @@ from django.db import connections
 from django.test import Client
 from django.utils import timezone
 
-from evaweb.api.door import stops_alone
-from evaweb.api.tokens import token_create
+from evaweb.api.door import stop_application
+from evaweb.api.tokens import create_token
 from evaweb.credentials import SESSION, credentials
 from evaweb.stations import leases
 from evaweb.stations.models import Command
 from runtime.ipc.session_state import SessionState
 from tests.evaweb.api.test_door import asked, written
-from tests.evaweb.noted import settled
+from tests.evaweb.noted import wait_for_stop_records
 
 pytestmark = pytest.mark.django_db(transaction=True)
 NAME, CSRF = lab.SESSION_COOKIE_NAME, lab.CSRF_COOKIE_NAME
 
-ALONE = stops_alone(8000)
+ALONE = stop_application(8000)
 HERE = {"host": "localhost:8001", "of": ALONE}
 PAGE = {"origin": "http://localhost:8000"}
 
@@ -33,7 +33,7 @@ PAGE = {"origin": "http://localhost:8000"}
 @pytest.fixture(autouse=True)
 def _all_is_written():
     yield
-    settled()
+    wait_for_stop_records()
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_press_is_done_and_written_down_once_however_many_ways_it_comes(live, 
         status, answer, _ = asked("POST", f"{live.name}/estop", press, cookie=f"{NAME}={session}", **way)
         assert (status, answer["status"]) == (200, "done")
     assert written(press["uuid"]).args == {"why": "both ways"}
-    settled()
+    wait_for_stop_records()
     assert Command.objects.count() == 1
 
 
@@ -148,7 +148,7 @@ def test_a_session_whose_time_is_over_presses_and_does_nothing_else(live, sessio
 
 
 def test_everything_else_is_said_to_be_at_the_web(live, ann):
-    token = token_create(user=ann, name="tests")
+    token = create_token(user=ann, name="tests")
     for method, path in (("GET", ""), ("POST", f"{live.name}/commands"), ("PUT", f"{live.name}/estop")):
         status, answer, _ = asked(method, path, {"kind": "home"}, token=token, **HERE)
         assert (status, "the web is at port 8000" in answer["error"]) == (404, True)
@@ -167,7 +167,7 @@ def test_everything_else_is_said_to_be_at_the_web(live, ann):
 def test_a_stop_that_lacks_something_is_told_what_as_the_pages_own_interface_says_it(
     live, ann, runtime, kind, given, named
 ):
-    token = token_create(user=ann, name="tests")
+    token = create_token(user=ann, name="tests")
     connections.close_all()
     path = f"{live.name}/commands"
     here = asked("POST", path, {"kind": kind, **given}, token=token, **HERE)[:2]

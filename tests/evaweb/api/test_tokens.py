@@ -10,7 +10,7 @@ from django.core.management import CommandError, call_command
 from django.utils import timezone
 
 from evaweb.api.models import Token
-from evaweb.api.tokens import token_create, token_user
+from evaweb.api.tokens import create_token, user_of_token
 from evaweb.errors import Conflict, EvaError
 from tests.evaweb.api.conftest import Rest
 from tests.evaweb.trials import builders
@@ -22,36 +22,36 @@ def ann(db):
 
 
 def test_a_token_is_kept_as_its_digest_alone(ann):
-    secret = token_create(user=ann, name="export")
+    secret = create_token(user=ann, name="export")
     kept = Token.objects.values().get()
     assert secret not in str(kept)
     assert len(secret) > 40
-    assert token_user(secret=secret) == ann
+    assert user_of_token(secret=secret) == ann
 
 
 def test_the_use_of_a_token_is_noted_but_not_each_time(ann, django_assert_num_queries):
-    secret = token_create(user=ann, name="export")
+    secret = create_token(user=ann, name="export")
     assert Token.objects.get().used_at is None
-    token_user(secret=secret)
+    user_of_token(secret=secret)
     assert Token.objects.get().used_at is not None
     with django_assert_num_queries(1):
-        token_user(secret=secret)
+        user_of_token(secret=secret)
 
 
 def test_a_user_who_was_switched_off_has_no_token(ann):
-    secret = token_create(user=ann, name="export")
+    secret = create_token(user=ann, name="export")
     ann.is_active = False
     ann.save()
-    assert token_user(secret=secret) is None
+    assert user_of_token(secret=secret) is None
     assert Rest(secret).get("me")[0] == 401
 
 
 def test_names_of_tokens_are_given_once(ann):
-    token_create(user=ann, name="export")
+    create_token(user=ann, name="export")
     with pytest.raises(Conflict, match="revoke it"):
-        token_create(user=ann, name=" export ")
+        create_token(user=ann, name=" export ")
     with pytest.raises(EvaError, match="1 to 80 characters"):
-        token_create(user=ann, name=" ")
+        create_token(user=ann, name=" ")
 
 
 def test_the_command_prints_the_token_and_nothing_else(ann):
@@ -63,25 +63,25 @@ def test_the_command_prints_the_token_and_nothing_else(ann):
 def test_the_command_names_the_users_there_are(ann):
     with pytest.raises(CommandError, match="there are: ann"):
         call_command("api_token", "bob", "export")
-    token_create(user=ann, name="export")
+    create_token(user=ann, name="export")
     with pytest.raises(CommandError, match="revoke it"):
         call_command("api_token", "ann", "export")
 
 
 def test_a_token_ends(ann):
-    secret = token_create(user=ann, name="export", days=1)
+    secret = create_token(user=ann, name="export", days=1)
     assert timedelta(hours=23) < Token.objects.get().ends_at - timezone.now() <= timedelta(days=1)
     Token.objects.update(ends_at=timezone.now())
     status, said = Rest(secret).get("me")
     assert status == 401
     assert "its time is over" in said["error"]
-    assert token_user(secret=secret, ended=True) == ann
+    assert user_of_token(secret=secret, ended=True) == ann
 
 
 @pytest.mark.parametrize("days", [0, -1, 367])
 def test_no_token_is_for_ever(ann, days):
     with pytest.raises(EvaError, match=f"days = {days}; allowed: 1 to 366"):
-        token_create(user=ann, name="export", days=days)
+        create_token(user=ann, name="export", days=days)
     with pytest.raises(CommandError, match="allowed: 1 to 366"):
         call_command("api_token", "ann", "export", f"--days={days}")
 
@@ -115,8 +115,8 @@ def switch_off(user):
 @pytest.mark.parametrize("change", [set_password, set_none, set_hash, switch_off])
 def test_tokens_are_withdrawn_with_the_password_and_with_the_account(ann, change, caplog):
     caplog.set_level(logging.INFO)
-    secret = token_create(user=ann, name="export")
-    other = token_create(user=builders.user("bob"), name="export")
+    secret = create_token(user=ann, name="export")
+    other = create_token(user=builders.user("bob"), name="export")
     change(User.objects.get(username="ann"))
     User.objects.filter(username="ann").update(is_active=True)
     assert Rest(secret).get("me")[0] == 401
@@ -125,7 +125,7 @@ def test_tokens_are_withdrawn_with_the_password_and_with_the_account(ann, change
 
 
 def test_a_password_that_is_hashed_anew_at_a_login_keeps_the_tokens(ann, settings, client):
-    secret = token_create(user=ann, name="export")
+    secret = create_token(user=ann, name="export")
     settings.PASSWORD_HASHERS = [
         "django.contrib.auth.hashers.PBKDF2PasswordHasher",
         "django.contrib.auth.hashers.MD5PasswordHasher",
@@ -137,12 +137,14 @@ def test_a_password_that_is_hashed_anew_at_a_login_keeps_the_tokens(ann, setting
 
 def test_what_is_no_token_costs_no_question_to_the_database(ann, django_assert_num_queries):
     with django_assert_num_queries(0):
-        assert [token_user(secret=text) for text in ("", "eva_", "x" * 47, "eva_" + "x" * 3000)] == [None] * 4
+        assert [user_of_token(secret=text) for text in ("", "eva_", "x" * 47, "eva_" + "x" * 3000)] == [
+            None
+        ] * 4
 
 
 def test_tokens_are_logged_when_they_are_made_and_withdrawn(ann, alma, client, caplog):
     caplog.set_level(logging.INFO)
-    secret = token_create(user=ann, name="export")
+    secret = create_token(user=ann, name="export")
     client.force_login(alma)
     chosen = {"action": "delete_selected", "_selected_action": [Token.objects.get().pk], "post": "yes"}
     assert client.post("/admin/api/token/", chosen).status_code == 302

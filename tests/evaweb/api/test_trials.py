@@ -5,7 +5,7 @@ from uuid import uuid4
 import pytest
 
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
@@ -28,7 +28,7 @@ def test_a_trial_is_prepared_scored_corrected_and_voided(rest, bench):
         1,
         "open bench bench-1",
     )
-    builders.over(Trial.objects.get())
+    builders.finished_trial(Trial.objects.get())
     where = f"trials/{made['id']}"
     status, scored = rest.post(f"{where}/score", milestones=ticks(bench, True, True, True), note="clean")
     assert (status, scored["success"], scored["score"], scored["note"]) == (200, True, 1.0, "clean")
@@ -115,7 +115,7 @@ def test_a_running_trial_is_not_scored(rest, bench):
 )
 def test_scores_that_make_no_sense_are_refused(rest, body, status):
     _, made = prepare(rest)
-    builders.over(Trial.objects.get())
+    builders.finished_trial(Trial.objects.get())
     got, answer = rest.post(f"trials/{made['id']}/score", **body)
     assert got == status
     assert answer["error"]
@@ -163,7 +163,7 @@ def test_the_list_is_paged_and_filtered(rest, bench):
 def test_a_note_with_unicode_and_newlines_survives_to_csv(rest, bench):
     note = '=HYPERLINK("x")\nzweite Zeile, "好" — 🤖'
     trial = bench.ended()
-    services.trial_score(
+    services.score_trial(
         user=bench.operator,
         trial=trial,
         milestones=bench.ticks(True, True, False),
@@ -261,7 +261,7 @@ def test_a_parent_of_a_blind_plan_is_not_named(rest, bench):
     plan = Plan.objects.create(name="blind", title="Blind", owner=owner, blind=True)
     plan.checkpoints.set([hidden])
     plan.positions.set(bench.scene.positions.all())
-    plan_freeze(user=owner, plan=plan)
+    freeze_plan(user=owner, plan=plan)
     assert rest.get("checkpoints/tuned")[1]["parent"] is None
 
 

@@ -21,7 +21,7 @@ from runtime.core.types import Result
 from runtime.recording.export import write_export
 from runtime.recording.labels import Label, append_label
 from tests.evaweb.episodes.conftest import data, recorded, station
-from tests.evaweb.trials.builders import Wire
+from tests.evaweb.trials.builders import FakeConnection
 from tests.runtime.recording.samples import resealed
 
 __all__ = ["data", "recorded", "station"]
@@ -43,9 +43,9 @@ def collecting(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def at(monkeypatch: pytest.MonkeyPatch) -> Wire:
+def at(monkeypatch: pytest.MonkeyPatch) -> FakeConnection:
     """What stands where wires to runtimes stand: a station that collects, and that nobody commands."""
-    made = Wire()
+    made = FakeConnection()
     made.snapshot = {**made.snapshot, "collect": collecting(), "lease": {"holder": "", "epoch": 0}}
     for place in ("stations.commands", "collect.services", "collect.station_commands"):
         monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
@@ -53,8 +53,8 @@ def at(monkeypatch: pytest.MonkeyPatch) -> Wire:
 
 
 @pytest.fixture
-def session(at: Wire, data: Path, station: Station, ann: User) -> CollectSession:
-    return services.session_begin(user=ann, station=station, task="stack the cups", target=20)
+def session(at: FakeConnection, data: Path, station: Station, ann: User) -> CollectSession:
+    return services.open_session(user=ann, station=station, task="stack the cups", target=20)
 
 
 Demonstrate = Callable[..., Demonstration]
@@ -78,8 +78,8 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
         resealed(target)
         write_export(target, data)
         closed = {"uuid": uuid, "status": status}
-        episodes.episode_closed(station=chosen.station, data=closed)
-        made = following.demonstration_told(event={"kind": "episode_closed", "data": closed})
+        episodes.record_closed(station=chosen.station, data=closed)
+        made = following.apply_station_event(event={"kind": "episode_closed", "data": closed})
         assert made is not None
         return made if result is None else labelled(data, made, result)
 
@@ -89,6 +89,6 @@ def demonstrate(data: Path, recorded: dict[str, Path], session: CollectSession) 
 def labelled(data: Path, made: Demonstration, result: Result | None, **said: Any) -> Demonstration:
     """As the station writes it down and tells of it."""
     append_label(data, str(made.pk), Label(1_700_000_000.0, "ann", result, **said))
-    told = following.demonstration_told(event={"kind": "labelled", "data": {"episode": str(made.pk)}})
+    told = following.apply_station_event(event={"kind": "labelled", "data": {"episode": str(made.pk)}})
     assert told is not None
     return told

@@ -11,14 +11,14 @@ from django.contrib.auth.models import User
 from evaweb.collect import services
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.collect.station_commands import session_command
-from evaweb.console.event_ingest import events_written
+from evaweb.console.event_ingest import ingest_events
 from evaweb.console.feed import History
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict, EvaError
 from evaweb.stations.models import Command, CommandStatus, Station
 from runtime.ipc import messages
 from tests.evaweb.collect.conftest import SETUP, collecting
-from tests.evaweb.trials.builders import Wire
+from tests.evaweb.trials.builders import FakeConnection
 
 pytestmark = pytest.mark.django_db
 
@@ -29,14 +29,14 @@ def give(session: CollectSession, user: User, kind: str, **given: Any) -> Comman
 
 
 def test_a_set_up_is_one_to_collect_for_the_sessions_task(
-    session: CollectSession, at: Wire, ann: User
+    session: CollectSession, at: FakeConnection, ann: User
 ) -> None:
     row = give(session, ann, "setup", args={"bench": {"seed": 3}})
     assert row.args == {"bench": {"seed": 3}, "collect": True, "task": "stack the cups"}
 
 
 def test_a_run_names_the_session_and_its_episode_is_one_of_it(
-    session: CollectSession, at: Wire, ann: User
+    session: CollectSession, at: FakeConnection, ann: User
 ) -> None:
     row = give(session, ann, "run")
     assert row.args == {
@@ -54,7 +54,7 @@ def test_a_run_names_the_session_and_its_episode_is_one_of_it(
     )
 
 
-def test_a_refused_run_has_no_episode(session: CollectSession, at: Wire, ann: User) -> None:
+def test_a_refused_run_has_no_episode(session: CollectSession, at: FakeConnection, ann: User) -> None:
     at.status_word, at.reason = "refused", "not armed"
     assert give(session, ann, "run").status == CommandStatus.REFUSED
     assert not Demonstration.objects.exists()
@@ -62,14 +62,14 @@ def test_a_refused_run_has_no_episode(session: CollectSession, at: Wire, ann: Us
 
 @pytest.mark.parametrize("late", [False, True])
 def test_a_demonstration_whose_recording_could_not_be_opened_leaves_nothing_behind(
-    session: CollectSession, at: Wire, ann: User, late: bool
+    session: CollectSession, at: FakeConnection, ann: User, late: bool
 ) -> None:
     def told(command: messages.Command) -> None:
         never = {"command": command.uuid, "episode": str(at.episode), "unopened": True}
         text = "running -> ready: no room"
         data = {"state": "ready", "unbegun": never}
         row = {"number": 1, "kind": "state", "text": text, "time": 1.0, "data": data}
-        events_written(station=Station.objects.get(), history=History("b", (row,)))
+        ingest_events(station=Station.objects.get(), history=History("b", (row,)))
 
     if late:  # the answer is heard after the event
         answer = at.request
@@ -83,7 +83,7 @@ def test_a_demonstration_whose_recording_could_not_be_opened_leaves_nothing_behi
 
 
 def test_a_station_that_has_changed_is_not_run_and_the_differences_are_listed(
-    session: CollectSession, at: Wire, ann: User
+    session: CollectSession, at: FakeConnection, ann: User
 ) -> None:
     at.snapshot = {**at.snapshot, "collect": collecting(setup={**SETUP, "robot": "g2"})}
     with pytest.raises(Conflict, match=r"session stack the cups \(cups\): robot = g2, allowed agilex_piper"):
@@ -91,18 +91,18 @@ def test_a_station_that_has_changed_is_not_run_and_the_differences_are_listed(
     assert not Command.objects.exists()
 
 
-def test_a_closed_session_is_not_run(session: CollectSession, at: Wire, ann: User) -> None:
-    services.session_close(user=ann, session=session)
+def test_a_closed_session_is_not_run(session: CollectSession, at: FakeConnection, ann: User) -> None:
+    services.close_session(user=ann, session=session)
     with pytest.raises(Conflict, match="is closed: resume it first"):
         give(session, ann, "run")
 
 
 def test_the_same_uuid_again_gets_the_first_answer_whatever_has_changed_meanwhile(
-    session: CollectSession, at: Wire, ann: User
+    session: CollectSession, at: FakeConnection, ann: User
 ) -> None:
     uuid = uuid4()
     first = give(session, ann, "run", uuid=uuid)
-    services.session_close(user=ann, session=session)
+    services.close_session(user=ann, session=session)
     assert give(session, ann, "run", uuid=uuid).data == first.data
     assert Demonstration.objects.count() == 1
 
@@ -115,16 +115,16 @@ def test_the_same_uuid_again_gets_the_first_answer_whatever_has_changed_meanwhil
     ],
 )
 def test_what_a_session_does_not_take_is_refused(
-    session: CollectSession, at: Wire, ann: User, kind: str, args: dict[str, Any], said: str
+    session: CollectSession, at: FakeConnection, ann: User, kind: str, args: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(EvaError, match=said):
         give(session, ann, kind, args=args)
 
 
 def test_an_episode_that_is_being_recorded_keeps_its_session_open(
-    session: CollectSession, at: Wire, ann: User
+    session: CollectSession, at: FakeConnection, ann: User
 ) -> None:
     episode = give(session, ann, "run").data["episode"]
     at.snapshot = {**at.snapshot, "collect": collecting(episode=episode)}
     with pytest.raises(Conflict, match="stop it first"):
-        services.session_close(user=ann, session=session)
+        services.close_session(user=ann, session=session)

@@ -15,7 +15,7 @@ from evaweb.collect.record import SESSIONS
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from tests.evaweb.collect.conftest import SETUP, Demonstrate, labelled
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 pytestmark = pytest.mark.django_db
 
@@ -30,18 +30,18 @@ def test_the_newest_label_counts_and_a_discarded_one_stays_so(demonstrate: Demon
 def test_told_twice_it_is_one_demonstration(demonstrate: Demonstrate, session: CollectSession) -> None:
     made = demonstrate()
     event = {"kind": "episode_closed", "data": {"uuid": str(made.pk)}}
-    assert following.demonstration_told(event=event) == made
+    assert following.apply_station_event(event=event) == made
     assert Demonstration.objects.count() == 1
 
 
 @pytest.mark.parametrize("data_of", [{}, {"uuid": "none"}, {"episode": str(uuid4())}])
 def test_what_is_of_no_session_is_left_alone(data_of: dict, session: CollectSession) -> None:
-    assert following.demonstration_told(event={"kind": "labelled", "data": data_of}) is None
+    assert following.apply_station_event(event={"kind": "labelled", "data": data_of}) is None
 
 
 def lost() -> None:
     """The database, but for its guards' opinion."""
-    with unguarded("collect"):
+    with without_triggers("collect"):
         Demonstration.objects.all().delete()
         SessionEvent.objects.all().delete()
         CollectSession.objects.all().delete()
@@ -51,8 +51,8 @@ def test_sessions_and_labels_come_back_from_the_disk(
     session: CollectSession, demonstrate: Demonstrate, ann: User
 ) -> None:
     made = demonstrate("success")
-    services.session_target(user=ann, session=session, target=7)
-    services.session_close(user=ann, session=session)
+    services.set_session_target(user=ann, session=session, target=7)
+    services.close_session(user=ann, session=session)
     lost()
     assert reconcile().problems == ()
     again = CollectSession.objects.get()

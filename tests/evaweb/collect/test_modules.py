@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.evaweb.console.test_modules import pytestmark, run
-from tests.standing import standing
+from tests.standing import state_flags
 
 __all__ = ["pytestmark"]
 MOMENTS, PADS = "../collect/moments.js", "../collect/pad_buttons.js"
@@ -20,12 +20,12 @@ def call(name: str, *given: Any) -> Any:
 
 @pytest.mark.parametrize("state", ["setting_up", "running", "holding"])
 def test_wherever_the_robot_moves_the_big_button_stops_it(state: str) -> None:
-    assert call("big", standing(state))["kind"] == "stop"
+    assert call("big", state_flags(state))["kind"] == "stop"
 
 
 @pytest.mark.parametrize("state", ["ready", "idle", "faulted", "disconnected"])
 def test_at_rest_it_starts(state: str) -> None:
-    assert call("big", standing(state)) == {"kind": "run", "text": "Start"}
+    assert call("big", state_flags(state)) == {"kind": "run", "text": "Start"}
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_what_is_said_is_about_the_open_episode_else_the_newest() -> None:
 
 
 def test_a_discarded_episode_is_not_labelled_and_not_discarded_again() -> None:
-    snapshot = {**standing("ready"), "collect": {**COLLECT, "last": {"uuid": "a", "discarded": True}}}
+    snapshot = {**state_flags("ready"), "collect": {**COLLECT, "last": {"uuid": "a", "discarded": True}}}
     assert call("whyNotLabel", snapshot, "a") == "the episode is discarded"
     assert call("whyNotDiscard", snapshot, "a") == "the episode is discarded already"
     assert call("whyNotLabel", snapshot, "b") == ""
@@ -68,21 +68,23 @@ def test_the_open_episode_is_not_named_where_it_is_discarded() -> None:
 
 def test_an_episode_is_labelled_once_it_is_over() -> None:
     assert (
-        call("whyNotLabel", {**standing("running"), "collect": {**COLLECT, "episode": "a"}}, "a")
+        call("whyNotLabel", {**state_flags("running"), "collect": {**COLLECT, "episode": "a"}}, "a")
         == "stop and save first"
     )
 
 
 def test_the_step_to_do_is_the_result_until_somebody_has_said_it() -> None:
     last = {"uuid": "a", "result": None, "discarded": False}
-    ready = {**standing("ready"), "collect": {**COLLECT, "last": last}}
+    ready = {**state_flags("ready"), "collect": {**COLLECT, "last": last}}
     assert call("step", ready, None) == "session"
     assert call("step", ready, "s") == "result"
     assert (
-        call("step", {**standing("ready"), "collect": {**COLLECT, "last": {**last, "result": "fail"}}}, "s")
+        call(
+            "step", {**state_flags("ready"), "collect": {**COLLECT, "last": {**last, "result": "fail"}}}, "s"
+        )
         == "record"
     )
-    assert call("step", {**standing("idle"), "collect": COLLECT}, "s") == "setup"
+    assert call("step", {**state_flags("idle"), "collect": COLLECT}, "s") == "setup"
 
 
 def twice(body: str) -> Any:

@@ -13,15 +13,15 @@ from django.test import Client
 from evaweb.collect import services
 from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.console import changes
-from evaweb.console.event_ingest import Scribe, events_written
+from evaweb.console.event_ingest import StationEventIngester, ingest_events
 from evaweb.console.feed import Feeds, History
 from evaweb.jobs.models import Job
 from evaweb.reviews.models import Standing
 from evaweb.stations.models import Station
 from runtime.recording.labels import Label, append_label
 from tests.evaweb.collect.conftest import Demonstrate, collecting
-from tests.evaweb.stand_in import StandIn
-from tests.evaweb.trials.builders import Wire
+from tests.evaweb.stand_in import FakeStation
+from tests.evaweb.trials.builders import FakeConnection
 from tests.processes import eventually, joined
 
 pytestmark = pytest.mark.django_db
@@ -52,7 +52,7 @@ def test_the_tab_is_there_where_the_station_collects(browser: Client, station: S
 def test_without_a_session_it_offers_tasks_and_sessions_of_before(
     browser: Client, session: CollectSession, ann: User
 ) -> None:
-    services.session_close(user=ann, session=session)
+    services.close_session(user=ann, session=session)
     shown = text(browser, PAGE)
     assert '<option value="stack the cups">' in shown
     assert f'<option value="{session.pk}">' in shown
@@ -102,9 +102,9 @@ def test_a_session_is_shown_with_counts_queue_flags_and_what_can_be_published(
 
 
 def test_a_task_is_a_text_and_no_markup(
-    browser: Client, at: Wire, data: Path, station: Station, ann: User, vera: User
+    browser: Client, at: FakeConnection, data: Path, station: Station, ann: User, vera: User
 ) -> None:
-    services.session_begin(user=ann, station=station, task=NASTY)
+    services.open_session(user=ann, station=station, task=NASTY)
     browser.force_login(vera)
     shown = text(browser, PAGE)
     assert (NASTY in shown, f'data-task="{ESCAPED}"' in shown) == (False, True)
@@ -113,11 +113,11 @@ def test_a_task_is_a_text_and_no_markup(
 def test_who_watches_is_told_that_something_has_changed(
     session: CollectSession, demonstrate: Demonstrate, ann: User
 ) -> None:
-    before = changes.marks("bench")
-    services.session_target(user=ann, session=session, target=3)
-    assert changes.difference(before, after := changes.marks("bench")) == ["collect"]
+    before = changes.change_marks("bench")
+    services.set_session_target(user=ann, session=session, target=3)
+    assert changes.changed_names(before, after := changes.change_marks("bench")) == ["collect"]
     demonstrate("success")
-    assert "collect" in changes.difference(after, changes.marks("bench"))
+    assert "collect" in changes.changed_names(after, changes.change_marks("bench"))
 
 
 def test_a_label_comes_from_the_event_log_into_the_row(demonstrate: Demonstrate, data: Path) -> None:
@@ -130,15 +130,15 @@ def test_a_label_comes_from_the_event_log_into_the_row(demonstrate: Demonstrate,
         "time": 1.0,
         "data": {"episode": str(made.pk)},
     }
-    events_written(station=made.session.station, history=History("b1", (told,)))
+    ingest_events(station=made.session.station, history=History("b1", (told,)))
     assert Demonstration.objects.get().result == "partial"
 
 
 @pytest.mark.django_db(transaction=True)
 def test_a_station_says_by_itself_that_it_collects_and_that_it_does_no_more(
-    runtime: StandIn, live: Station
+    runtime: FakeStation, live: Station
 ) -> None:
-    scribe = Scribe(runtime.name, Feeds())
+    scribe = StationEventIngester(runtime.name, Feeds())
     scribe.start()
 
     def says(collect: dict[str, Any] | None) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from evaweb.collect.setups import differences, setup_in, setup_of
+from evaweb.collect.setups import setup_differences, setup_from_manifest, setup_from_snapshot
 from evaweb.errors import Conflict
 from tests.evaweb.collect.conftest import SETUP, collecting
 
@@ -17,7 +17,7 @@ def changed(**changes: Any) -> dict[str, Any]:
 
 
 def test_the_same_set_up_has_no_difference() -> None:
-    assert differences(SETUP, deepcopy(SETUP)) == []
+    assert setup_differences(SETUP, deepcopy(SETUP)) == []
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_the_same_set_up_has_no_difference() -> None:
     ],
 )
 def test_each_difference_is_a_sentence_of_its_own(changes: dict[str, Any], said: list[str]) -> None:
-    assert differences(changed(**changes), SETUP) == said
+    assert setup_differences(changed(**changes), SETUP) == said
 
 
 def test_a_manifest_and_a_snapshot_are_compared_in_the_same_words() -> None:
@@ -52,11 +52,16 @@ def test_a_manifest_and_a_snapshot_are_compared_in_the_same_words() -> None:
         "fps": 30.0,
         "streams": SETUP["streams"],
     }
-    assert differences(setup_in(manifest), setup_of({"collect": collecting()}, "bench")) == []
+    assert (
+        setup_differences(
+            setup_from_manifest(manifest), setup_from_snapshot({"collect": collecting()}, "bench")
+        )
+        == []
+    )
 
 
 def test_a_station_that_collects_nothing_or_sees_nothing_has_no_set_up() -> None:
     with pytest.raises(Conflict, match=r"no \[collection\]"):
-        setup_of({"collect": None}, "bench")
+        setup_from_snapshot({"collect": None}, "bench")
     with pytest.raises(Conflict, match="cam_high"):
-        setup_of({"collect": collecting(setup=None)}, "bench")
+        setup_from_snapshot({"collect": collecting(setup=None)}, "bench")

@@ -8,7 +8,7 @@ import pytest
 from django.utils import timezone
 
 from evaweb.collect.models import CollectSession, Demonstration
-from evaweb.collect.work import queue_of
+from evaweb.collect.work import session_queue
 from evaweb.jobs.models import Job
 from tests.evaweb.collect.conftest import Demonstrate
 
@@ -33,7 +33,7 @@ def two(demonstrate: Demonstrate) -> tuple[Demonstration, Demonstration]:
 
 
 def test_nothing_to_do_is_an_empty_queue(session: CollectSession, two: tuple) -> None:
-    found = queue_of(session=session)
+    found = session_queue(session=session)
     assert (found.items, found.total, found.done, found.active, found.left_s) == ((), 0, 0, False, 0)
 
 
@@ -45,7 +45,7 @@ def test_time_left_is_that_of_earlier_jobs_of_the_kind_frame_by_frame(
     job(first, "preview", "done", 4.0)
     job(second, "quality", "running", 2.0)
     job(second, "preview", "queued")
-    found = queue_of(session=session)
+    found = session_queue(session=session)
     assert [(item.job.kind, item.number) for item in found.items] == [("quality", 2), ("preview", 2)]
     assert [item.left_s for item in found.items] == pytest.approx([6.0, 4.0], abs=0.5)
     assert found.items[0].fraction == pytest.approx(0.25, abs=0.1)
@@ -55,7 +55,7 @@ def test_time_left_is_that_of_earlier_jobs_of_the_kind_frame_by_frame(
 
 def test_a_kind_that_was_never_done_has_no_known_time(session: CollectSession, two: tuple) -> None:
     job(two[0], "publish", "queued")
-    found = queue_of(session=session)
+    found = session_queue(session=session)
     assert (found.items[0].left_s, found.left_s) == (None, None)
 
 
@@ -65,7 +65,7 @@ def test_the_newest_of_a_key_counts_and_failures_stand_first(session: CollectSes
     job(first, "preview", "done", 1.0)
     job(first, "quality", "queued")
     job(second, "publish", "failed", error="discarded")
-    found = queue_of(session=session)
+    found = session_queue(session=session)
     assert [(item.job.kind, item.job.status) for item in found.items] == [
         ("publish", "failed"),
         ("quality", "queued"),
@@ -76,4 +76,4 @@ def test_the_newest_of_a_key_counts_and_failures_stand_first(session: CollectSes
 def test_jobs_of_others_are_not_in_it(session: CollectSession, two: tuple) -> None:
     Job.objects.create(kind="preview", key="preview:00000000-0000-4000-8000-000000000009")
     Job.objects.create(kind="reconcile", key="reconcile")
-    assert queue_of(session=session).total == 0
+    assert session_queue(session=session).total == 0

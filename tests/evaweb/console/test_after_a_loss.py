@@ -8,7 +8,7 @@ import time
 import pytest
 
 from evaweb.console import event_ingest as chronicle
-from evaweb.console.event_ingest import Scribe
+from evaweb.console.event_ingest import StationEventIngester
 from evaweb.console.feed import Feeds
 from evaweb.stations.models import Lease, Station
 from runtime.ipc.messages import Command
@@ -50,10 +50,10 @@ def told(monkeypatch):
     made = []
     monkeypatch.setattr(
         chronicle.trials,
-        "run_changed",
+        "apply_station_event",
         lambda station, event, boot: made.append((event["number"], event["kind"])),
     )
-    monkeypatch.setattr(chronicle.episodes, "episode_closed", lambda station, data: None)
+    monkeypatch.setattr(chronicle.episodes, "record_closed", lambda station, data: None)
     return made
 
 
@@ -63,7 +63,7 @@ def web(told):
     scribes = []
 
     def start():
-        scribes.append(Scribe(STATION, Feeds()))
+        scribes.append(StationEventIngester(STATION, Feeds()))
         scribes[-1].start()
         return scribes[-1]
 

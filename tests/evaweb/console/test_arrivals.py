@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evaweb.console.arrivals import Arrivals
+from evaweb.console.arrivals import ConnectionLimiter
 
 
 @pytest.fixture
@@ -19,10 +19,10 @@ def closed():
 
 @pytest.fixture
 def arrive(now, closed):
-    made = Arrivals(most=6, most_of_one=3, clock=lambda: now[0])
+    made = ConnectionLimiter(most=6, most_of_one=3, clock=lambda: now[0])
 
     def came(key, peer="10.0.0.1", seconds=15.0):
-        made.came(key, peer, seconds, lambda: closed.append(key))
+        made.add(key, peer, seconds, lambda: closed.append(key))
 
     came.all_of_them = made
     return came

@@ -11,8 +11,8 @@ import sys
 import pytest
 from django.conf import settings
 
-from evaweb.console.bodies import MEMBER, STRANGER, bound_of
-from evaweb.headers import BARE
+from evaweb.console.bodies import ANONYMOUS_LIMIT, USER_LIMIT, body_bound
+from evaweb.headers import DEFAULT_HEADERS
 from evaweb.plans.references import LARGEST
 from tests.evaweb.console.test_serve import MANAGE, served
 from tests.processes import PATIENCE_S
@@ -27,22 +27,22 @@ HUGE = 200_000_000
 @pytest.mark.parametrize(
     ("path", "cookies", "authorized", "largest", "status"),
     [
-        (b"/login/", [], False, STRANGER, 413),
-        (b"/login/", [b"eva_csrf=eva_session"], False, STRANGER, 413),
-        (b"/api/v1/trials/1/score", [], False, STRANGER, 401),
+        (b"/login/", [], False, ANONYMOUS_LIMIT, 413),
+        (b"/login/", [b"eva_csrf=eva_session"], False, ANONYMOUS_LIMIT, 413),
+        (b"/api/v1/trials/1/score", [], False, ANONYMOUS_LIMIT, 401),
         (b"/api/v1/trials/1/score", [], True, 256 * 1024, 413),
         (b"/api/v1/trials/1/score", SESSION, False, 256 * 1024, 413),
         (b"/api/v1/stations/bench-1/commands", SESSION, False, 256 * 1024, 413),
         (b"/api/v1/nowhere", SESSION, False, 64 * 1024, 413),
-        (b"/result/trials/1/score", SESSION, False, MEMBER, 413),
-        (b"/admin/plans/plan/import/", SESSION, False, LARGEST + STRANGER, 413),
-        (b"/admin/plans/plan/import/", [], True, MEMBER, 413),
-        (b"/admin/plans/plan/import/", [], False, STRANGER, 413),
-        (b"/api/v1/stations/bench-1/estop", [], False, STRANGER, 0),
+        (b"/result/trials/1/score", SESSION, False, USER_LIMIT, 413),
+        (b"/admin/plans/plan/import/", SESSION, False, LARGEST + ANONYMOUS_LIMIT, 413),
+        (b"/admin/plans/plan/import/", [], True, USER_LIMIT, 413),
+        (b"/admin/plans/plan/import/", [], False, ANONYMOUS_LIMIT, 413),
+        (b"/api/v1/stations/bench-1/estop", [], False, ANONYMOUS_LIMIT, 0),
     ],
 )
 def test_how_much_may_be_sent(path, cookies, authorized, largest, status):
-    found = bound_of(path, cookies, authorized)
+    found = body_bound(path, cookies, authorized)
     assert (found.largest, found.status) == (largest, status)
 
 
@@ -86,7 +86,7 @@ def asked(port, path, *headers, body=b"", method="POST"):
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
     head, _, content = answer.partition(b"\r\n\r\n")
     status, *told = head.decode().lower().split("\r\n")
-    assert {name.decode() for name, _ in BARE} <= {line.partition(":")[0] for line in told}, (
+    assert {name.decode() for name, _ in DEFAULT_HEADERS} <= {line.partition(":")[0] for line in told}, (
         "as every answer has them"
     )
     return int(status.split()[1]), content
@@ -152,7 +152,7 @@ def test_what_is_too_long_is_refused_by_its_headers_alone(port, path, header, st
 @pytest.mark.exhaustive
 @pytest.mark.slow
 def test_a_file_is_read_of_an_administrator_alone(port, sessions):
-    length, path = MEMBER + 1, "/admin/plans/plan/import/"
+    length, path = USER_LIMIT + 1, "/admin/plans/plan/import/"
     admin, viewer = (f"Cookie: {NAME}={key}" for key in sessions)
     status, content = asked(port, path, f"Content-Length: {length}", viewer)
     assert (status, b"you are a viewer; this needs an admin" in content) == (403, True)
@@ -163,7 +163,7 @@ def test_a_file_is_read_of_an_administrator_alone(port, sessions):
 
 @pytest.mark.slow
 def test_a_body_of_unsaid_length_is_refused_when_it_has_become_too_long(port):
-    chunk = b"%x\r\n%s\r\n" % (STRANGER, b"x" * STRANGER)
+    chunk = b"%x\r\n%s\r\n" % (ANONYMOUS_LIMIT, b"x" * ANONYMOUS_LIMIT)
     status, content = asked(port, "/login/", "Transfer-Encoding: chunked", body=chunk + b"1\r\nx\r\n")
     assert (status, b"the body is too long" in content) == (413, True)
 
@@ -179,7 +179,7 @@ def test_what_is_short_enough_is_answered_by_the_page(port):
 @pytest.mark.slow
 @pytest.mark.parametrize("chunked", [False, True])
 def test_an_e_stop_goes_on_without_what_is_too_long(port, chunked):
-    body = b"x" * (STRANGER + 1)
+    body = b"x" * (ANONYMOUS_LIMIT + 1)
     kind = "Transfer-Encoding: chunked" if chunked else f"Content-Length: {len(body)}"
     sent = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body) if chunked else body
     path = "/api/v1/stations/bench-1/" + ("estop" if chunked else "%65stop")

@@ -12,7 +12,7 @@ from runtime.ipc.messages import Mode
 from runtime.processes.coordinator.session.machine import COMMANDS
 from runtime.strategies.base import StrategyParameters
 from tests.evaweb.console.test_modules import NODE, run
-from tests.standing import standing
+from tests.standing import state_flags
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
 MODES = get_args(Mode)
@@ -45,7 +45,7 @@ def test_every_mode_of_the_runtime_is_offered_with_a_line() -> None:
 )
 def test_there_is_one_big_button_at_each_moment(state: str, mode: str, chunk: int, button: str) -> None:
     proposal = {"chunk": chunk} if chunk else {}
-    given = {**standing(state), "mode": mode, "proposal": proposal}
+    given = {**state_flags(state), "mode": mode, "proposal": proposal}
 
     assert run("debug/modes.js", "return m.primary(given)", given) == button
 
@@ -77,11 +77,11 @@ def test_what_the_run_does_is_said_in_words() -> None:
         "debug/modes.js",
         body,
         [
-            {**standing("running"), "phase": "executing", "control": {"remaining": 45}, "rate": 30},
-            {**standing("running"), "phase": "asking"},
-            {**standing("running"), "phase": "something_new"},
-            {**standing("ready"), "phase": "executing"},
-            {**standing("running"), "phase": ""},
+            {**state_flags("running"), "phase": "executing", "control": {"remaining": 45}, "rate": 30},
+            {**state_flags("running"), "phase": "asking"},
+            {**state_flags("running"), "phase": "something_new"},
+            {**state_flags("ready"), "phase": "executing"},
+            {**state_flags("running"), "phase": ""},
         ],
     )
 
@@ -115,7 +115,7 @@ def store(**more: Any) -> dict[str, Any]:
     """A page that commands; `more` is of the snapshot or of the page."""
     page = {"fresh": True, "role": "operator", "lease": "mine"}
     page |= {key: more.pop(key) for key in tuple(more) if key in page}
-    return {**page, "snapshot": {**standing("running"), "mode": "continuous", "allowed": [], **more}}
+    return {**page, "snapshot": {**state_flags("running"), "mode": "continuous", "allowed": [], **more}}
 
 
 def test_a_stop_needs_no_news_and_everything_else_does() -> None:
@@ -144,9 +144,9 @@ def test_who_does_not_command_is_told_how_to() -> None:
     ("kind", "situation", "reason"),
     [
         ("step", {"guarded": {"step": "the policy is being asked"}}, "the policy is being asked"),
-        ("step", {**standing("ready")}, "run in the mode step or preview first"),
-        ("commit", {**standing("idle")}, "run in the mode preview first"),
-        ("move", {**standing("holding")}, "the robot holds: resume or stop first"),
+        ("step", {**state_flags("ready")}, "run in the mode step or preview first"),
+        ("commit", {**state_flags("idle")}, "run in the mode preview first"),
+        ("move", {**state_flags("holding")}, "the robot holds: resume or stop first"),
         ("home", {"allowed": ["stop", "estop"]}, "not while running; possible now: Stop"),
         ("home", {"allowed": ["estop"]}, "not while running; possible now: nothing"),
         ("stop", {"allowed": ["stop"]}, ""),
@@ -478,11 +478,11 @@ def test_stages_are_shown_while_they_go_on_and_after_one_failed() -> None:
     failed = [{"name": "connect", "state": "failed", "seconds": 5.0}]
     done = [{"name": "connect", "state": "done", "seconds": 0.2}]
     snapshots = [
-        {**standing("setting_up"), "stages": done},
-        {**standing("idle"), "stages": failed},
-        {**standing("idle"), "stages": done},
-        {**standing("ready"), "stages": done},
-        {**standing("idle")},
+        {**state_flags("setting_up"), "stages": done},
+        {**state_flags("idle"), "stages": failed},
+        {**state_flags("idle"), "stages": done},
+        {**state_flags("ready"), "stages": done},
+        {**state_flags("idle")},
     ]
 
     assert run("trial/setup.js", "return given.map((snapshot) => m.unfinished(snapshot))", snapshots) == [

@@ -9,7 +9,7 @@ from django.db import OperationalError
 from django.utils import timezone
 
 from evaweb.console import changes
-from evaweb.console.changes import difference, marks
+from evaweb.console.changes import change_marks, changed_names
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.stations.models import Lease, LeaseRequest, Station
@@ -21,9 +21,9 @@ def station(db):
 
 
 def changed(work):
-    before = marks("changing")
+    before = change_marks("changing")
     work()
-    return difference(before, marks("changing"))
+    return changed_names(before, change_marks("changing"))
 
 
 def test_nothing_changes_by_itself(station):
@@ -56,6 +56,6 @@ def test_a_database_that_does_not_answer_says_nothing(monkeypatch, caplog):
     def locked(station):
         raise OperationalError("database is locked")
 
-    monkeypatch.setattr(changes, "marks", locked)
-    assert asyncio.run(changes.look("changing")) is None
+    monkeypatch.setattr(changes, "change_marks", locked)
+    assert asyncio.run(changes.read_marks("changing")) is None
     assert "database is locked" in caplog.text

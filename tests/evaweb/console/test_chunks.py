@@ -7,11 +7,11 @@ import pytest
 
 from evaweb.binary_frames import decode
 from evaweb.console import parts
-from evaweb.console.chunks import GHOSTS, chunk_part
-from evaweb.stations.geometry import geometry
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.console.chunks import GHOSTS, encode_chunk
+from evaweb.stations.geometry import scene_geometry
+from evaweb.stations.robot_geometry import drawn_robot
 
-LOOKS = looks_of("agilex_piper")
+LOOKS = drawn_robot("agilex_piper")
 
 
 def chunk(count=16, **changes):
@@ -30,7 +30,7 @@ def chunk(count=16, **changes):
 
 
 def shown(content, looks=LOOKS):
-    frame = decode(parts.frame([chunk_part(content, looks, 0.0)], 1, 0.0))
+    frame = decode(parts.build_frame([encode_chunk(content, looks, 0.0)], 1, 0.0))
     return frame, frame.header["streams"]["chunk"]
 
 
@@ -54,7 +54,7 @@ def test_dots_are_where_the_robots_fingertips_would_be():
     frame, _ = shown(content)
     tips = frame.array("chunk", "tips")
     assert tips.shape == (16, 2, 3)
-    for arm, tip in enumerate(geometry("agilex_piper", simulated=False)["tips"]):
+    for arm, tip in enumerate(scene_geometry("agilex_piper", simulated=False)["tips"]):
         part = LOOKS.poses(content["rows"][5])[tip["part"]].reshape(4, 4).T
         assert np.allclose(tips[5, arm], (part @ np.reshape(tip["pose"], (4, 4)).T)[:3, 3], atol=1e-6)
 

@@ -15,15 +15,15 @@ from django.db import OperationalError, connections
 from evaweb.console import consumers
 from evaweb.console import hub as hubs
 from evaweb.credentials import credentials
-from evaweb.lookups import Lookups
+from evaweb.lookups import FairLookupPool
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
-from evaweb.stations.runtime_client import StationWire
+from evaweb.stations.runtime_client import StationConnection
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
 from tests import presses
 from tests.evaweb.console.page import Page, cookie, run
-from tests.evaweb.noted import settled
+from tests.evaweb.noted import wait_for_stop_records
 from tests.processes import PATIENCE_S, eventually
 
 pytestmark = pytest.mark.django_db(transaction=True)
@@ -197,7 +197,7 @@ async def _written(*uuids):
 
 def _in_the_database(uuids):
     try:
-        settled()
+        wait_for_stop_records()
         eventually(lambda: Command.objects.filter(pk__in=uuids).count() == len(uuids), "they are written")
     finally:
         connections.close_all()
@@ -234,13 +234,13 @@ def test_the_estop_waits_neither_for_the_database_nor_for_a_renewal(
 ):
     order = []
     lease = leases.claim(user=ann, station=live, page="p1")
-    noted = commands.estop_noted
+    noted = commands.record_estop
 
     def locked(**named):
         order.append("row")
         return noted(**named)
 
-    monkeypatch.setattr(commands, "estop_noted", locked)
+    monkeypatch.setattr(commands, "record_estop", locked)
 
     async def scenario():
         page = await Page(live.name, ann).open()
@@ -320,7 +320,7 @@ def test_a_page_outlasts_a_database_that_does_not_say_who_is_logged_in(live, ann
         raise OperationalError("gone")
 
     monkeypatch.setattr(consumers, "_LOGIN_S", 0.02)
-    monkeypatch.setattr(consumers, "role_now", away)
+    monkeypatch.setattr(consumers, "current_role", away)
     lease = leases.claim(user=ann, station=live, page="p1")
 
     async def scenario():
@@ -337,14 +337,14 @@ def test_a_page_outlasts_a_database_that_does_not_say_who_is_logged_in(live, ann
 def test_a_run_goes_on_for_a_minute_without_the_database_and_stops_work_for_longer(
     live, ann, runtime, monkeypatch, loaded_anew
 ):
-    now, away, look = [1000.0], threading.Event(), credentials.look
+    now, away, look = [1000.0], threading.Event(), credentials.look_up
 
     def gone(kind, secret):
         if away.is_set():
             raise OperationalError("gone")
         return look(kind, secret)
 
-    monkeypatch.setattr(credentials, "look", gone)
+    monkeypatch.setattr(credentials, "look_up", gone)
     monkeypatch.setattr(credentials, "_clock", lambda: now[0])
     lease = leases.claim(user=ann, station=live, page="p1")
 
@@ -464,14 +464,14 @@ def test_a_station_that_dies_and_comes_back_is_said(live, ann, runtime):
 
 def test_what_changes_in_the_database_is_said(live, ann, bob, runtime, monkeypatch):
     lease = leases.claim(user=ann, station=live, page="p1")
-    looked, look = asyncio.Event(), hubs.changes.look
+    looked, look = asyncio.Event(), hubs.changes.read_marks
 
     async def watched(station):
         found = await look(station)
         looked.set()
         return found
 
-    monkeypatch.setattr(hubs.changes, "look", watched)
+    monkeypatch.setattr(hubs.changes, "read_marks", watched)
     monkeypatch.setattr(hubs, "_CHANGES_S", 0.05)
 
     async def scenario():
@@ -565,7 +565,7 @@ def test_an_aim_that_hangs_keeps_no_stop_and_no_command_waiting(live, ann, runti
 
 def _given(**command):
     try:
-        return commands.issue(**command)
+        return commands.issue_command(**command)
     finally:
         connections.close_all()
 
@@ -597,7 +597,7 @@ def test_a_flood_of_presses_at_a_dead_station_is_two_and_another_station_is_stop
     dead.mute = True
     settings.EVA_COMMAND_TIMEOUT_S = 3.0
     presses = []
-    urgent = StationWire.urgent
+    urgent = StationConnection.request_urgent
 
     def counted(self, command, *given):
         presses.append(self.name)
@@ -618,7 +618,7 @@ def test_a_flood_of_presses_at_a_dead_station_is_two_and_another_station_is_stop
         await _written()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(StationWire, "urgent", counted)
+        patch.setattr(StationConnection, "request_urgent", counted)
         run(scenario())
     # Those of 1500 that came while the first was out are one more; what came later still makes another pair.
     assert presses.count(alive.name) == 1
@@ -678,14 +678,14 @@ def test_a_page_that_opens_while_the_database_is_away_can_stop(live, ann, runtim
     runtime.ready()
     runtime.do(lambda: runtime.session._enter(SessionState.RUNNING, ""))
     away, pressed = threading.Event(), str(uuid4())
-    look = credentials.look
+    look = credentials.look_up
 
     def gone(kind, secret):
         if away.is_set():
             raise OperationalError("gone")
         return look(kind, secret)
 
-    monkeypatch.setattr(credentials, "look", gone)
+    monkeypatch.setattr(credentials, "look_up", gone)
     monkeypatch.setattr(consumers, "_AGAIN_S", 0.02)
 
     async def scenario():
@@ -738,10 +738,10 @@ def test_a_page_that_has_no_turn_to_be_looked_up_presses_unverified_and_halts_no
         raise OperationalError("gone")
 
     monkeypatch.setattr(consumers, "_admitted", gone)
-    full, begun, turn = Lookups(1, most=1), threading.Event(), threading.Event()
-    full.ask("nowhere", lambda: begun.set() or turn.wait(PATIENCE_S))
+    full, begun, turn = FairLookupPool(1, most=1), threading.Event(), threading.Event()
+    full.submit("nowhere", lambda: begun.set() or turn.wait(PATIENCE_S))
     assert begun.wait(PATIENCE_S)
-    full.ask("nowhere", lambda: None)
+    full.submit("nowhere", lambda: None)
     monkeypatch.setattr(credentials, "_strangers", full)
 
     async def scenario():

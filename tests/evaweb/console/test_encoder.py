@@ -7,15 +7,15 @@ import pytest
 
 from evaweb.binary_frames import decode
 from evaweb.console import parts
-from evaweb.console.encoder import Encoder
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.console.encoder import StreamEncoder
+from evaweb.stations.robot_geometry import drawn_robot
 
 Q = np.full(14, 0.1, np.float32)
 
 
 def encoded(content, robot="agilex_piper", stream="joints"):
-    made = Encoder(robot).encode(stream, content)
-    return decode(parts.frame(made, 1, 0.0))
+    made = StreamEncoder(robot).encode(stream, content)
+    return decode(parts.build_frame(made, 1, 0.0))
 
 
 def joints(measured=Q, commanded=Q, engaged=True):
@@ -51,7 +51,7 @@ def test_a_simulated_robot_is_the_third_that_is_drawn():
     assert real.array("poses").shape == (2, 20, 16)
     third = simulated.array("poses")[2]
     assert np.array_equal(simulated.array("poses")[:2], real.array("poses"))
-    assert np.allclose(third, looks_of("agilex_piper").poses(Q + 0.2), atol=1e-6)
+    assert np.allclose(third, drawn_robot("agilex_piper").poses(Q + 0.2), atol=1e-6)
 
 
 def test_beside_a_simulated_robot_what_is_not_commanded_is_no_pose():
@@ -79,28 +79,28 @@ def test_what_cannot_be_drawn_is_still_told(content, robot):
 
 
 def test_a_robot_is_drawn_in_the_groups_that_its_station_says_it_has():
-    encoder = Encoder("agilex_piper")
+    encoder = StreamEncoder("agilex_piper")
     one = joints(measured=Q[:7], commanded=Q[:7])
     assert [part.stream for part in encoder.encode("joints", one)] == ["joints", "recent"]
     encoder.encode("state", {"facts": {"groups": ["right_arm"]}})
     poses = [part for part in encoder.encode("joints", one) if part.stream == "poses"]
-    assert decode(parts.frame(poses, 1, 0.0)).array("poses").shape == (2, 10, 16)
-    assert encoder.looks is looks_of("agilex_piper", ["right_arm"])
+    assert decode(parts.build_frame(poses, 1, 0.0)).array("poses").shape == (2, 10, 16)
+    assert encoder.looks is drawn_robot("agilex_piper", ["right_arm"])
 
 
 @pytest.mark.parametrize("facts", [None, {}, {"groups": None}, {"groups": []}])
 def test_a_station_that_does_not_say_has_all_groups(facts):
-    encoder = Encoder("agilex_piper")
+    encoder = StreamEncoder("agilex_piper")
     encoder.encode("state", {"facts": facts})
-    assert encoder.looks is looks_of("agilex_piper")
+    assert encoder.looks is drawn_robot("agilex_piper")
 
 
 def test_a_station_with_groups_that_nobody_knows_is_not_drawn():
-    encoder = Encoder("agilex_piper")
+    encoder = StreamEncoder("agilex_piper")
     encoder.encode("state", {"facts": {"groups": ["tail"]}})
     assert encoder.looks is None
     assert [part.stream for part in encoder.encode("joints", joints())] == ["joints", "recent"]
 
 
 def test_events_and_link_are_no_parts():
-    assert Encoder("agilex_piper").encode("events", object()) == []
+    assert StreamEncoder("agilex_piper").encode("events", object()) == []

@@ -9,7 +9,7 @@ import pytest
 from django.db import OperationalError, connection
 
 from evaweb.console import event_ingest as chronicle
-from evaweb.console.event_ingest import Chronicle, Scribe, events_written
+from evaweb.console.event_ingest import EventIngest, StationEventIngester, ingest_events
 from evaweb.console.feed import Feeds, History
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, Lease, Station
@@ -25,8 +25,8 @@ class Services:
         self.episodes = []
         self.fail = []
         self.news = threading.Condition()
-        monkeypatch.setattr(chronicle.trials, "run_changed", self.run_changed)
-        monkeypatch.setattr(chronicle.episodes, "episode_closed", self.episode_closed)
+        monkeypatch.setattr(chronicle.trials, "apply_station_event", self.run_changed)
+        monkeypatch.setattr(chronicle.episodes, "record_closed", self.episode_closed)
 
     def run_changed(self, *, station, event, boot):
         with self.news:
@@ -63,9 +63,9 @@ def station(db):
 
 def test_events_are_handed_on_in_order_and_each_once(station, services):
     seen = history(row(1), row(2, "setup"), row(3, "command"), row(4, "episode_closed", uuid="e1"))
-    assert events_written(station=station, history=seen) == ("b1", 4)
-    events_written(station=station, history=seen)
-    events_written(station=Station.objects.get(), history=seen)  # another web process
+    assert ingest_events(station=station, history=seen) == ("b1", 4)
+    ingest_events(station=station, history=seen)
+    ingest_events(station=Station.objects.get(), history=seen)  # another web process
     assert services.trials == [("b1", 1, "state"), ("b1", 3, "command"), ("b1", 4, "episode_closed")]
     assert services.episodes == ["e1"]
     station.refresh_from_db()
@@ -75,27 +75,27 @@ def test_events_are_handed_on_in_order_and_each_once(station, services):
 def test_after_a_restart_of_the_web_it_goes_on_where_it_was(station, services):
     Station.objects.update(boot="b1", last_event=2)
     station.refresh_from_db()
-    events_written(station=station, history=history(row(1), row(2), row(3), row(4)))
+    ingest_events(station=station, history=history(row(1), row(2), row(3), row(4)))
     assert [number for _, number, _ in services.trials] == [3, 4]
 
 
 def test_a_restarted_station_begins_anew_with_a_word_of_ours(station, services):
-    events_written(station=station, history=history(row(1)), state="running")
-    events_written(station=station, history=history(row(1), boot="b2"), state="disconnected")
+    ingest_events(station=station, history=history(row(1)), state="running")
+    ingest_events(station=station, history=history(row(1), boot="b2"), state="disconnected")
     assert services.trials == [("b1", 1, "state"), ("b2", 0, "state"), ("b2", 1, "state")]
 
 
 def test_a_database_that_is_locked_is_tried_again_from_there(station, services):
     services.fail = [OperationalError("database is locked")]
     with pytest.raises(OperationalError):
-        events_written(station=station, history=history(row(1), row(2)))
-    events_written(station=Station.objects.get(), history=history(row(1), row(2)))
+        ingest_events(station=station, history=history(row(1), row(2)))
+    ingest_events(station=Station.objects.get(), history=history(row(1), row(2)))
     assert [number for _, number, _ in services.trials] == [1, 2]
 
 
 def test_an_event_that_a_service_cannot_take_is_logged_and_keeps_no_other_back(station, services, caplog):
     services.fail = [KeyError("uuid")]
-    events_written(station=station, history=history(row(1), row(2)))
+    ingest_events(station=station, history=history(row(1), row(2)))
     assert [number for _, number, _ in services.trials] == [2]
     assert "event 1 of written-down (state 1) is not in the database" in caplog.text
 
@@ -103,7 +103,7 @@ def test_an_event_that_a_service_cannot_take_is_logged_and_keeps_no_other_back(s
 def test_events_that_are_no_longer_kept_are_said_to_be_lost(station, services, caplog):
     Station.objects.update(boot="b1", last_event=3)
     station.refresh_from_db()
-    events_written(station=station, history=history(row(9)))
+    ingest_events(station=station, history=history(row(9)))
     assert "events 4 to 8 of written-down are lost" in caplog.text
     assert [number for _, number, _ in services.trials] == [9]
 
@@ -114,7 +114,7 @@ def test_events_that_are_no_longer_kept_are_said_to_be_lost(station, services, c
 @pytest.fixture
 def scribe(live, runtime, transactional_db):
     """Writes down what happens at `runtime`; ended before the database is."""
-    made = Scribe(runtime.name, Feeds())
+    made = StationEventIngester(runtime.name, Feeds())
     yield made
     made.end()
     joined(made._thread)
@@ -164,7 +164,7 @@ def test_a_lost_answer_is_found(scribe, live, runtime, services, ann, settings, 
     lease = leases.claim(user=ann, station=live, page="p1")
     runtime.swallows.add("run")
     given = {"boot": runtime.boot, "sequence": runtime.session.sequence, "epoch": lease.epoch}
-    row = commands.issue(user=ann, station=live, kind="run", page="p1", **given)
+    row = commands.issue_command(user=ann, station=live, kind="run", page="p1", **given)
     assert row.status == CommandStatus.UNKNOWN
     runtime.swallows.clear()
     scribe.start()
@@ -176,14 +176,14 @@ def test_a_lost_answer_is_found(scribe, live, runtime, services, ann, settings, 
 def test_a_locked_database_delays_and_loses_nothing(scribe, live, runtime, services, caplog, monkeypatch):
     locked = threading.Event()
     locked.set()
-    written = chronicle.events_written
+    written = chronicle.ingest_events
 
     def busy(**named):
         if locked.is_set():
             raise OperationalError("database is locked")
         return written(**named)
 
-    monkeypatch.setattr(chronicle, "events_written", busy)
+    monkeypatch.setattr(chronicle, "ingest_events", busy)
     scribe.start()
     with caplog.at_level(logging.WARNING):
         for number in range(3):
@@ -195,7 +195,7 @@ def test_a_locked_database_delays_and_loses_nothing(scribe, live, runtime, servi
 
 @pytest.mark.django_db(transaction=True)
 def test_two_web_processes_write_the_same_and_nothing_twice_in_the_row(live, runtime, services):
-    both = [Scribe(runtime.name, Feeds()) for _ in range(2)]
+    both = [StationEventIngester(runtime.name, Feeds()) for _ in range(2)]
     for one in both:
         one.start()
     for number in range(20):
@@ -210,7 +210,7 @@ def test_two_web_processes_write_the_same_and_nothing_twice_in_the_row(live, run
 
 @pytest.mark.django_db(transaction=True)
 def test_a_chronicle_finds_stations_that_are_added_later(runtime, services):
-    made = Chronicle(Feeds())
+    made = EventIngest(Feeds())
     made.start()
     Station.objects.create(name=runtime.name, robot="agilex_piper")
     runtime.say("state", "hello")

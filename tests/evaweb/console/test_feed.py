@@ -7,10 +7,10 @@ import threading
 import pytest
 from django.conf import settings
 
-from evaweb.console.feed import EVENTS_KEPT, Feed, History, Link
+from evaweb.console.feed import EVENTS_KEPT, History, LinkState, StationFeed
 from runtime.ipc.session_state import SessionState
 from runtime.processes.coordinator.session.transitions import SessionEvent
-from tests.evaweb.stand_in import before_an_upgrade
+from tests.evaweb.stand_in import old_snapshot
 from tests.processes import PATIENCE_S
 
 
@@ -40,15 +40,15 @@ class Ear:
 
 @pytest.fixture
 def ear(runtime):
-    feed, listener = Feed(runtime.name), Ear()
-    feed.join(listener, pictures=True)
+    feed, listener = StationFeed(runtime.name), Ear()
+    feed.subscribe(listener, pictures=True)
     listener.feed = feed
     yield listener
-    feed.leave(listener)
+    feed.unsubscribe(listener)
 
 
 def test_everything_that_is_published_is_heard(ear, runtime):
-    ear.wait(lambda stream, content: (stream, content) == ("link", Link(True)))
+    ear.wait(lambda stream, content: (stream, content) == ("link", LinkState(True)))
     ear.wait(lambda stream, content: stream == "joints" and len(content["measured"]) == 14)
     ear.wait(lambda stream, content: stream == "camera/cam_high" and content.endswith(b"picture"))
     _, state = ear.wait(lambda stream, content: stream == "state")
@@ -56,7 +56,7 @@ def test_everything_that_is_published_is_heard(ear, runtime):
 
 
 def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(ear, runtime, monkeypatch):
-    before_an_upgrade(runtime, monkeypatch)
+    old_snapshot(runtime, monkeypatch)
     runtime.enter(SessionEvent.ESTOPPED)
     _, state = ear.wait(lambda stream, content: stream == "state" and content["state"] == "faulted")
     assert state["state_is"] == SessionState.FAULTED.meaning_dict()
@@ -65,12 +65,12 @@ def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(
 def test_events_are_complete_also_those_from_before(runtime):
     for number in range(5):
         runtime.say("old", str(number))
-    feed, ear = Feed(runtime.name), Ear()
-    feed.join(ear, pictures=False)
+    feed, ear = StationFeed(runtime.name), Ear()
+    feed.subscribe(ear, pictures=False)
     for number in range(100):
         runtime.say("new", str(number))
     ear.wait(lambda stream, content: stream == "events" and content.newest == 105)
-    feed.leave(ear)
+    feed.unsubscribe(ear)
     assert [row["number"] for row in feed.history.rows] == list(range(1, 106))
 
 
@@ -86,7 +86,7 @@ def test_a_restarted_runtime_is_found_and_its_events_begin_anew(ear, runtime):
 
 
 def test_a_dead_station_is_a_link_that_says_so(ear, runtime):
-    ear.wait(lambda stream, content: (stream, content) == ("link", Link(True)))
+    ear.wait(lambda stream, content: (stream, content) == ("link", LinkState(True)))
     runtime.mute = True
     _, link = ear.wait(
         lambda stream, content: stream == "link" and not content.ok and "sign" in content.reason
@@ -94,28 +94,28 @@ def test_a_dead_station_is_a_link_that_says_so(ear, runtime):
     assert link.reason.startswith(f"no sign of life from {runtime.name}")
     ear.forget()
     runtime.mute = False
-    ear.wait(lambda stream, content: (stream, content) == ("link", Link(True)))
+    ear.wait(lambda stream, content: (stream, content) == ("link", LinkState(True)))
 
 
 def test_a_station_that_was_never_started_is_a_link_that_says_so():
-    feed, ear = Feed("never-started"), Ear()
-    feed.join(ear, pictures=False)
+    feed, ear = StationFeed("never-started"), Ear()
+    feed.subscribe(ear, pictures=False)
     ear.wait(lambda stream, content: stream == "link" and "has to be started" in content.reason)
-    feed.leave(ear)
+    feed.unsubscribe(ear)
 
 
 @pytest.mark.parametrize("content", ["{}", "no json", '{"state": "nowhere"}', '{"state": "tcp://*:?"}'])
 def test_an_address_that_cannot_be_used_is_a_link_that_says_so_until_there_is_a_better_one(
     ear, runtime, content
 ):
-    ear.wait(lambda stream, content: (stream, content) == ("link", Link(True)))
+    ear.wait(lambda stream, content: (stream, content) == ("link", LinkState(True)))
     path = settings.DATA_DIR / "stations" / runtime.name / "endpoints" / "coordinator.json"
     good = path.read_text()
     path.write_text(content)
     ear.wait(lambda stream, content: stream == "link" and not content.ok and "yet" not in content.reason)
     ear.forget()
     path.write_text(good)
-    ear.wait(lambda stream, content: (stream, content) == ("link", Link(True)))
+    ear.wait(lambda stream, content: (stream, content) == ("link", LinkState(True)))
 
 
 def test_what_cannot_be_used_ends_no_feed(ear, runtime):
@@ -136,23 +136,23 @@ def test_who_joins_later_is_told_what_is_known_at_once(ear):
 
 
 def test_nothing_is_known_any_more_when_nobody_has_listened(runtime):
-    feed, ear = Feed(runtime.name), Ear()
-    feed.join(ear, pictures=False)
+    feed, ear = StationFeed(runtime.name), Ear()
+    feed.subscribe(ear, pictures=False)
     ear.wait(lambda stream, content: stream == "state")
-    feed.leave(ear)
+    feed.unsubscribe(ear)
     assert feed.state == {}
     assert not feed.link.ok
 
 
 def test_pictures_are_only_followed_while_somebody_wants_them(runtime):
-    feed, chronicle, page = Feed(runtime.name), Ear(), Ear()
-    feed.join(chronicle, pictures=False)
+    feed, chronicle, page = StationFeed(runtime.name), Ear(), Ear()
+    feed.subscribe(chronicle, pictures=False)
     assert feed._pictures is None
-    feed.join(page, pictures=True)
+    feed.subscribe(page, pictures=True)
     page.wait(lambda stream, content: stream == "camera/cam_high")
-    feed.leave(page)
+    feed.unsubscribe(page)
     assert feed._pictures is None
-    feed.leave(chronicle)
+    feed.unsubscribe(chronicle)
     assert feed._numbers is None
 
 

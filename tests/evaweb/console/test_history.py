@@ -8,12 +8,12 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.console.history import DAYS, histories
 from evaweb.episodes.models import Episode
 from tests.evaweb.trials import builders
 
-HIDDEN = Sight(checkpoints=frozenset({1}), names=frozenset({"pi0-secret"}))
+HIDDEN = Visibility(checkpoints=frozenset({1}), names=frozenset({"pi0-secret"}))
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_each_day_has_what_was_recorded_in_it(bench):
     recorded(bench, 2, "interrupted", policy={}, control={})
     recorded(bench, DAYS + 1)  # too long ago
     recorded(bench, status="recording")
-    (found,) = histories(EVERYTHING)
+    (found,) = histories(FULL_VISIBILITY)
     today, before = found.days[-1], found.days[-3]
     assert (today.runs, today.broken, today.minutes, today.latency_ms, today.missed_per_mille) == (
         2,

@@ -9,20 +9,20 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.console import home, stills
-from evaweb.console.feed import Link, feeds
+from evaweb.console.feed import LinkState, feeds
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict
 from evaweb.jobs.models import Job
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Lease, LeaseRequest
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.blind_lab import NAMES
 from tests.evaweb.trials import builders
-from tests.standing import standing
+from tests.standing import state_flags
 
 pytestmark = pytest.mark.django_db
 Usage = namedtuple("Usage", "total used free")
@@ -37,12 +37,12 @@ def _room(monkeypatch, settings, tmp_path):
 @pytest.fixture
 def bench(monkeypatch):
     made = builders.bench()
-    monkeypatch.setattr(feeds.of(made.station.name), "link", Link(True))
+    monkeypatch.setattr(feeds.get(made.station.name), "link", LinkState(True))
     return made
 
 
 def seen(user):
-    return home.now(user=user, sight=sight_of(user))
+    return home.now(user=user, sight=visibility_for_user(user))
 
 
 def texts(items):
@@ -57,7 +57,7 @@ def test_a_quiet_lab_says_nothing(bench):
 def test_what_an_operator_began_waits_for_that_operator_alone(bench):
     trial = bench.prepare()
     assert texts(seen(bench.operator).work) == [f"Trial {trial.pk}, block on plate, position 1: prepared"]
-    builders.over(trial)
+    builders.finished_trial(trial)
     item = seen(bench.operator).work[0]
     assert (item.address, item.go) == (f"/result/trials/{trial.pk}/", "Score it")
     assert texts(seen(builders.user("ben")).work) == ["1 episode is waiting for a review"]
@@ -83,13 +83,13 @@ def test_who_asks_for_my_station_is_said(bench):
     ],
 )
 def test_a_camera_that_is_lost_is_an_alarm(bench, monkeypatch, ages, lost):
-    monkeypatch.setattr(feeds.of("bench-1"), "state", {"link": {"ages": ages}})
+    monkeypatch.setattr(feeds.get("bench-1"), "state", {"link": {"ages": ages}})
     assert texts(seen(bench.operator).alarms) == lost
 
 
 def test_alarms_are_said_until_they_are_over(bench, monkeypatch):
     long_ago = timezone.now() - timedelta(days=40)
-    monkeypatch.setattr(feeds.of("bench-1"), "link", Link(False, "bench-1 is not running"))
+    monkeypatch.setattr(feeds.get("bench-1"), "link", LinkState(False, "bench-1 is not running"))
     monkeypatch.setattr(home.shutil, "disk_usage", lambda path: Usage(1e12, 9.5e11, 5e10))
     Episode.objects.create(station=bench.station, status="finished", damage=[{"file": "rows.arrow"}])
     Episode.objects.update(created_at=long_ago)
@@ -110,10 +110,10 @@ def test_alarms_are_said_until_they_are_over(bench, monkeypatch):
 
 
 def test_a_station_that_needs_somebody_is_said_without_why(bench, monkeypatch):
-    state = {**standing("faulted"), "reason": NAMES[0]}
-    monkeypatch.setattr(feeds.of("bench-1"), "state", state)
+    state = {**state_flags("faulted"), "reason": NAMES[0]}
+    monkeypatch.setattr(feeds.get("bench-1"), "state", state)
     assert texts(seen(bench.operator).alarms) == ["bench-1 is faulted"]
-    monkeypatch.setattr(feeds.of("bench-1"), "state", standing("ready"))
+    monkeypatch.setattr(feeds.get("bench-1"), "state", state_flags("ready"))
     assert seen(bench.operator).alarms == []
 
 
@@ -122,8 +122,8 @@ def test_of_a_blind_plan_home_says_how_far_it_is_and_no_more(bench):
     plan = Plan.objects.create(name="blocks", title="Blocks", owner=olga)
     plan.checkpoints.set(Checkpoint.objects.create(name=name, policy={"url": "ws://h:1"}) for name in NAMES)
     plan.positions.set(bench.scene.positions.all())
-    plan = plan_freeze(user=olga, plan=plan)
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    plan = freeze_plan(user=olga, plan=plan)
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
     Job.objects.create(kind="quality", key="quality:1", status="running", progress=f"{NAMES[0]} 2 of 3")
     shown = seen(bench.operator)
     assert [(one.row.foreseen, one.evidence) for one in shown.plans] == [(4, "")]
@@ -140,9 +140,11 @@ def test_evidence_is_linked_where_it_may_be_seen(bench):
     plan = Plan.objects.create(name="open", title="Open", owner=bench.operator, blind=False)
     plan.checkpoints.set([bench.checkpoint])
     plan.positions.set(bench.scene.positions.all())
-    plan = plan_freeze(user=bench.operator, plan=plan)
+    plan = freeze_plan(user=bench.operator, plan=plan)
     assert [one.evidence for one in seen(bench.operator).plans] == [""]
-    trial = builders.over(hand_out(user=bench.operator, station=bench.station, plan=plan).trial)
+    trial = builders.finished_trial(
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    )
     Trial.objects.filter(pk=trial.pk).update(status="scored")
     assert [one.evidence for one in seen(bench.operator).plans] == ["/result/plans/open/1/evidence/"]
 
@@ -168,7 +170,7 @@ def test_a_still_is_asked_for_once_for_all_viewers(bench, monkeypatch):
             raise Conflict("no picture from cam_high")
         return {cameras[0]: b"jpeg"}
 
-    monkeypatch.setattr(stills.pictures, "now", now)
+    monkeypatch.setattr(stills.pictures, "current_images", now)
     monkeypatch.setattr(stills, "_stills", {})
     browser = Client()
     browser.force_login(bench.operator)
@@ -178,7 +180,7 @@ def test_a_still_is_asked_for_once_for_all_viewers(bench, monkeypatch):
     assert len(asked) == 1
     monkeypatch.setattr(stills, "KEPT_S", -1)
     assert browser.get("/stations/bench-1/still").status_code == 204
-    monkeypatch.setattr(feeds.of("bench-1"), "link", Link(False, "gone"))
+    monkeypatch.setattr(feeds.get("bench-1"), "link", LinkState(False, "gone"))
     assert browser.get("/stations/bench-1/still").status_code == 204
     assert len(asked) == 2
     assert browser.get("/stations/nowhere/still").status_code == 404

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from evaweb.blinding import EVERYTHING
+from evaweb.blinding import FULL_VISIBILITY
 from evaweb.console import hub as hubs
 
 
@@ -16,7 +16,7 @@ def test_viewers_of_the_same_are_sent_the_very_same_bytes(live, ann):
         loop = asyncio.get_running_loop()
         room = hubs.LiveHub(loop).room(live.name, live.robot)
         got = [[], []]
-        boxes = [room.join(sent.append, ann, EVERYTHING) for sent in got]
+        boxes = [room.join(sent.append, ann, FULL_VISIBILITY) for sent in got]
         for box in boxes:
             room.watch(box, ["state"])
         while not all(any(isinstance(message, bytes) for message in sent) for sent in got):

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from evaweb.console import parts
-from evaweb.console.feed import History, Link
+from evaweb.console.feed import History, LinkState
 from evaweb.console.mailbox import CREDITS, EVENTS_AT_ONCE, Mailbox
 
 
@@ -41,7 +41,7 @@ class Page:
 
 
 def part(stream, body):
-    return parts.Part(stream, (), body, 0.0)
+    return parts.EncodedPart(stream, (), body, 0.0)
 
 
 def history(count, boot="b"):
@@ -139,7 +139,7 @@ def test_a_page_that_is_not_heard_gets_a_bounded_number_of_texts_and_then_the_re
         page.flush()
     held_back = len(page.texts)
     assert held_back < 50
-    page.box.heard()
+    page.box.mark_read()
     page.flush()
     assert page.events == list(range(1, 200))
     assert len(page.texts) == held_back + 1
@@ -155,8 +155,8 @@ def test_many_events_come_in_messages_of_a_bearable_size():
 
 def test_the_newest_word_on_the_link_and_all_changes_arrive():
     page = Page()
-    page.box.put_link(Link(False, "away"))
-    page.box.put_link(Link(True))
+    page.box.put_link(LinkState(False, "away"))
+    page.box.put_link(LinkState(True))
     page.box.put_changed(["trial"])
     page.box.put_changed(["lease", "trial"])
     page.flush()

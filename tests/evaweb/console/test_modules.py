@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaweb.console import parts
-from tests.standing import standing
+from tests.standing import state_flags
 
 MODULES = Path(__file__).parents[3] / "static" / "console"
 NODE = shutil.which("node")
@@ -45,12 +45,12 @@ def run(module: str, body: str, given: Any = None) -> Any:
 def test_a_frame_of_the_server_is_read_with_every_number_and_picture() -> None:
     rows = np.arange(14, dtype=np.float32) / 8
     poses = np.arange(2 * 3 * 16, dtype=np.float32).reshape(2, 3, 16)
-    frame = parts.frame(
+    frame = parts.build_frame(
         [
-            parts.facts("state", {"state": "running", "nothing": float("nan")}, 1.0),
-            parts.numbers("joints", {"engaged": True}, {"measured": rows, "commanded": -rows}, 1.0),
-            parts.picture("camera/cam_high", b"\xff\xd8jpeg", 1.0),
-            parts.array("poses", poses, 1.0),
+            parts.encode_facts("state", {"state": "running", "nothing": float("nan")}, 1.0),
+            parts.encode_numbers("joints", {"engaged": True}, {"measured": rows, "commanded": -rows}, 1.0),
+            parts.encode_picture("camera/cam_high", b"\xff\xd8jpeg", 1.0),
+            parts.encode_array("poses", poses, 1.0),
         ],
         7,
         1.25,
@@ -350,7 +350,7 @@ def test_of_nothing_there_is_no_quantile() -> None:
     ],
 )
 def test_the_step_to_do_now_follows_trial_and_state(panel: dict[str, str], state: str, step: str) -> None:
-    assert run("trial/steps.js", "return m.current(given[0], given[1])", [panel, standing(state)]) == step
+    assert run("trial/steps.js", "return m.current(given[0], given[1])", [panel, state_flags(state)]) == step
 
 
 def test_an_identity_is_a_random_uuid_of_version_four() -> None:
@@ -501,9 +501,9 @@ def test_a_state_asks_for_the_robots_picture_only_where_it_says_that_there_is_no
 
 def test_an_event_is_said_in_words_with_its_weight() -> None:
     events = [
-        {"kind": "state", "text": "setting_up -> ready: 50 rows", "data": standing("ready")},
-        {"kind": "state", "text": "running -> holding: halted", "data": standing("holding")},
-        {"kind": "state", "text": "running -> faulted: e-stop", "data": standing("faulted")},
+        {"kind": "state", "text": "setting_up -> ready: 50 rows", "data": state_flags("ready")},
+        {"kind": "state", "text": "running -> holding: halted", "data": state_flags("holding")},
+        {"kind": "state", "text": "running -> faulted: e-stop", "data": state_flags("faulted")},
         {"kind": "command", "text": "run by ann: accepted"},
         {"kind": "command", "text": "run by bob: refused, web:ann:6b9c-1 holds the lease"},
         {"kind": "source_frames_lost", "text": "source: frames lost (3 so far)"},

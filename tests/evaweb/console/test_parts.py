@@ -18,12 +18,12 @@ NAMES = st.text(min_size=1, max_size=6)
 def test_a_frame_of_parts_is_read_like_one_encoded_at_once(values, poses, jpeg, said):
     words = {"said": said, "age": float("nan")}
     made = [
-        parts.facts("state", words, 1.0),
-        parts.numbers("joints", words, values, 1.0),
-        parts.array("poses", poses, 1.0),
-        parts.picture("camera/a", jpeg, 1.0),
+        parts.encode_facts("state", words, 1.0),
+        parts.encode_numbers("joints", words, values, 1.0),
+        parts.encode_array("poses", poses, 1.0),
+        parts.encode_picture("camera/a", jpeg, 1.0),
     ]
-    found = decode(parts.frame(made, number=7, now=1.25))
+    found = decode(parts.build_frame(made, number=7, now=1.25))
     wanted = decode(
         encode(
             {
@@ -41,10 +41,10 @@ def test_a_frame_of_parts_is_read_like_one_encoded_at_once(values, poses, jpeg, 
 
 
 def test_the_same_part_serves_frames_in_which_it_stands_elsewhere():
-    picture = parts.picture("camera/a", b"12345", 1.0)
-    joints = parts.numbers("joints", {}, {"measured": np.arange(3, dtype=np.float32)}, 1.0)
-    first = decode(parts.frame([picture, joints], 1, 1.0))
-    second = decode(parts.frame([joints, picture], 2, 2.0))
+    picture = parts.encode_picture("camera/a", b"12345", 1.0)
+    joints = parts.encode_numbers("joints", {}, {"measured": np.arange(3, dtype=np.float32)}, 1.0)
+    first = decode(parts.build_frame([picture, joints], 1, 1.0))
+    second = decode(parts.build_frame([joints, picture], 2, 2.0))
     for frame in (first, second):
         assert frame.data("camera/a") == b"12345"
         assert frame.array("joints", "measured").tolist() == [0, 1, 2]
@@ -52,4 +52,4 @@ def test_the_same_part_serves_frames_in_which_it_stands_elsewhere():
 
 
 def test_an_empty_frame_is_a_frame():
-    assert decode(parts.frame([], 1, 0.5)).header == {"frame": 1, "t": 0.5, "streams": {}}
+    assert decode(parts.build_frame([], 1, 0.5)).header == {"frame": 1, "t": 0.5, "streams": {}}

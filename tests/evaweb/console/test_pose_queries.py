@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from evaweb.console import pose_queries as aims
-from evaweb.console.pose_queries import Aims, aimed
+from evaweb.console.pose_queries import AimQueries, query_aim
 from evaweb.console.requests import Aim
 from evaweb.roles import Role
 from evaweb.stations.models import Station
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.stations.robot_geometry import drawn_robot
 from runtime.ipc.messages import Ack
 from tests.processes import PATIENCE_S
 
 Q = [0.1] * 14
-PIPER = looks_of("agilex_piper")
+PIPER = drawn_robot("agilex_piper")
 
 
 def test_a_target_comes_with_where_every_part_would_be(live, runtime):
     runtime.aim_says = Ack(
         "", "done", data={"joints": np.array(Q, np.float32), "reached": True, "distance": 0.5}
     )
-    found = aimed(live.name, "ann", {"pose": "home"}, PIPER)
+    found = query_aim(live.name, "ann", {"pose": "home"}, PIPER)
     assert (found["ok"], found["reached"], found["distance"]) == (True, True, 0.5)
     assert np.allclose(found["joints"], Q)
     wanted = PIPER.poses(np.array(Q)).ravel()
@@ -37,7 +37,7 @@ def test_a_target_comes_with_where_every_part_would_be(live, runtime):
 
 def test_a_refusal_has_its_sentence_and_no_parts(live, runtime):
     runtime.aim_says = Ack("", "refused", "pose = 'x' is unknown; web:bob:p1 holds the lease")
-    assert aimed(live.name, "ann", {"pose": "x"}, PIPER) == {
+    assert query_aim(live.name, "ann", {"pose": "x"}, PIPER) == {
         "ok": False,
         "reason": "pose = 'x' is unknown; bob holds the lease",
         "links": [],
@@ -47,23 +47,23 @@ def test_a_refusal_has_its_sentence_and_no_parts(live, runtime):
 @pytest.mark.parametrize("joints", [None, [0.0] * 3, [None] * 14])
 def test_a_target_that_cannot_be_drawn_has_no_parts(live, runtime, joints):
     runtime.aim_says = Ack("", "done", data={"joints": joints})
-    assert aimed(live.name, "ann", {}, PIPER)["links"] == []
+    assert query_aim(live.name, "ann", {}, PIPER)["links"] == []
 
 
 def test_a_robot_that_is_not_drawn_has_no_parts(live, runtime):
     runtime.aim_says = Ack("", "done", data={"joints": Q})
-    assert aimed(live.name, "ann", {}, None)["links"] == []
+    assert query_aim(live.name, "ann", {}, None)["links"] == []
 
 
 def test_a_station_that_is_away_is_a_reason():
-    found = aimed("bench-nowhere", "ann", {}, PIPER)
+    found = query_aim("bench-nowhere", "ann", {}, PIPER)
     reason = "bench-nowhere is not running: its runtime has to be started"
     sentence = {"id": "stations.runtime_client.not_running", "arguments": {"name": "bench-nowhere"}}
     assert found == {"ok": False, "reason": reason, "sentence": sentence}
 
 
 def test_what_cannot_be_sent_never_reaches_the_station(live, runtime):
-    found = aimed(live.name, "ann", {"joints": [2**70]}, PIPER)
+    found = query_aim(live.name, "ann", {"joints": [2**70]}, PIPER)
     assert (found["ok"], runtime.aims) == (False, [])
     assert "cannot be sent" in found["reason"]
 
@@ -74,8 +74,8 @@ class Page:
     def __init__(self, monkeypatch, role=Role.OPERATOR):
         self.told, self.asked = [], []
         self.begun, self.go = threading.Event(), threading.Event()
-        self.aims = Aims(Station(name="bench-1"), "ann", role, self.told.append, lambda: PIPER)
-        monkeypatch.setattr(aims, "aimed", self._aimed)
+        self.aims = AimQueries(Station(name="bench-1"), "ann", role, self.told.append, lambda: PIPER)
+        monkeypatch.setattr(aims, "query_aim", self._aimed)
 
     def _aimed(self, station, username, args, looks):
         assert (station, looks) == ("bench-1", PIPER)

@@ -6,7 +6,7 @@ import numpy as np
 
 from evaweb.binary_frames import decode
 from evaweb.console import parts
-from evaweb.console.recent import SAMPLES, Recent
+from evaweb.console.recent import SAMPLES, RecentSamples
 
 NOTHING = np.full(3, np.nan, np.float32)
 
@@ -17,19 +17,19 @@ def row(value):
 
 def sampled(count, dim=3, recent=None, **words):
     """The stream after `count` samples: sample k is measured at k, one second after the one before."""
-    recent = recent or Recent()
+    recent = recent or RecentSamples()
     for number in range(count):
         vectors = {
             "measured": np.full(dim, number, np.float32),
             "commanded": np.full(dim, -number, np.float32),
         }
         made = recent.with_one_more(vectors, {"step": number, **words}, float(number))
-    return decode(parts.frame([made], 1, 0.0))
+    return decode(parts.build_frame([made], 1, 0.0))
 
 
 def one(vectors, **words):
-    made = Recent().with_one_more({"measured": row(1), "commanded": row(2)} | vectors, words, 0.0)
-    return decode(parts.frame([made], 1, 0.0))
+    made = RecentSamples().add_sample({"measured": row(1), "commanded": row(2)} | vectors, words, 0.0)
+    return decode(parts.build_frame([made], 1, 0.0))
 
 
 def facts(frame):
@@ -44,7 +44,7 @@ def test_the_newest_samples_stand_in_columns_the_oldest_first():
 
 
 def test_two_parts_in_a_row_leave_no_sample_out():
-    recent = Recent()
+    recent = RecentSamples()
     first = sampled(SAMPLES, recent=recent)
     second = sampled(SAMPLES - 1, recent=recent)
     steps = facts(first)["step"] + facts(second)["step"][1:]
@@ -87,7 +87,7 @@ def test_raw_and_planned_are_missing_where_they_were_not_said():
 
 
 def test_another_robot_begins_anew():
-    recent = Recent()
+    recent = RecentSamples()
     sampled(4, recent=recent)
     frame = sampled(2, dim=5, recent=recent)
     assert frame.array("recent", "measured").shape == (2, 5)

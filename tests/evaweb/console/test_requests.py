@@ -18,7 +18,7 @@ from evaweb.console.requests import (
     Renew,
     Stop,
     Watch,
-    may_stop,
+    looks_like_stop,
     parse,
 )
 from tests import presses
@@ -84,7 +84,7 @@ def test_whatever_is_wrong_with_a_press_it_is_one(name):
     pressed = parse(text, CAMERAS)
     assert isinstance(pressed, EStop)
     assert 0 < len(pressed.why) <= 240
-    assert may_stop(text), "also from a page that floods"
+    assert looks_like_stop(text), "also from a page that floods"
 
 
 @given(presses.json_texts("type"))

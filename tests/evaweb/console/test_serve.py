@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 
 from evaweb.console.server import _address
-from evaweb.listening import PortTaken, listen
+from evaweb.listening import PortTaken, open_listener
 from tests import migrated
 from tests.processes import PATIENCE_S, eventually
 
@@ -55,17 +55,17 @@ def test_a_taken_port_is_an_error_that_names_the_option():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(PortTaken, match=rf"cannot listen on 127.0.0.1:{port}: .* with --host, --port"):
-            listen("127.0.0.1", port)
+            open_listener("127.0.0.1", port)
 
 
 def test_an_address_of_another_machine_is_an_error_too():
     with pytest.raises(PortTaken, match=r"cannot listen on 192\.0\.2\.1:0"):
-        listen("192.0.2.1", 0)
+        open_listener("192.0.2.1", 0)
 
 
 @pytest.mark.parametrize(("host", "shown"), [("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1")])
 def test_what_is_announced_can_be_opened(host, shown):
-    with listen(host, 0) as listener:
+    with open_listener(host, 0) as listener:
         address = _address(listener)
         assert address["url"] == f"http://{shown}:{address['port']}"
         socket.create_connection((shown, address["port"])).close()
@@ -215,10 +215,10 @@ def _template():
 
 _MADE = """
 from django.contrib.auth.models import User
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.stations.models import Station
 Station.objects.create(name="bench", robot="agilex_piper")
-print(token_create(user=User.objects.create(username="program"), name="tests"))
+print(create_token(user=User.objects.create(username="program"), name="tests"))
 """
 
 

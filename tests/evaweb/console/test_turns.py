@@ -9,10 +9,10 @@ import pytest
 from daphne.ws_protocol import WebSocketProtocol
 from twisted.internet.abstract import FileDescriptor
 
-from evaweb.console.quota import AT_ONCE, Quota
+from evaweb.console.quota import AT_ONCE, MessageQuota
 from evaweb.console.reading import AHEAD, STALLED_S, until_read
-from evaweb.console.sockets import _MOST_PARTS, PING, CountedSocket, unsent
-from evaweb.console.turns import Turns
+from evaweb.console.sockets import _MOST_PARTS, PING, LimitedWebSocket, unsent
+from evaweb.console.turns import TurnScheduler
 
 
 @pytest.fixture
@@ -29,9 +29,9 @@ def loop():
 
 
 def test_a_turn_begins_so_much_and_the_rest_waits_in_order(loop):
-    turns, done = Turns(loop.soon, most=2), []
+    turns, done = TurnScheduler(loop.soon, most=2), []
     for number in range(5):
-        turns.take(lambda number=number: done.append(number))
+        turns.submit(lambda number=number: done.append(number))
     assert (done, len(loop.planned)) == ([], 1)
     for expected in ([0, 1], [0, 1, 2, 3], [0, 1, 2, 3, 4]):
         loop.turn()
@@ -40,14 +40,14 @@ def test_a_turn_begins_so_much_and_the_rest_waits_in_order(loop):
 
 
 def test_work_that_fails_or_brings_more_keeps_no_other_waiting(loop):
-    turns, done = Turns(loop.soon, most=1), []
+    turns, done = TurnScheduler(loop.soon, most=1), []
 
     def fails():
-        turns.take(lambda: done.append("more"))
+        turns.submit(lambda: done.append("more"))
         raise OSError("it failed")
 
-    turns.take(fails)
-    turns.take(lambda: done.append("next"))
+    turns.submit(fails)
+    turns.submit(lambda: done.append("next"))
     with pytest.raises(OSError, match="it failed"):
         loop.turn()
     loop.turn()
@@ -68,8 +68,8 @@ def socket(monkeypatch):
         "evaweb.console.sockets.WebSocketProtocol.dropConnection",
         lambda self, abort: self.cut.append(self.wasNotCleanReason),
     )
-    made = CountedSocket()
-    made.heard, made.cut, made._parts, made._quota = [], [], 0, Quota(lambda: 0.0)
+    made = LimitedWebSocket()
+    made.heard, made.cut, made._parts, made._quota = [], [], 0, MessageQuota(lambda: 0.0)
     return made
 
 

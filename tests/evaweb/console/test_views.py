@@ -15,7 +15,7 @@ from django.test.utils import CaptureQueriesContext
 from django.urls import reverse
 from django.utils import timezone
 
-from evaweb.blinding import EVERYTHING
+from evaweb.blinding import FULL_VISIBILITY
 from evaweb.console import selectors
 from evaweb.episodes.models import Episode
 from evaweb.roles import Role
@@ -472,13 +472,13 @@ def test_a_trial_is_set_up_by_the_last_set_up_of_its_station_alone(
 ) -> None:
     own = Command.objects.create(station=station, user=ada, kind="setup", status="accepted")
     make_trial(station, ada, setup=own.pk)
-    assert selectors.panel(station=station, user=ada, sight=EVERYTHING).set_up
+    assert selectors.eval_panel(station=station, user=ada, sight=FULL_VISIBILITY).set_up
 
     refused = Command.objects.create(station=station, user=ada, kind="setup", status="refused")
-    assert selectors.panel(station=station, user=ada, sight=EVERYTHING).set_up, refused
+    assert selectors.eval_panel(station=station, user=ada, sight=FULL_VISIBILITY).set_up, refused
 
     Command.objects.create(station=station, user=ada, kind="setup", status="unknown")
-    assert not selectors.panel(station=station, user=ada, sight=EVERYTHING).set_up
+    assert not selectors.eval_panel(station=station, user=ada, sight=FULL_VISIBILITY).set_up
 
 
 @pytest.mark.parametrize(
@@ -578,7 +578,7 @@ def test_the_next_choice_begins_where_the_last_trial_leads(
 ) -> None:
     make_trial(station, ada, status)
 
-    found = selectors.panel(station=station, user=ada, sight=EVERYTHING)
+    found = selectors.eval_panel(station=station, user=ada, sight=FULL_VISIBILITY)
 
     assert found.position is not None
     assert found.position.number == number

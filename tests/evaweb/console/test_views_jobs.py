@@ -4,7 +4,7 @@ import pytest
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.blinding import HIDDEN, Sight
+from evaweb.blinding import HIDDEN, Visibility
 from evaweb.console.views_jobs import KINDS, row_of
 from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell, kinds, services
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.django_db
 
 @pytest.fixture
 def page(monkeypatch):
-    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     browser = Client()
     browser.force_login(builders.user("ann"))
     return browser
@@ -99,6 +99,6 @@ def test_who_only_looks_is_offered_nothing(episode):
 
 def test_what_may_tell_which_checkpoint_it_is_about_is_hidden(episode):
     job = preview(episode, status="running", progress="asking the server of pi0-secret 2 of 3")
-    row = row_of(job, Sight(checkpoints=frozenset({1}), names=frozenset({"pi0-secret"})), served())
+    row = row_of(job, Visibility(checkpoints=frozenset({1}), names=frozenset({"pi0-secret"})), served())
     assert (row.said, row.pace.fraction, row.minutes_left) == (HIDDEN, None, "")
     services.cancel(user=builders.user("ann"), job=job)

@@ -19,10 +19,10 @@ from evaweb.collect.models import CollectSession
 from evaweb.collect.record import SESSIONS
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder, preview_folder
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.exchange import exported
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.exchange import export_toml
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.results.ratings import judging
 from evaweb.reviews import services as reviews
 from evaweb.trials import services, voids
@@ -104,12 +104,12 @@ def _lived(lab):  # noqa: F811
     lab.score(corrected, True, True, True, reason="seen on the video")
     voided = lab.run()
     lab.score(voided, True, False, False)
-    voids.trial_void(user=ann, trial=voided, reason="a hand was in the picture")
+    voids.void_trial(user=ann, trial=voided, reason="a hand was in the picture")
     lab.bench.unrecorded(success=False)
     lab.run(position=2, seed=7)  # waits for its score
     waiting = trial_open(station)
     assert waiting is not None
-    voids.trial_void(user=ann, trial=waiting, reason="the lamp was off")
+    voids.void_trial(user=ann, trial=waiting, reason="the lamp was off")
     lab.run(smoke=True)
     _reviewed(first.episode, ann)
     text = _planned(lab)
@@ -119,12 +119,12 @@ def _lived(lab):  # noqa: F811
 
 def _reviewed(episode, ann):
     bob = builders.user("bob")
-    reviews.review_add(user=ann, episode=episode, verdict="pass")
-    reviews.review_add(user=bob, episode=episode, verdict="fail", note="it slips ⟂")
-    held = reviews.segment_put(user=ann, episode=episode, first=0, last=3, label="reach", milestone="held")
-    gone = reviews.segment_put(user=bob, episode=episode, first=4, last=5, label="wrong")
-    reviews.segment_put(user=ann, episode=episode, first=1, last=4, label="reach", segment=held.uuid)
-    reviews.segment_remove(user=bob, episode=episode, segment=gone.uuid)
+    reviews.add_review(user=ann, episode=episode, verdict="pass")
+    reviews.add_review(user=bob, episode=episode, verdict="fail", note="it slips ⟂")
+    held = reviews.save_segment(user=ann, episode=episode, first=0, last=3, label="reach", milestone="held")
+    gone = reviews.save_segment(user=bob, episode=episode, first=4, last=5, label="wrong")
+    reviews.save_segment(user=ann, episode=episode, first=1, last=4, label="reach", segment=held.uuid)
+    reviews.remove_segment(user=bob, episode=episode, segment=gone.uuid)
 
 
 def _planned(lab):  # noqa: F811
@@ -146,16 +146,16 @@ def _planned(lab):  # noqa: F811
     )
     plan.checkpoints.set([lab.bench.checkpoint, other])
     plan.positions.set(lab.bench.scene.positions.all())
-    text = exported(plans=[plan])
-    plan = plan_freeze(user=owner, plan=plan)
+    text = export_toml(plans=[plan])
+    plan = freeze_plan(user=owner, plan=plan)
     for number in range(8):
-        trial = hand_out(user=lab.bench.operator, station=lab.bench.station, plan=plan).trial
-        builders.over(trial, 8.0 + number, cameras=["top"], uuid=UUID(int=100 + number))
+        trial = allocate_trial(user=lab.bench.operator, station=lab.bench.station, plan=plan).trial
+        builders.finished_trial(trial, 8.0 + number, cameras=["top"], uuid=UUID(int=100 + number))
         preview_folder(trial.episode_id).mkdir(parents=True)
         ok = number % 3 != 0
         times = dict(zip(lab.bench.ticks(1, 1, 1), (2.0, 3.25, None), strict=True))
         ticks = lab.bench.ticks(True, True, ok)
-        services.trial_score(
+        services.score_trial(
             user=lab.bench.operator,
             trial=trial,
             milestones=ticks,
@@ -163,20 +163,20 @@ def _planned(lab):  # noqa: F811
             failure="" if ok else "=dropped",
         )
     for reached in (True, False):
-        handout = judging.to_rate(rater).found
+        handout = judging.next_to_rate(rater).found
         assert handout is not None
         ticks = lab.bench.ticks(True, reached, reached)
-        judging.rate(
+        judging.save_rating(
             user=rater,
             plan=plan,
             code=handout.code,
             milestones=ticks,
             failure="" if reached else "wölbt sich",
         )
-    pair = judging.to_prefer(rater).found
+    pair = judging.next_to_compare(rater).found
     assert pair is not None
     codes = {"first": pair.first.code, "second": pair.second.code}
-    judging.prefer(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
+    judging.save_preference(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
     return text
 
 
@@ -184,17 +184,17 @@ def _collected(lab, recorded):  # noqa: F811
     """A session that was closed and resumed, with two demonstrations; another that lost its file."""
     station, ann = lab.bench.station, lab.bench.operator
     manifest = json.loads((recorded / "manifest.json").read_text())
-    at = builders.Wire()
+    at = builders.FakeConnection()
     at.snapshot = {**at.snapshot, "collect": collects(), "lease": {"holder": "", "epoch": 0}}
     with ExitStack() as stack:
-        stack.enter_context(patch("evaweb.collect.services.wire_to", lambda name: at))
-        session = collecting.session_begin(user=ann, station=station, task="stack the cups ⟂", target=20)
-        collecting.session_target(user=ann, session=session, target=7)
-        collecting.session_close(user=ann, session=session)
-        collecting.session_resume(user=ann, session=session)
-        collecting.session_close(user=ann, session=session)
-        without = collecting.session_begin(user=ann, station=station, task="pour", dataset="tea")
-        collecting.session_close(user=ann, session=without)
+        stack.enter_context(patch("evaweb.collect.services.connection_to", lambda name: at))
+        session = collecting.open_session(user=ann, station=station, task="stack the cups ⟂", target=20)
+        collecting.set_session_target(user=ann, session=session, target=7)
+        collecting.close_session(user=ann, session=session)
+        collecting.resume_session(user=ann, session=session)
+        collecting.close_session(user=ann, session=session)
+        without = collecting.open_session(user=ann, station=station, task="pour", dataset="tea")
+        collecting.close_session(user=ann, session=without)
     SESSIONS.path(without.pk).unlink()
     results: list[tuple[CollectSession, Result | None]] = [
         (session, "success"),
@@ -209,7 +209,7 @@ def _collected(lab, recorded):  # noqa: F811
         named["session"] = {"uuid": str(of.pk), "dataset": of.dataset}
         (folder / "manifest.json").write_text(json.dumps(manifest | named))
         _sealed(folder)
-        episodes.episode_closed(station=station, data={"uuid": uuid, "status": "finished"})
+        episodes.record_closed(station=station, data={"uuid": uuid, "status": "finished"})
         if result:
             append_label(recorded.parent.parent, uuid, Label(1_700_000_000.0, "ann", result, note="n"))
 

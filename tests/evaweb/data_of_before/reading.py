@@ -9,12 +9,12 @@ from pathlib import Path
 from django.core.serializers.json import DjangoJSONEncoder
 from django.test import Client
 
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs import doorbell
-from evaweb.plans.exchange import imported
+from evaweb.plans.exchange import import_file
 from evaweb.plans.models import Plan
 from evaweb.results.models import Preference, Rating
 from evaweb.reviews.models import Review, Segment, Standing
@@ -51,10 +51,10 @@ NAMES = {
 
 def restored(monkeypatch, settings, folder):
     """The report of a lab that has lost its database and finds this folder, and its plans in a file."""
-    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     settings.DATA_DIR = folder / "data"
     shutil.copytree(HERE / "disk", settings.DATA_DIR)
-    imported(user=builders.user("adam", "admin"), text=(HERE / "lab.toml").read_text("utf-8"))
+    import_file(user=builders.user("adam", "admin"), text=(HERE / "lab.toml").read_text("utf-8"))
     return reconcile()
 
 
@@ -67,7 +67,7 @@ def rows():
 
 def answers():
     """What the API says of the trials: the list, each of them, and the download."""
-    token = token_create(user=builders.user("vic", "viewer"), name="tests")
+    token = create_token(user=builders.user("vic", "viewer"), name="tests")
 
     def get(path, **query):
         return Client().get(f"/api/v1/{path}", query, headers={"Authorization": f"Bearer {token}"})

@@ -21,7 +21,7 @@ Foreign = Callable[..., Path]
 def data(settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, db: None) -> Path:
     """The data folder of this test; no broker hears of its jobs."""
     settings.DATA_DIR = tmp_path
-    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     return tmp_path
 
 

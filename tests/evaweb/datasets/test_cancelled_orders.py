@@ -27,8 +27,8 @@ def root(data: Path) -> User:
 
 
 def ordered(root: User, **given: Any) -> Job:
-    job = orders.asked(user=root, given=given)
-    services.work("cpu")
+    job = orders.submit_order(user=root, given=given)
+    services.run_queue("cpu")
     job.refresh_from_db()
     return job
 
@@ -37,11 +37,11 @@ def test_what_only_administrators_order_only_they_ask_for_again(
     foreign: Foreign, root: User, client: Client
 ) -> None:
     foreign("cups", version="v3.0")
-    job = orders.asked(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0]})
+    job = orders.submit_order(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0]})
     services.cancel(user=root, job=job)
     client.force_login(person("ann", "operator"))
     client.post("/jobs/repeat", {"job": job.pk})
-    assert services.work("cpu") == 0
+    assert services.run_queue("cpu") == 0
     assert overview("datasets/cups").episodes == 3
 
 

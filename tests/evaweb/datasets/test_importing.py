@@ -18,18 +18,23 @@ from django.urls import reverse
 
 import robots
 from evaweb.binary_frames import decode
-from evaweb.datasets.importing import imported
+from evaweb.datasets.importing import import_dataset
 from evaweb.datasets.job_kinds import dataset as run_order
-from evaweb.datasets.on_robot import recorded_at
+from evaweb.datasets.on_robot import playable_episode
 from evaweb.episodes.job_kinds import preview, publish_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
-from evaweb.jobs.kinds import Work
+from evaweb.jobs.kinds import JobContext
 from evaweb.jobs.models import Job
-from evaweb.reviews.job_kinds import look_for_outdated, look_for_unchecked, quality, sides
+from evaweb.reviews.job_kinds import (
+    find_outdated_sidecars,
+    find_unchecked_episodes,
+    quality,
+    write_sidecars_job,
+)
 from evaweb.reviews.models import Standing
 from evaweb.reviews.selectors import report_get
-from evaweb.reviews.services import review_add, segment_put
+from evaweb.reviews.services import add_review, save_segment
 from evaweb.stations.models import Station
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError, RecordingError
@@ -48,8 +53,8 @@ Foreign = Callable[..., Path]
 SAMPLE = os.environ.get("EVA_SAMPLE_EPISODE")
 
 
-def silently(kind: Callable[[Work], Any], uuid: object) -> Any:
-    return kind(Work({"uuid": str(uuid)}, lambda _: None))
+def silently(kind: Callable[[JobContext], Any], uuid: object) -> Any:
+    return kind(JobContext({"uuid": str(uuid)}, lambda _: None))
 
 
 def theirs(tmp_path: Path, **plan: Any) -> Path:
@@ -64,7 +69,7 @@ def test_episodes_of_any_version_are_those_of_the_lab_and_of_its_dataset(
     data: Path, tmp_path: Path, version: str
 ) -> None:
     source = theirs(tmp_path, version=version)
-    done = imported(source)
+    done = import_dataset(source)
     assert (done.dataset, done.made, done.problems) == ("datasets/cups", 2, ())
     second = Episode.objects.get(uuid=done.episodes[1])
     assert (second.status, second.kind, second.frames, second.fps) == (
@@ -80,13 +85,13 @@ def test_episodes_of_any_version_are_those_of_the_lab_and_of_its_dataset(
     for index in (0, 1):
         assert rows(data / "datasets" / "cups", index) == rows(source, index)
 
-    again = imported(source)
+    again = import_dataset(source)
     assert (again.episodes, again.made) == (done.episodes, 0)
     assert reconcile().problems == ()
 
 
 def test_it_is_replayed_with_its_own_numbers(browser: Client, tmp_path: Path) -> None:
-    uuid = imported(theirs(tmp_path)).episodes[1]
+    uuid = import_dataset(theirs(tmp_path)).episodes[1]
     silently(preview, uuid)
     page = browser.get(reverse("replay", args=[uuid]))
     told = page.context["config"]
@@ -117,7 +122,7 @@ def wide(**widths: int) -> dict[str, int]:
 def test_velocities_efforts_and_poses_come_along(data: Path, tmp_path: Path) -> None:
     names = {"observation.eef": POSES, "action_eef": POSES}
     source = theirs(tmp_path, widths=wide(), names=names)
-    journal = read_finished_episode(data / "episodes" / str(imported(source).episodes[1]))
+    journal = read_finished_episode(data / "episodes" / str(import_dataset(source).episodes[1]))
     for name, (stream, width) in BESIDE.items():
         stored = column(1, name, 8, Plan(smooth=True, widths=wide()))
         assert np.array_equal(journal.vectors(stream), stored)
@@ -134,7 +139,7 @@ def test_what_cannot_be_told_apart_or_has_another_width_is_left_out_and_named(
     wrong = [*POSES[:3], POSES[6], *POSES[3:6], *POSES[7:]]  # x, y, z, w last
     widths = wide(**{"observation.effort": 2})
     source = theirs(tmp_path, widths=widths, names={"observation.eef": wrong})
-    journal = read_finished_episode(data / "episodes" / str(imported(source).episodes[0]))
+    journal = read_finished_episode(data / "episodes" / str(import_dataset(source).episodes[0]))
     assert [stream for stream in VECTOR_STREAMS if journal.has_stream(stream)] == ["qvel"]
     reason = journal.outcome["reason"]
     assert "observation.effort is left out: its rows have 2 numbers, expected 6" in reason
@@ -144,9 +149,9 @@ def test_what_cannot_be_told_apart_or_has_another_width_is_left_out_and_named(
 
 def test_poses_of_others_are_sent_to_no_robot(data: Path, tmp_path: Path) -> None:
     source = theirs(tmp_path, widths=wide(), names=dict.fromkeys(("observation.eef", "action_eef"), POSES))
-    done = imported(source)
+    done = import_dataset(source)
     for name in (str(done.episodes[0]), f"{done.dataset}:0"):
-        recorded = recorded_at(name)
+        recorded = playable_episode(name)
         assert list(recorded.poses) == list(POSES)
         assert not recorded.ours
     path = str(data / "episodes" / str(done.episodes[0]))
@@ -158,18 +163,18 @@ def test_poses_of_others_are_sent_to_no_robot(data: Path, tmp_path: Path) -> Non
 
 
 def test_pictures_in_columns_are_played_too(data: Path, tmp_path: Path) -> None:
-    done = imported(theirs(tmp_path, videos=("cam_high",), images=("cam_wrist",)))
+    done = import_dataset(theirs(tmp_path, videos=("cam_high",), images=("cam_wrist",)))
     assert sorted(Episode.objects.get(uuid=done.episodes[0]).cameras) == ["cam_high", "cam_wrist"]
 
 
 def test_what_is_said_of_it_travels_with_its_dataset_through_conversions(data: Path, tmp_path: Path) -> None:
-    done = imported(theirs(tmp_path))
+    done = import_dataset(theirs(tmp_path))
     uuid = done.episodes[1]
     episode, ann = Episode.objects.get(uuid=uuid), person("ann", "operator")
-    review_add(user=ann, episode=episode, verdict="fail", note="dropped")
-    segment_put(user=ann, episode=episode, first=2, last=5, label="reach", milestone="cup touched")
-    assert look_for_outdated() == 1
-    assert silently(sides, uuid)["attached"]
+    add_review(user=ann, episode=episode, verdict="fail", note="dropped")
+    save_segment(user=ann, episode=episode, first=2, last=5, label="reach", milestone="cup touched")
+    assert find_outdated_sidecars() == 1
+    assert silently(write_sidecars_job, uuid)["attached"]
     home = data / "datasets" / "cups"
     convert(home, tmp_path / "other", "v3.0")
     convert(tmp_path / "other", tmp_path / "back", "v2.1")
@@ -182,8 +187,8 @@ def test_what_is_said_of_it_travels_with_its_dataset_through_conversions(data: P
 
 
 def test_it_is_judged_as_its_dataset_has_it(data: Path, tmp_path: Path) -> None:
-    done = imported(theirs(tmp_path, lengths=(12,)))
-    assert look_for_unchecked() == 1
+    done = import_dataset(theirs(tmp_path, lengths=(12,)))
+    assert find_unchecked_episodes() == 1
     silently(quality, done.episodes[0])
     report = report_get(uuid=done.episodes[0])
     assert report["frames"] == 12
@@ -229,9 +234,9 @@ def test_an_import_that_was_cut_short_is_gone_on_with(
     monkeypatch.setattr(importing, "import_episode", cut)
     source = theirs(tmp_path)
     with pytest.raises(RecordingError, match="the disk is full"):
-        imported(source)
+        import_dataset(source)
     assert Episode.objects.count() == 1
-    assert (imported(source).made, Episode.objects.count()) == (1, 2)
+    assert (import_dataset(source).made, Episode.objects.count()) == (1, 2)
 
 
 def test_a_page_has_it_done_by_the_worker(browser: Client, foreign: Foreign) -> None:
@@ -239,7 +244,7 @@ def test_a_page_has_it_done_by_the_worker(browser: Client, foreign: Foreign) -> 
     form = {"what": "import", "dataset": "cups", "robot": "", "state": "observation.state"}
     assert browser.post(reverse("dataset-ask"), form).status_code == 302
     job = Job.objects.get(kind="dataset")
-    found = run_order(Work(job.args, lambda _: None))
+    found = run_order(JobContext(job.args, lambda _: None))
     assert found == {"done": True, "dataset": "datasets/cups", "episodes": 3, "made": 3, "problems": []}
     assert Episode.objects.filter(dataset="datasets/cups").count() == 3
     browser.post(reverse("dataset-ask"), form | {"robot": "hal"})
@@ -247,13 +252,13 @@ def test_a_page_has_it_done_by_the_worker(browser: Client, foreign: Foreign) -> 
     page = browser.get(reverse("dataset", args=["cups"])).content.decode()
     assert "robot = &#x27;hal&#x27;; allowed: agibot_g2" in page
     assert "Import cups" in page
-    refused = run_order(Work(job.args | {"state": "joints"}, lambda _: None))
+    refused = run_order(JobContext(job.args | {"state": "joints"}, lambda _: None))
     assert not refused["done"]
     assert "has no column joints" in refused["why"]
 
 
 def test_it_is_published_nowhere_else(data: Path, tmp_path: Path) -> None:
-    done = imported(theirs(tmp_path))
+    done = import_dataset(theirs(tmp_path))
     told = silently(publish_episode, done.episodes[0])
     assert not told["published"]
     assert "it was imported" in told["why"]
@@ -286,7 +291,7 @@ def test_a_robot_of_as_many_joints_may_be_named(data: Path, tmp_path: Path) -> N
     with pytest.raises(
         RecordingError, match=f"observation.state has {width} numbers, agilex_piper has 14 joints"
     ):
-        imported(theirs(tmp_path), robot="agilex_piper")
+        import_dataset(theirs(tmp_path), robot="agilex_piper")
 
 
 @pytest.mark.exhaustive
@@ -295,7 +300,7 @@ def test_the_real_episode_is_imported_reviewed_and_converted_there_and_back(
     browser: Client, data: Path, tmp_path: Path
 ) -> None:
     assert SAMPLE is not None
-    done = imported(Path(SAMPLE), to="real", robot="agilex_piper")
+    done = import_dataset(Path(SAMPLE), to="real", robot="agilex_piper")
     (uuid,) = done.episodes
     silently(preview, uuid)
     silently(quality, uuid)
@@ -312,9 +317,9 @@ def test_the_real_episode_is_imported_reviewed_and_converted_there_and_back(
         assert np.array_equal(journal.vectors(stream), np.array(source[name].to_pylist(), np.float32))
     assert [name for name in VECTOR_STREAMS if journal.has_stream(name)] == list(VECTOR_STREAMS)
     episode, ann = Episode.objects.get(uuid=uuid), person("ann", "operator")
-    review_add(user=ann, episode=episode, verdict="pass")
-    segment_put(user=ann, episode=episode, first=0, last=100, label="reach")
-    silently(sides, uuid)
+    add_review(user=ann, episode=episode, verdict="pass")
+    save_segment(user=ann, episode=episode, first=0, last=100, label="reach")
+    silently(write_sidecars_job, uuid)
     home = data / "datasets" / "real"
     convert(home, tmp_path / "v3", "v3.0")
     convert(tmp_path / "v3", tmp_path / "back", "v2.1")

@@ -22,7 +22,7 @@ from evaweb.datasets import orders
 from evaweb.datasets.finding import dataset_names
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.stations.models import Station
 from runtime.datasets.consistency import check
 from runtime.datasets.reader import open_dataset
@@ -47,8 +47,8 @@ def done(root: User) -> Done:
     """Have something done at once; returns what came of it."""
 
     def do(**order: Any) -> dict[str, Any]:
-        job = orders.asked(user=root, given=order)
-        work("cpu")
+        job = orders.submit_order(user=root, given=order)
+        run_queue("cpu")
         job.refresh_from_db()
         assert job.error == ""
         return dict(job.result)
@@ -104,12 +104,12 @@ def test_episodes_are_deleted_once_however_often_the_job_is_done(
     foreign: Foreign, data: Path, root: User
 ) -> None:
     foreign("cups", version="v2.1")
-    job = orders.asked(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0, 0]})
+    job = orders.submit_order(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0, 0]})
     with pytest.raises(Conflict, match="are being deleted"):
-        orders.asked(user=root, given={"what": "delete", "dataset": "cups", "episodes": [1]})
-    work("cpu")
+        orders.submit_order(user=root, given={"what": "delete", "dataset": "cups", "episodes": [1]})
+    run_queue("cpu")
     Job.objects.filter(pk=job.pk).update(status="queued", attempts=0)  # its worker died after the last step
-    work("cpu")
+    run_queue("cpu")
     job.refresh_from_db()
     assert "nothing was deleted" in job.result["why"]
     assert [entry.length for entry in open_dataset(data / "datasets" / "cups").episodes] == [8, 7]
@@ -140,16 +140,18 @@ def test_an_order_that_is_none_is_refused_by_name(
 ) -> None:
     foreign("cups")
     with pytest.raises(EvaError, match=why):
-        orders.asked(user=root, given=order)
+        orders.submit_order(user=root, given=order)
     assert not Job.objects.exists()
 
 
 def test_nothing_is_written_over(foreign: Foreign, root: User) -> None:
     foreign("cups")
     with pytest.raises(Conflict, match="is there already"):
-        orders.asked(user=root, given={"what": "convert", "dataset": "cups", "to": "cups", "version": "v3.0"})
+        orders.submit_order(
+            user=root, given={"what": "convert", "dataset": "cups", "to": "cups", "version": "v3.0"}
+        )
     with pytest.raises(NotFound, match="there is no dataset 'datasets/plates'"):
-        orders.asked(user=root, given={"what": "check", "dataset": "plates"})
+        orders.submit_order(user=root, given={"what": "check", "dataset": "plates"})
 
 
 def test_only_administrators_take_data_away_or_out_of_the_house(foreign: Foreign) -> None:
@@ -160,10 +162,10 @@ def test_only_administrators_take_data_away_or_out_of_the_house(foreign: Foreign
         {"what": "push", "dataset": "cups", "repository": "lab/cups"},
     ):
         with pytest.raises(NotAllowed):
-            orders.asked(user=ann, given=order)
+            orders.submit_order(user=ann, given=order)
     with pytest.raises(NotAllowed):
-        orders.asked(user=vera, given={"what": "check", "dataset": "cups"})
-    assert orders.asked(user=ann, given={"what": "check", "dataset": "cups"}).kind == "dataset"
+        orders.submit_order(user=vera, given={"what": "check", "dataset": "cups"})
+    assert orders.submit_order(user=ann, given={"what": "check", "dataset": "cups"}).kind == "dataset"
 
 
 def test_a_push_without_the_client_says_so(
@@ -204,14 +206,14 @@ def test_forms_of_the_page_ask_and_a_deletion_wants_the_name(
     assert not Job.objects.exists()
     answer = browser.post(ask, form | {"confirm": "cups"}, follow=True)
     assert "Delete 2 episodes of cups" in answer.content.decode()
-    work("cpu")
+    run_queue("cpu")
     assert len(open_dataset(data / "datasets" / "cups").episodes) == 1
     answer = browser.post(
         ask,
         {"what": "split", "dataset": "datasets/cups", "to": "one", "parts": "first=0 again=0"},
         follow=True,
     )
-    work("cpu")
+    run_queue("cpu")
     page = browser.get(reverse("dataset", args=["cups"])).content.decode()
     assert "one/first" in page
     assert browser.get(reverse("dataset-work"))["HX-Refresh"] == "true"
@@ -373,7 +375,9 @@ def test_no_dataset_is_written_into_a_folder_of_the_lab(foreign: Foreign, root: 
     foreign("cups")
     for to in (f"{folder}/bench", f"{folder}/bench/ssh", f"./{folder}/x", f"{folder}//x"):
         with pytest.raises(EvaError, match="names no dataset"):
-            orders.asked(user=root, given={"what": "convert", "dataset": "cups", "to": to, "version": "v3.0"})
+            orders.submit_order(
+                user=root, given={"what": "convert", "dataset": "cups", "to": to, "version": "v3.0"}
+            )
     assert not Job.objects.exists()
 
 
@@ -385,7 +389,9 @@ def test_the_folders_of_the_lab_were_found() -> None:
 def test_no_dataset_is_written_around_or_into_others(foreign: Foreign, root: User, to: str) -> None:
     foreign("cups")
     with pytest.raises(EvaError):
-        orders.asked(user=root, given={"what": "convert", "dataset": "cups", "to": to, "version": "v3.0"})
+        orders.submit_order(
+            user=root, given={"what": "convert", "dataset": "cups", "to": to, "version": "v3.0"}
+        )
     assert not Job.objects.exists()
 
 
@@ -394,8 +400,8 @@ def test_an_operator_sets_up_an_episode_by_its_name_and_no_path_of_theirs(
 ) -> None:
     foreign("cups", widths={"observation.state": 7, "action": 7})
     Station.objects.create(name="bench", robot="ur5e", title="Bench")
-    wire = builders.Wire()
-    monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: wire)
+    wire = builders.FakeConnection()
+    monkeypatch.setattr("evaweb.stations.commands.connection_to", lambda name: wire)
 
     def asked(**given: Any) -> Any:
         body = {"uuid": str(uuid4()), "kind": "setup", "page": "p1", **given}

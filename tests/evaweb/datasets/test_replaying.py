@@ -268,4 +268,4 @@ def test_a_picture_of_a_dataset_that_is_far_too_large_is_refused_and_named(
     monkeypatch.setattr(stills.Image, "MAX_IMAGE_PIXELS", 1000)
     episode: Any = SimpleNamespace(video=lambda camera: None, cameras={"top": "observation.images.top"})
     with pytest.raises(RecordingError, match=r"picture 3 of 'observation\.images\.top' cannot be decoded"):
-        stills.still(episode, "top", 3)
+        stills.still_image(episode, "top", 3)

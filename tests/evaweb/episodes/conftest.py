@@ -14,7 +14,7 @@ from evaweb.episodes import services
 from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.stations.models import Station
 from runtime.recording.export import write_export
 from tests.once import made_once
@@ -55,7 +55,7 @@ def _record(folder: Path) -> None:
 def data(settings: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The data folder of this test; no broker hears of its jobs."""
     settings.DATA_DIR = tmp_path
-    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     return tmp_path
 
 
@@ -86,7 +86,7 @@ def closed(put: Put, station: Station) -> Callable[..., Episode]:
 
     def close(status: str = "finished") -> Episode:
         folder = put(status)
-        return services.episode_closed(station=station, data={"uuid": folder.name, "status": status})
+        return services.record_closed(station=station, data={"uuid": folder.name, "status": status})
 
     return close
 
@@ -95,6 +95,6 @@ def closed(put: Put, station: Station) -> Callable[..., Episode]:
 def previewed(closed: Callable[..., Episode]) -> Episode:
     """One that can be played."""
     episode = closed()
-    assert work("cpu") == 1
+    assert run_queue("cpu") == 1
     assert Job.objects.get().error == ""
     return Episode.objects.get(uuid=UUID(str(episode.uuid)))

@@ -12,11 +12,11 @@ from evaweb.episodes import arriving, services, verifying
 from evaweb.episodes.job_kinds import look_for_arrived
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
-from evaweb.episodes.selectors import stage_of, unrecorded_because
+from evaweb.episodes.selectors import playback_stage, why_unrecorded
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
-from evaweb.results.ratings.video_available import coming
-from evaweb.reviews.selectors import unchecked
+from evaweb.jobs.services import run_queue
+from evaweb.results.ratings.video_available import may_become_watchable
+from evaweb.reviews.selectors import unchecked_episodes
 from evaweb.stations.models import Station, StationKey
 from runtime.link.contents import contents_of
 from runtime.link.incoming import Shelf
@@ -37,7 +37,7 @@ def away(data: Path, recorded: dict[str, Path], elsewhere: Station) -> Episode:
     """One that its station has closed on its own computer."""
     uuid = recorded["finished"].name
     told = {"uuid": uuid, "status": "finished", "reason": "stopped by the operator", "rows": 24}
-    return services.episode_closed(station=elsewhere, data=told)
+    return services.record_closed(station=elsewhere, data=told)
 
 
 def send(data: Path, folder: Path, pieces: int = 10**6) -> None:
@@ -58,13 +58,13 @@ def folder_station(folder: Path) -> str:
 
 def test_one_that_is_away_is_what_its_station_said_and_nothing_looks_for_its_folder(away: Episode) -> None:
     assert (away.status, away.frames, away.reason) == ("finished", 24, "stopped by the operator")
-    assert stage_of(episode=away).sentence == "It is on the computer of station bench, not here yet."
-    assert stage_of(episode=away).passing
+    assert playback_stage(episode=away).sentence == "It is on the computer of station bench, not here yet."
+    assert playback_stage(episode=away).is_transient
     away.cameras = ["cam_high"]
-    assert coming(away)
-    assert not unchecked().exists()
-    assert services.smoothness_asked(most=9) == 0
-    assert verifying.scrub_asked() is None
+    assert may_become_watchable(away)
+    assert not unchecked_episodes().exists()
+    assert services.request_smoothness(most=9) == 0
+    assert verifying.request_scrub() is None
     assert reconcile().missing == 0
     assert Episode.objects.get().status == EpisodeStatus.FINISHED
     assert not Job.objects.exists()
@@ -74,18 +74,18 @@ def test_a_run_elsewhere_has_no_evidence_until_its_computer_has_told_and_is_not_
     data: Path, elsewhere: Station
 ) -> None:
     told = {"uuid": "00000000-0000-4000-8000-000000000001"}
-    services.episode_opened(station=elsewhere, uuid=told["uuid"])
-    why = unrecorded_because(episode=Episode.objects.get())
+    services.record_opened(station=elsewhere, uuid=told["uuid"])
+    why = why_unrecorded(episode=Episode.objects.get())
     assert why.startswith(f"the computer of {elsewhere} has not told yet"), why
-    closed = services.episode_closed(station=elsewhere, data=told | {"status": "interrupted", "rows": 90})
-    assert unrecorded_because(episode=closed) == ""
+    closed = services.record_closed(station=elsewhere, data=told | {"status": "interrupted", "rows": 90})
+    assert why_unrecorded(episode=closed) == ""
 
 
 def test_a_recording_that_goes_on_elsewhere_is_not_missing(
     data: Path, elsewhere: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(services, "APPEARS_WITHIN", services.APPEARS_WITHIN * 0)
-    services.episode_opened(station=elsewhere, uuid="00000000-0000-4000-8000-000000000001")
+    services.record_opened(station=elsewhere, uuid="00000000-0000-4000-8000-000000000001")
     assert reconcile().missing == 0
     StationKey.objects.all().delete()
     assert reconcile().missing == 1
@@ -101,18 +101,18 @@ def test_a_page_says_how_much_of_it_is_here_and_why_no_more(
     send(data, folder, pieces=1)
     assert reconcile().problems == ()
     size = contents_of(folder).size
-    said = stage_of(episode=away).sentence
+    said = playback_stage(episode=away).sentence
     assert said.startswith(f"It is on the computer of station {elsewhere.name}, not here yet: ")
     assert said.endswith(f" of {size / 1e6:.1f} MB.")
     list(Shelf(data, elsewhere.name, lambda uuid: "bench-9", reserve=0).take(Offer(folder.name), b"[]"))
-    assert "not here yet: the list of its files cannot be used" in stage_of(episode=away).sentence
+    assert "not here yet: the list of its files cannot be used" in playback_stage(episode=away).sentence
 
 
 def test_one_that_has_arrived_is_played_checked_and_published_as_it_was_asked_to_be(
     data: Path, away: Episode, recorded: dict[str, Path]
 ) -> None:
-    services.publish_asked(episode=away)
-    assert work("cpu") == 1
+    services.request_publish(episode=away)
+    assert run_queue("cpu") == 1
     why = Job.objects.get().result["why"]
     assert why == "It is on the computer of station bench, not here yet. It is published when it is."
     send(data, recorded["finished"])
@@ -121,12 +121,12 @@ def test_one_that_has_arrived_is_played_checked_and_published_as_it_was_asked_to
     row = Episode.objects.get()
     assert (row.away_since, row.status, row.frames) == (None, "finished", 24)
     assert row.seal
-    assert [one.pk for one in unchecked()] == [row.pk]
-    work("cpu")
+    assert [one.pk for one in unchecked_episodes()] == [row.pk]
+    run_queue("cpu")
     row = Episode.objects.get()
     assert row.previewed_at is not None
     assert row.dataset_index == 0
-    assert stage_of(episode=row).name == "ready"
+    assert playback_stage(episode=row).name == "ready"
 
 
 def test_one_that_was_noted_as_away_after_it_had_come_is_found(
@@ -162,6 +162,6 @@ def test_whose_an_episode_is_the_database_says_or_that_it_cannot(
 
 def test_one_of_this_computer_whose_folder_is_lost_is_not_on_its_way(data: Path, station: Station) -> None:
     told = {"uuid": "00000000-0000-4000-8000-000000000002", "status": "finished", "rows": 3}
-    episode = services.episode_closed(station=station, data=told)
+    episode = services.record_closed(station=station, data=told)
     assert episode.away_since is None
-    assert stage_of(episode=episode).name == "missing"
+    assert playback_stage(episode=episode).name == "missing"

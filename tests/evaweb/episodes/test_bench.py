@@ -14,10 +14,10 @@ from django.test import Client
 from django.urls import reverse
 
 from evaweb.binary_frames import decode
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.episodes import services
 from evaweb.episodes.bench import bench_course
-from evaweb.episodes.curves import curves
+from evaweb.episodes.curves import curve_message
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import unscored_for
 from evaweb.stations.models import Station
@@ -46,7 +46,7 @@ def simulated(put: Callable[..., Path]) -> Path:
 
 
 def milestones(folder: Path, **given: object) -> list[tuple[float, str]]:
-    marks = decode(curves(folder, **given)).header["marks"]  # type: ignore[arg-type]
+    marks = decode(curve_message(folder, **given)).header["marks"]  # type: ignore[arg-type]
     return [(mark["time"], mark["text"]) for mark in marks if mark["kind"] == "milestone"]
 
 
@@ -78,23 +78,23 @@ def test_whoever_is_blind_hears_how_it_went_after_scoring_alone(db: None, simula
         events.write(json.dumps(truth) + "\n")
 
     def hears(**given: bool) -> bool:
-        marks = decode(curves(simulated, **given)).header["marks"]
+        marks = decode(curve_message(simulated, **given)).header["marks"]
         return any(mark["kind"] == "truth" for mark in marks)
 
     assert hears()
     assert hears(covered=True)
     assert not hears(covered=True, unscored=True)
-    blind = Sight(checkpoints=frozenset({1}), names=frozenset({"secret"}))
+    blind = Visibility(checkpoints=frozenset({1}), names=frozenset({"secret"}))
     hidden = Episode(uuid=uuid.uuid4(), checkpoint="secret")
     assert unscored_for(episode=hidden, sight=blind)
-    assert not unscored_for(episode=hidden, sight=EVERYTHING)
+    assert not unscored_for(episode=hidden, sight=FULL_VISIBILITY)
 
 
 def test_the_address_of_the_course_is_for_everybody_who_is_logged_in(
     simulated: Path, station: Station, client: Client
 ) -> None:
     data = {"uuid": simulated.name, "status": "finished"}
-    episode = services.episode_closed(station=station, data=data)
+    episode = services.record_closed(station=station, data=data)
     address = reverse("episode-bench", args=[episode.uuid])
     assert client.get(address).status_code == 302
     client.force_login(User.objects.create_user("viewer"))

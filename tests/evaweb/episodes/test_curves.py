@@ -12,10 +12,10 @@ import pytest
 
 from evaweb.binary_frames import decode
 from evaweb.episodes import poses as posing
-from evaweb.episodes.curves import _interventions, curves, held_spans
-from evaweb.episodes.poses import poses
+from evaweb.episodes.curves import _interventions, curve_message, hold_spans
+from evaweb.episodes.poses import pose_message
 from evaweb.errors import NotFound
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.stations.robot_geometry import drawn_robot
 from runtime.kinematics.forward import ChainForward
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
@@ -31,7 +31,7 @@ def folder(recorded: dict[str, Path]) -> Path:
 
 
 def test_every_tick_has_what_was_measured_asked_for_and_sent(folder: Path) -> None:
-    frame, episode = decode(curves(folder)), open_episode(folder)
+    frame, episode = decode(curve_message(folder)), open_episode(folder)
     time = frame.array("ticks", "time")
     assert time[0] == 0
     assert np.allclose(time, np.arange(len(time)) / 30)
@@ -51,7 +51,7 @@ def test_every_tick_has_what_was_measured_asked_for_and_sent(folder: Path) -> No
 
 
 def test_the_policys_own_rows_lie_at_the_step_they_were_meant_for(folder: Path) -> None:
-    frame, episode = decode(curves(folder)), open_episode(folder)
+    frame, episode = decode(curve_message(folder)), open_episode(folder)
     used = [row for row in episode.raw.to_pylist() if row["target_step"] >= 0]
     first = episode.ticks["step"][0].as_py()
     assert len(used) > 10
@@ -82,7 +82,7 @@ def test_interventions_are_marked(folder: Path, hands: list[int], marks: list[tu
 
 
 def test_held_spans_and_events_are_on_the_same_clock(folder: Path) -> None:
-    frame, episode = decode(curves(folder)), open_episode(folder)
+    frame, episode = decode(curve_message(folder)), open_episode(folder)
     sources = column(episode.rows, "control_source").tolist()
     held = sum(round((to - since) * 30) for since, to in frame.header["held"])
     assert held == sources.count("hold") + sources.count("none") > 0
@@ -102,7 +102,7 @@ def test_held_spans_and_events_are_on_the_same_clock(folder: Path) -> None:
     ],
 )
 def test_spans_of_rows_in_which_nobody_asked(sources: list[str], spans: list[list[float]]) -> None:
-    assert np.allclose(held_spans(sources, 10.0), spans)
+    assert np.allclose(hold_spans(sources, 10.0), spans)
 
 
 def test_a_policy_that_speaks_in_poses_has_no_raw_joint_curve(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_a_policy_that_speaks_in_poses_has_no_raw_joint_curve(tmp_path: Path) ->
     made.rows = lambda seen, number: eef_of(np.tile(STANDS, (20, 1)))
     bench = Station(made)
     bench.running(12)
-    frame = decode(curves(bench.stop().path))
+    frame = decode(curve_message(bench.stop().path))
     assert frame.header["streams"]["raw"]["json"]["spaces"] == ["eef"]
     assert frame.header["streams"]["raw"]["json"]["rows"] > 0
     assert frame.array("raw", "values").shape == (14, 0)
@@ -123,10 +123,10 @@ def test_poses_are_those_of_the_measured_joints_and_come_in_parts(
 ) -> None:
     monkeypatch.setattr(posing, "MOST_ROWS", 10)
     episode = open_episode(folder)
-    looks = looks_of("agilex_piper")
+    looks = drawn_robot("agilex_piper")
     wanted = looks.scene.poses(column(episode.rows, "qpos").astype(np.float64))
     for first, count in ((0, 10), (20, episode.frames - 20)):
-        frame = decode(poses(folder, first))
+        frame = decode(pose_message(folder, first))
         found = frame.array("poses")
         assert found.shape == (count, len(looks.scene.parts), 16)
         matrices = found.reshape(count, -1, 4, 4).swapaxes(-1, -2)  # column by column
@@ -137,7 +137,7 @@ def test_poses_are_those_of_the_measured_joints_and_come_in_parts(
 @pytest.mark.parametrize("first", [-1, 24, 5000])
 def test_a_row_that_there_is_not_is_refused(folder: Path, first: int) -> None:
     with pytest.raises(NotFound, match="has rows 0 to 23"):
-        poses(folder, first)
+        pose_message(folder, first)
 
 
 def test_a_robot_that_nobody_knows_any_more_leaves_curves_without_units(put: object) -> None:
@@ -145,23 +145,23 @@ def test_a_robot_that_nobody_knows_any_more_leaves_curves_without_units(put: obj
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["robot"]["name"] = "retired"
     (folder / "manifest.json").write_text(json.dumps(manifest))
-    assert decode(curves(folder)).header["units"] == [""] * 14
+    assert decode(curve_message(folder)).header["units"] == [""] * 14
 
 
 def test_a_table_of_zeros_has_no_curve_and_rows_that_are_missing_are_told(put: object) -> None:
     folder = put()  # type: ignore[operator]
     (folder / "ticks.arrow").write_bytes(bytes(100))
-    assert decode(curves(folder)).array("ticks", "time").size == 0
+    assert decode(curve_message(folder)).array("ticks", "time").size == 0
     (folder / "rows.arrow").unlink()
     with pytest.raises(RecordingError, match=r"rows\.arrow is damaged: 0 rows readable"):
-        curves(folder)
+        curve_message(folder)
 
 
 # --- chunks --------------------------------------------------------------------------------------------------
 
 
 def test_every_tick_names_the_chunk_that_owns_it_and_all_that_made_it(folder: Path) -> None:
-    frame, episode = decode(curves(folder)), open_episode(folder)
+    frame, episode = decode(curve_message(folder)), open_episode(folder)
     owners = frame.array("ticks", "chunk")
     assert owners.tolist() == episode.ticks["chunk_id"].to_pylist()
     offsets, ids = frame.array("ticks", "makers"), frame.array("makers", "chunk")
@@ -181,7 +181,7 @@ def test_of_every_chunk_it_is_known_when_and_how_late_it_came(tmp_path: Path) ->
     bench = Station(stubbed(tmp_path, delay=3))
     bench.running(40)
     folder = bench.stop().path
-    frame, episode = decode(curves(folder)), open_episode(folder)
+    frame, episode = decode(curve_message(folder)), open_episode(folder)
     told = {name: frame.array("chunks", name) for name in frame.header["streams"]["chunks"]["arrays"]}
     raw = episode.raw.to_pylist()
     assert told["id"].tolist() == sorted({row["chunk_id"] for row in raw})
@@ -199,7 +199,7 @@ def test_of_every_chunk_it_is_known_when_and_how_late_it_came(tmp_path: Path) ->
 def test_a_chunk_that_never_arrived_and_an_older_episode_leave_unknown_what_is_unknown(put: object) -> None:
     folder = put()  # type: ignore[operator]
     old_raw(folder / "raw.arrow")
-    frame = decode(curves(folder))
+    frame = decode(curve_message(folder))
     told = {
         name: frame.array("chunks", name).tolist() for name in ("id", "first", "last", "overlap", "strategy")
     }
@@ -207,7 +207,7 @@ def test_a_chunk_that_never_arrived_and_an_older_episode_leave_unknown_what_is_u
     table = pa.ipc.open_stream((folder / "raw.arrow").read_bytes()).read_all()
     lost = table.set_column(2, "arrival_step", pa.array([-1] * 4, pa.int64()))
     write_table(folder / "raw.arrow", lost)
-    frame = decode(curves(folder))
+    frame = decode(curve_message(folder))
     assert np.isnan(frame.array("chunks", "arrived")).all()
     assert frame.array("chunks", "delay").tolist() == [-1]
 
@@ -216,6 +216,6 @@ def test_an_episode_of_no_chunks_has_none(put: object) -> None:
     folder = put()  # type: ignore[operator]
     for name in ("raw", "smoothed"):
         (folder / f"{name}.arrow").unlink()
-    frame = decode(curves(folder))
+    frame = decode(curve_message(folder))
     assert frame.array("chunks", "id").size == frame.array("makers", "chunk").size == 0
     assert not frame.array("ticks", "makers").any()

@@ -37,8 +37,8 @@ def score(data: Path, episode: Episode, success: bool, **more: object) -> None:
 
 def publish(episode: Episode) -> Job:
     """Ask for the dataset and let the worker do all that waits."""
-    job = services.publish_asked(episode=episode)
-    jobs.work("cpu")
+    job = services.request_publish(episode=episode)
+    jobs.run_queue("cpu")
     job.refresh_from_db()
     return job
 
@@ -80,9 +80,9 @@ def test_a_preview_that_was_cut_off_leaves_nothing_and_is_made_anew(closed: Clos
     left = data / "previews" / f".{episode.uuid}.abandoned"
     left.mkdir(parents=True)
     (left / "cam_high.mp4").write_bytes(b"half")
-    jobs.work("cpu")
-    services.preview_asked(episode=episode)
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
+    services.request_preview(episode=episode)
+    jobs.run_queue("cpu")
     assert [path.name for path in (data / "previews").iterdir()] == [str(episode.uuid)]
     assert [job.status for job in Job.objects.all()] == [JobStatus.DONE] * 2
 
@@ -100,7 +100,7 @@ def test_a_damaged_episode_fails_its_job_with_the_file_named(
     job = Job.objects.get()
     for _ in range(jobs.MOST_ATTEMPTS):
         Job.objects.update(not_before=None)
-        jobs.work("cpu")
+        jobs.run_queue("cpu")
     job.refresh_from_db()
     assert job.status == JobStatus.FAILED
     assert str(file) in job.error
@@ -205,7 +205,7 @@ def test_an_episode_that_is_still_being_written_is_tried_again(closed: Closed, d
     assert "has no outcome.json" in job.error
     outcome.write_bytes(content)
     Job.objects.update(not_before=None)
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     job.refresh_from_db()
     assert job.result["published"] is True
 
@@ -257,8 +257,8 @@ def test_a_worker_killed_while_publishing_leaves_a_dataset_that_the_next_one_com
     job = Job.objects.get(key=f"publish:{episode.uuid}")
     assert job.status == JobStatus.RUNNING
     Job.objects.filter(pk=job.pk).update(seen_at=timezone.now() - timedelta(hours=1))
-    assert jobs.sweep() == 1
-    assert jobs.work("cpu") == 1
+    assert jobs.reclaim_stale_jobs() == 1
+    assert jobs.run_queue("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.result["index"]) == (JobStatus.DONE, 0, 1)
     assert check(root) == []
@@ -270,7 +270,7 @@ def test_the_job_reconcile_tells_what_it_found(closed: Closed, data: Path) -> No
     episode = closed()
     Episode.objects.all().delete()
     job = jobs.enqueue(kind="reconcile", key="reconcile", args={})
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     job.refresh_from_db()
     assert job.result == {
         "episodes": 1,
@@ -282,7 +282,7 @@ def test_the_job_reconcile_tells_what_it_found(closed: Closed, data: Path) -> No
     }
     shutil.rmtree(data / "episodes" / str(episode.uuid))
     again = jobs.enqueue(kind="reconcile", key="reconcile", args={})
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     again.refresh_from_db()
     assert again.result["missing"] == 1
 
@@ -292,15 +292,15 @@ def test_the_table_is_made_once_and_stays(closed: Closed, data: Path) -> None:
     (path,) = (data / "exports").rglob("*.parquet")
     before = path.stat()
     for _ in range(2):
-        job = services.export_asked(episode=episode)
-        jobs.work("cpu")
+        job = services.request_export(episode=episode)
+        jobs.run_queue("cpu")
         job.refresh_from_db()
         assert job.status == JobStatus.DONE, job.error
         assert job.result == {"file": str(path.relative_to(data)), "bytes": before.st_size}
     assert path.stat().st_mtime_ns == before.st_mtime_ns
     path.unlink()
-    services.export_asked(episode=episode)
-    jobs.work("cpu")
+    services.request_export(episode=episode)
+    jobs.run_queue("cpu")
     assert path.stat().st_size == before.st_size
 
 
@@ -314,10 +314,10 @@ def sim_manifest(data: Path, episode: Episode) -> None:
 def test_a_run_with_a_simulated_robot_is_not_even_queued(closed: Closed, data: Path) -> None:
     episode = closed()
     sim_manifest(data, episode)
-    episode = services.episode_read(uuid=episode.uuid)
+    episode = services.sync_episode(uuid=episode.uuid)
     score(data, episode, True)
     before = Job.objects.count()
-    assert services.publish_asked(episode=episode) is None
+    assert services.request_publish(episode=episode) is None
     assert Job.objects.count() == before
 
 

@@ -14,7 +14,7 @@ from django.core.management import call_command
 from evaweb.episodes import reconcile as reconciling
 from evaweb.episodes import services
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.reconcile import Kept, reconcile
+from evaweb.episodes.reconcile import RestorableRun, reconcile
 from evaweb.errors import EvaError
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job
@@ -48,8 +48,8 @@ def test_a_lost_database_comes_back_with_stations_previews_and_datasets(
         scores = data / "scores" / f"{episode.uuid}.jsonl"
         scores.parent.mkdir(exist_ok=True)
         scores.write_bytes(SCORE.read_bytes())
-        services.publish_asked(episode=episode)
-    jobs.work("cpu")
+        services.request_publish(episode=episode)
+    jobs.run_queue("cpu")
     before = {row.uuid: row for row in Episode.objects.all()}
     Episode.objects.all().delete()
     Station.objects.all().delete()
@@ -77,13 +77,13 @@ def test_one_reader_has_seen_all_runs_before_the_next_one_begins(
     first, second = sorted((put().name, put("interrupted").name))
     seen: list[tuple[str, str]] = []
 
-    def trials(kept: Kept) -> int:
+    def trials(kept: RestorableRun) -> int:
         seen.append(("trials", str(kept.uuid)))
         if str(kept.uuid) == first:
             raise OverflowError("date value out of range")
         return 1
 
-    def preferences(kept: Kept) -> int:
+    def preferences(kept: RestorableRun) -> int:
         seen.append(("preferences", str(kept.uuid)))
         return 1
 
@@ -172,9 +172,9 @@ def test_an_empty_lab_has_nothing_to_reconcile(data: Path, db: None) -> None:
 def test_runs_go_to_who_understands_them_and_a_stranger_is_told(
     put: Callable[..., Path], data: Path, db: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: list[Kept] = []
+    given: list[RestorableRun] = []
 
-    def restore(kept: Kept) -> int:
+    def restore(kept: RestorableRun) -> int:
         given.append(kept)
         return len(kept.lines)
 
@@ -205,7 +205,7 @@ def test_what_cannot_be_restored_is_told_and_keeps_no_other(
     names = [put(status).name for status in ("finished", "interrupted")]
     seen = []
 
-    def restore(kept: Kept) -> int:
+    def restore(kept: RestorableRun) -> int:
         seen.append(str(kept.uuid))
         if len(seen) == 1:
             raise EvaError("its scores are odd")
@@ -221,8 +221,8 @@ def test_an_episode_that_was_scored_after_it_was_published_is_published_again(
     closed: Callable[..., Episode], data: Path
 ) -> None:
     episode = closed()
-    services.publish_asked(episode=episode)
-    jobs.work("cpu")
+    services.request_publish(episode=episode)
+    jobs.run_queue("cpu")
     Job.objects.all().delete()
     assert reconcile().published == 1
     assert not Job.objects.exists()
@@ -231,7 +231,7 @@ def test_an_episode_that_was_scored_after_it_was_published_is_published_again(
     scores.write_text('{"kind": "score", "success": false}\n')
     reconcile()
     assert Job.objects.get().key == f"publish:{episode.uuid}"
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     Job.objects.all().delete()
     reconcile()
     assert not Job.objects.exists()
@@ -265,7 +265,7 @@ def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
     closed: Callable[..., Episode], data: Path
 ) -> None:
     whole, broken = closed(), closed("interrupted")
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     Job.objects.all().delete()
     tables = {path.stem: path for path in (data / "exports").rglob("*.parquet")}
     for path in tables.values():
@@ -273,7 +273,7 @@ def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
     (data / "episodes" / str(broken.uuid) / "manifest.json").write_text("{")
     reconcile()
     assert [job.key for job in Job.objects.all()] == [f"export:{whole.uuid}"]
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     assert tables[str(whole.uuid)].is_file()
     Job.objects.all().delete()
     reconcile()
@@ -287,8 +287,8 @@ def test_a_table_that_is_missing_is_asked_for_and_a_damaged_episode_has_none(
 def published(closed: Callable[..., Episode], data: Path) -> Episode:
     """An episode in the dataset that it was published into."""
     episode = closed()
-    services.publish_asked(episode=episode)
-    jobs.work("cpu")
+    services.request_publish(episode=episode)
+    jobs.run_queue("cpu")
     return Episode.objects.get(uuid=episode.uuid)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import robots
-from evaweb.episodes.robot import groups_in, looks_in, robot_in
+from evaweb.episodes.robot import drawn_robot_for, groups_of_manifest, robot_of_manifest
 from evaweb.errors import NotFound
 
 
@@ -17,14 +17,14 @@ def manifest(*groups: str, **said: Any) -> dict[str, Any]:
 
 
 def test_the_groups_are_those_of_the_recorded_joints() -> None:
-    assert groups_in(manifest("right_arm")) == ("right_arm",)
-    assert looks_in(manifest("right_arm")).robot.dim == 7
-    assert looks_in(manifest()).robot.dim == 14
+    assert groups_of_manifest(manifest("right_arm")) == ("right_arm",)
+    assert drawn_robot_for(manifest("right_arm")).robot.dim == 7
+    assert drawn_robot_for(manifest()).robot.dim == 14
 
 
 def test_an_old_recording_without_names_is_of_the_robot_with_all_its_groups() -> None:
-    assert groups_in(manifest(joint_names=None)) is None
-    assert looks_in(manifest(joint_names=None)).robot.dim == 14
+    assert groups_of_manifest(manifest(joint_names=None)) is None
+    assert drawn_robot_for(manifest(joint_names=None)).robot.dim == 14
 
 
 @pytest.mark.parametrize(
@@ -40,11 +40,11 @@ def test_an_old_recording_without_names_is_of_the_robot_with_all_its_groups() ->
 )
 def test_what_cannot_be_shown_says_why(said: dict[str, Any], sentence: str) -> None:
     with pytest.raises(NotFound, match=sentence):
-        looks_in(manifest(**said))
+        drawn_robot_for(manifest(**said))
 
 
 @pytest.mark.parametrize("broken", [{}, {"robot": None}, {"robot": "agilex_piper"}])
 def test_a_manifest_without_a_robot_has_none(broken: dict[str, Any]) -> None:
-    assert robot_in(broken) == {}
+    assert robot_of_manifest(broken) == {}
     with pytest.raises(NotFound):
-        looks_in(broken)
+        drawn_robot_for(broken)

@@ -12,7 +12,7 @@ from django.utils import timezone
 
 from evaweb.episodes import services
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.selectors import stage_of
+from evaweb.episodes.selectors import playback_stage
 from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.django_db
 
 
 def opened(station: Station, identity: str) -> Episode:
-    return services.episode_opened(
+    return services.record_opened(
         station=station, uuid=identity, task="stack", checkpoint="good", operator="ann"
     )
 
@@ -42,7 +42,7 @@ def test_closing_reads_the_folder_and_asks_for_one_preview(
     folder = put()
     opened(station, folder.name)
     for _ in range(2):
-        services.episode_closed(station=station, data={"uuid": folder.name, "status": "finished"})
+        services.record_closed(station=station, data={"uuid": folder.name, "status": "finished"})
     episode = Episode.objects.get()
     assert episode.status == EpisodeStatus.FINISHED
     assert episode.reason == "stopped by the operator"
@@ -58,15 +58,15 @@ def test_an_episode_that_waits_for_room_says_so_until_it_is_closed(
     folder = put()
     (folder / "outcome.json").rename(folder / "aside")
     told = {"uuid": folder.name, "status": "failed", "reason": "disk full while writing it", "waits": True}
-    waits = services.episode_closed(station=station, data=told)
+    waits = services.record_closed(station=station, data=told)
     sentence = "its end waits for room on the disk: disk full while writing it"
-    assert (waits.status, waits.reason, stage_of(episode=waits).sentence) == (
+    assert (waits.status, waits.reason, playback_stage(episode=waits).sentence) == (
         EpisodeStatus.RECORDING,
         sentence,
         sentence,
     )
     (folder / "aside").rename(folder / "outcome.json")
-    closed = services.episode_closed(station=station, data=told | {"status": "finished", "waits": False})
+    closed = services.record_closed(station=station, data=told | {"status": "finished", "waits": False})
     assert (closed.status, closed.reason) == (EpisodeStatus.FINISHED, "stopped by the operator")
 
 
@@ -74,13 +74,13 @@ def test_an_episode_that_opens_after_it_was_closed_stays_closed(
     put: Callable[..., Path], station: Station
 ) -> None:
     folder = put()
-    services.episode_closed(station=station, data={"uuid": folder.name})
+    services.record_closed(station=station, data={"uuid": folder.name})
     assert opened(station, folder.name).status == EpisodeStatus.FINISHED
 
 
 def test_a_folder_on_another_machine_leaves_the_words_of_the_event(data: Path, station: Station) -> None:
     told = {"uuid": str(uuid.uuid4()), "status": "interrupted", "reason": "e-stop", "path": "/etc/passwd"}
-    episode = services.episode_closed(station=station, data=told)
+    episode = services.record_closed(station=station, data=told)
     assert episode.status == EpisodeStatus.INTERRUPTED
     assert episode.reason.startswith("e-stop (")
     assert "manifest.json cannot be read" in episode.reason
@@ -90,7 +90,7 @@ def test_a_folder_on_another_machine_leaves_the_words_of_the_event(data: Path, s
 def test_a_damaged_manifest_is_named(put: Callable[..., Path], station: Station) -> None:
     folder = put()
     (folder / "manifest.json").write_text('{"format": 1, "uuid"')
-    episode = services.episode_closed(station=station, data={"uuid": folder.name, "status": "made up"})
+    episode = services.record_closed(station=station, data={"uuid": folder.name, "status": "made up"})
     assert episode.status == EpisodeStatus.FAILED
     assert f"{folder}/manifest.json is not a whole JSON document" in episode.reason
 
@@ -98,7 +98,7 @@ def test_a_damaged_manifest_is_named(put: Callable[..., Path], station: Station)
 @pytest.mark.parametrize("given", [None, "", "../../etc", 7])
 def test_an_event_that_names_no_episode_is_refused(station: Station, given: object) -> None:
     with pytest.raises(EvaError, match="is no episode"):
-        services.episode_closed(station=station, data={"uuid": given})
+        services.record_closed(station=station, data={"uuid": given})
     assert not Episode.objects.exists()
 
 
@@ -106,11 +106,11 @@ def test_a_repaired_recording_is_closed_without_an_event(put: Callable[..., Path
     folder = put()
     unended(folder)
     opened(station, folder.name)
-    assert services.catch_up() == 0
+    assert services.close_unheard_episodes() == 0
     repair(folder)
-    assert services.catch_up() == 1
+    assert services.close_unheard_episodes() == 1
     assert Episode.objects.get().status == EpisodeStatus.INTERRUPTED
-    assert services.catch_up() == 0
+    assert services.close_unheard_episodes() == 0
 
 
 def test_a_recording_closed_with_an_unusable_outcome_fails_with_the_file_named(
@@ -119,7 +119,7 @@ def test_a_recording_closed_with_an_unusable_outcome_fails_with_the_file_named(
     folder = put()
     opened(station, folder.name)
     unsealed(folder, status="fine", frames=2)
-    assert services.catch_up() == 0
+    assert services.close_unheard_episodes() == 0
     episode = Episode.objects.get()
     assert episode.status == EpisodeStatus.FAILED
     assert "outcome.json: status is 'fine', must be one of finished, interrupted, failed" in episode.reason
@@ -132,7 +132,7 @@ def test_folders_that_are_gone_are_missing_but_one_just_announced_is_not(
     Episode.objects.filter(uuid=old.uuid).update(created_at=timezone.now() - timedelta(hours=1))
     ahead = timezone.now() + timedelta(hours=1)
     monkeypatch.setattr(timezone, "now", lambda: ahead)  # of the worker, which is another machine
-    assert services.missing_marked() == 1
+    assert services.mark_missing() == 1
     assert Episode.objects.get(uuid=old.uuid).status == EpisodeStatus.MISSING
     assert Episode.objects.get(uuid=fresh.uuid).status == EpisodeStatus.RECORDING
 
@@ -143,10 +143,10 @@ def test_a_station_says_nothing_of_anothers_episode(station: Station) -> None:
     episode = opened(station, str(uuid.uuid4()))
     told = {"uuid": str(episode.uuid), "status": "failed", "reason": "made up"}
     for say in (
-        lambda: services.episode_closed(station=other, data=told),
+        lambda: services.record_closed(station=other, data=told),
         lambda: opened(other, str(episode.uuid)),
     ):
         with pytest.raises(EvaError, match=f"is of {station.name}: bench-elsewhere says nothing of it"):
             say()
-    services.episode_unopened(station=other, uuid=episode.uuid)
+    services.forget_unopened(station=other, uuid=episode.uuid)
     assert Episode.objects.get().status == EpisodeStatus.RECORDING

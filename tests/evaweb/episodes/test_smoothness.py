@@ -9,12 +9,12 @@ import pyarrow as pa
 import pytest
 
 from evaweb.episodes import services
-from evaweb.episodes.job_kinds import look_for_unmeasured
+from evaweb.episodes.job_kinds import find_unmeasured_episodes
 from evaweb.episodes.models import Episode
-from evaweb.episodes.robot import described_in
+from evaweb.episodes.robot import robot_for
 from evaweb.episodes.smoothness import smoothness_in, smoothness_of
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.statistics.smoothness import sparc
 from runtime.recording.reader import open_episode
 from tests.runtime.lockstep_station import STANDS
@@ -65,7 +65,7 @@ def test_it_is_the_sparc_of_the_hands_speed(real):
     assert found.measured == pytest.approx(sparc(speed[1:], RATE), abs=1e-4)  # a turn: the way is the angle
     assert found.commanded == found.measured
     assert set(found.arms) == {"left_arm"}
-    arm = described_in(real.manifest).arms[0]
+    arm = robot_for(real.manifest).arms[0]
     here, there = (arm.pose(STANDS + np.eye(len(STANDS))[0] * angle)[:3] for angle in (angles[0], angles[-1]))
     assert found.arms["left_arm"]["measured_m"] > np.linalg.norm(there - here)
     assert found.why == ""
@@ -129,11 +129,11 @@ def test_who_cannot_be_measured_says_why(real):
 @pytest.mark.django_db
 def test_it_is_asked_for_once_and_kept_with_the_episode(closed, monkeypatch):
     episode = closed()
-    assert look_for_unmeasured() == 1
-    assert look_for_unmeasured() == 0
+    assert find_unmeasured_episodes() == 1
+    assert find_unmeasured_episodes() == 0
     job = Job.objects.get(kind="smoothness")
     Job.objects.exclude(pk=job.pk).delete()
-    assert work("cpu") == 1
+    assert run_queue("cpu") == 1
     episode = Episode.objects.get(pk=episode.pk)
     found = smoothness_in(services.journal_folder(episode.uuid))
     assert (episode.smoothness, episode.smoothness_commanded) == (found.measured, found.commanded)
@@ -146,19 +146,19 @@ def test_what_could_not_be_measured_is_tried_again_when_its_folder_is_read_anew(
     manifest = services.journal_folder(episode.uuid) / "manifest.json"
     kept = manifest.read_bytes()
     manifest.unlink()
-    look_for_unmeasured()
+    find_unmeasured_episodes()
     Job.objects.exclude(kind="smoothness").delete()
-    work("cpu")
+    run_queue("cpu")
     episode.refresh_from_db()
     assert episode.smoothness is None
     assert "manifest.json" in episode.smoothness_detail["why"]
     manifest.write_bytes(kept)
-    services.episode_read(uuid=episode.uuid)
-    assert look_for_unmeasured() == 1
+    services.sync_episode(uuid=episode.uuid)
+    assert find_unmeasured_episodes() == 1
 
 
 @pytest.mark.django_db
 @pytest.mark.parametrize("facts", [{"kind": "demonstration"}, {"status": "missing"}, {"frames": 0}])
 def test_nobody_asks_for_that_of_what_is_no_run(closed, facts):
     Episode.objects.filter(pk=closed().pk).update(**facts)
-    assert look_for_unmeasured() == 0
+    assert find_unmeasured_episodes() == 0

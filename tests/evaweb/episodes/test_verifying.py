@@ -13,9 +13,9 @@ from django.contrib.auth.models import User
 from django.test import Client
 from django.utils import timezone
 
-from evaweb.datasets.on_robot import recorded_at
+from evaweb.datasets.on_robot import playable_episode
 from evaweb.episodes import selectors, services, verifying
-from evaweb.episodes.job_kinds import look_for_unverified
+from evaweb.episodes.job_kinds import find_unverified_episodes
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict
@@ -35,7 +35,7 @@ Closed = Callable[..., Episode]
 def old(closed: Closed) -> Episode:
     """An episode of a week ago, whose worker has nothing else to do."""
     episode = closed()
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
     episode.refresh_from_db()
     return episode
@@ -53,8 +53,8 @@ def a_bit_off(path: Path) -> Iterator[None]:
 
 def scrubbed() -> Job:
     """The worker's next look, and what it then does."""
-    assert look_for_unverified()
-    jobs.work("cpu")
+    assert find_unverified_episodes()
+    jobs.run_queue("cpu")
     return Job.objects.filter(kind="scrub").latest("created_at")
 
 
@@ -67,7 +67,7 @@ def test_an_old_recording_is_verified_once_and_again_after_a_month(old: Episode)
     assert job.status == JobStatus.DONE
     assert (job.result["sound"], job.result["found"], job.result["problems"]) == (1, [], [])
     assert job.result["bytes"] > 1000
-    assert not look_for_unverified()
+    assert not find_unverified_episodes()
     Episode.objects.update(verified_at=timezone.now() - verifying.AGAIN_AFTER - timedelta(hours=1))
     assert scrubbed().pk != job.pk
     old.refresh_from_db()
@@ -80,27 +80,27 @@ def test_what_was_just_recorded_waits_and_so_does_a_scrub_while_anything_else_is
     episode = closed()
     assert Job.objects.filter(status=JobStatus.QUEUED).exists()  # its preview
     Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
-    assert not look_for_unverified()
-    jobs.work("cpu")
+    assert not find_unverified_episodes()
+    jobs.run_queue("cpu")
     Episode.objects.update(created_at=timezone.now())
-    assert not look_for_unverified()
+    assert not find_unverified_episodes()
     Episode.objects.filter(pk=episode.pk).update(created_at=timezone.now() - timedelta(days=7))
-    assert look_for_unverified()
+    assert find_unverified_episodes()
 
 
 def test_a_scrub_goes_round_a_bounded_part_at_a_time(
     old: Episode, put: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = put("interrupted")
-    services.episode_read(uuid=folder.name)
-    jobs.work("cpu")
+    services.sync_episode(uuid=folder.name)
+    jobs.run_queue("cpu")
     Episode.objects.update(created_at=timezone.now() - timedelta(days=7))
     monkeypatch.setattr(verifying, "MOST_BYTES", 1)
     assert scrubbed().result["sound"] == 1
     assert Episode.objects.filter(verified_at=None).count() == 1
     assert scrubbed().result["sound"] == 1
     assert not Episode.objects.filter(verified_at=None).exists()
-    assert not look_for_unverified()
+    assert not find_unverified_episodes()
 
 
 def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
@@ -123,14 +123,14 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
         old = Episode.objects.get(pk=old.pk)
         assert [damage["file"] for damage in old.damage] == ["ticks.arrow"]
         with pytest.raises(Conflict, match=r"is damaged: ticks\.arrow is changed"):
-            recorded_at(str(old.uuid))
-        jobs.work("cpu")
+            playable_episode(str(old.uuid))
+        jobs.run_queue("cpu")
     Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
     assert scrubbed().result["sound"] == 1
     old.refresh_from_db()
     assert (old.damage, marked_damage(data, str(old.uuid))) == ([], [])
     assert not selectors.episode_list(quality="damaged").exists()
-    assert recorded_at(str(old.uuid)).rows == old.frames
+    assert playable_episode(str(old.uuid)).rows == old.frames
 
 
 @pytest.mark.some(2)
@@ -139,8 +139,8 @@ def test_damage_is_kept_on_the_disk_and_shown_until_the_files_are_back(
 )
 def test_a_publication_finds_the_damage_itself_and_keeps_it(old: Episode, data: Path, name: str) -> None:
     with a_bit_off(folder_of(data, old) / name):
-        job = services.publish_asked(episode=old)
-        jobs.work("cpu")
+        job = services.request_publish(episode=old)
+        jobs.run_queue("cpu")
         job.refresh_from_db()
     assert (job.status, job.attempts, job.result["published"]) == (JobStatus.DONE, 0, False)
     assert f"is damaged: {name} is " in job.result["why"]
@@ -152,8 +152,8 @@ def test_a_publication_finds_the_damage_itself_and_keeps_it(old: Episode, data: 
 def test_figures_of_damaged_rows_are_not_measured(old: Episode, data: Path) -> None:
     Episode.objects.update(smoothness=None, smoothness_detail=None)
     with a_bit_off(folder_of(data, old) / "rows.arrow"):
-        assert services.smoothness_asked(most=1) == 1
-        jobs.work("cpu")
+        assert services.request_smoothness(most=1) == 1
+        jobs.run_queue("cpu")
     old.refresh_from_db()
     assert old.smoothness is None
     assert "rows.arrow is changed" in old.smoothness_detail["why"]
@@ -163,8 +163,8 @@ def test_an_older_recording_is_published_and_said_to_have_no_digests(old: Episod
     unsealed(folder_of(data, old))
     Episode.objects.update(seal="")
     assert scrubbed().result["unsealed"] == 1
-    job = services.publish_asked(episode=old)
-    jobs.work("cpu")
+    job = services.request_publish(episode=old)
+    jobs.run_queue("cpu")
     job.refresh_from_db()
     assert (job.result["published"], job.result["remark"]) == (True, UNSEALED)
 
@@ -174,7 +174,7 @@ def test_a_recording_that_is_gone_keeps_none_of_the_others(old: Episode, data: P
     job = scrubbed()
     assert (job.status, job.result["sound"]) == (JobStatus.DONE, 0)
     assert "is no episode" in job.result["problems"][0]
-    assert not look_for_unverified()
+    assert not find_unverified_episodes()
 
 
 # --- an outcome that is lost ---------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def test_a_recording_that_is_gone_keeps_none_of_the_others(old: Episode, data: P
 
 def again() -> Job:
     """The next look, a month later."""
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     Episode.objects.update(verified_at=None, created_at=timezone.now() - timedelta(days=7))
     return scrubbed()
 
@@ -225,8 +225,8 @@ def test_one_that_was_sealed_anew_before_anybody_looked_is_damaged_and_not_publi
     shutil.rmtree(data / "exports")
     (folder / "rows.arrow").write_bytes(aside["rows.arrow"][:-20])
     assert repair(folder).verdict == "repaired"
-    publication = services.publish_asked(episode=old)
-    jobs.work("cpu")
+    publication = services.request_publish(episode=old)
+    jobs.run_queue("cpu")
     publication.refresh_from_db()
     said = "outcome.json is not the one with which the recording was closed"
     assert publication.result["published"] is False

@@ -16,13 +16,13 @@ from django.urls import reverse
 from evaweb.episodes.folders import preview_folder, preview_video
 from evaweb.episodes.job_kinds import store_at_start
 from evaweb.episodes.models import Episode
-from evaweb.episodes.selectors import stage_of
+from evaweb.episodes.selectors import playback_stage
 from evaweb.episodes.videos import video_address, video_file
 from evaweb.headers import content_security_policy
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.object_stores import StoreError
-from evaweb.results.ratings.stills import stills_of
+from evaweb.results.ratings.stills import trial_stills
 from tests.evaweb.s3_server import SECRET, Server, why_no_server
 
 pytestmark = pytest.mark.django_db
@@ -47,7 +47,7 @@ def stored(request: Any, closed: Callable[..., Episode], tmp_path: Path, setting
     else:
         settings.EVA_STORE = request.getfixturevalue("server").bucket(prefix=tmp_path.name)
     episode = closed()
-    assert work("cpu") == 2  # the preview, and what follows of it
+    assert run_queue("cpu") == 2  # the preview, and what follows of it
     assert {(job.kind, job.status) for job in Job.objects.all()} == {("preview", "done"), ("store", "done")}
     return Episode.objects.get(pk=episode.pk)
 
@@ -64,9 +64,9 @@ both = pytest.mark.parametrize("stored", ["folder", "s3"], indirect=True)
 @both
 def test_they_are_in_the_store_alone_and_can_be_played_and_judged(stored: Episode) -> None:
     assert list(preview_folder(stored.pk).glob("*.mp4")) == []
-    assert stage_of(episode=stored).name == "ready"
+    assert playback_stage(episode=stored).name == "ready"
     assert video_file(stored.pk, CAMERA).stat().st_size > 0
-    assert stills_of(stored)
+    assert trial_stills(stored)
 
 
 @pytest.mark.parametrize("stored", ["s3"], indirect=True)
@@ -102,7 +102,7 @@ def test_a_store_that_is_away_leaves_them_here_until_a_worker_starts_and_it_is_b
     settings.EVA_STORE = tmp_path / "store"
     settings.EVA_STORE.write_bytes(b"no folder")
     store_at_start()
-    work("cpu")
+    run_queue("cpu")
     job = Job.objects.get(kind="store")
     assert "does not take a file" in job.error
     assert preview_video(previewed.pk, CAMERA).is_file()
@@ -110,7 +110,7 @@ def test_a_store_that_is_away_leaves_them_here_until_a_worker_starts_and_it_is_b
     settings.EVA_STORE.unlink()
     settings.EVA_STORE.mkdir()
     store_at_start()
-    assert work("cpu") == 1
+    assert run_queue("cpu") == 1
     assert not preview_video(previewed.pk, CAMERA).exists()
     assert video_file(previewed.pk, CAMERA).is_file()
 

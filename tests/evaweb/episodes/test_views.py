@@ -289,7 +289,7 @@ def test_the_page_waits_for_the_preview_and_goes_on_by_itself(
     assert 'hx-trigger="every 1s"' in page
     address = reverse("replay-stage", args=[episode.uuid])
     assert "HX-Refresh" not in browser.get(address)
-    jobs.work("cpu")
+    jobs.run_queue("cpu")
     assert browser.get(address)["HX-Refresh"] == "true"
 
 
@@ -440,7 +440,7 @@ def test_a_table_that_is_not_made_yet_is_made_on_demand(
     asked = browser.post(address).content.decode()
     assert "is being made" in asked
     assert f'hx-get="{reverse("episode-table", args=[previewed.uuid])}"' in asked
-    assert jobs.work("cpu") == 1
+    assert jobs.run_queue("cpu") == 1
     assert fetch(address)[2] == content
     shown = browser.get(reverse("episode-table", args=[previewed.uuid])).content.decode()
     assert f'href="{address}"' in shown

@@ -7,13 +7,13 @@ from django.db import connection
 from django.test import Client
 from django.test.utils import CaptureQueriesContext
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.errors import EvaError
 from evaweb.find.selectors import LONGEST, MOST, find
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.blinding_rules import look
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.blind_lab import NAMES
@@ -37,7 +37,7 @@ def bench():
 
 def found(query, user):
     """Group -> titles."""
-    groups = find(query=query, user=user, sight=sight_of(user))
+    groups = find(query=query, user=user, sight=visibility_for_user(user))
     return {group.name: [one.title for one in group.items] for group in groups}
 
 
@@ -46,7 +46,7 @@ def blind_plan(bench, owner):
     plan = Plan.objects.create(name="blocks", title="Blocks", owner=owner)
     plan.checkpoints.set(rows)
     plan.positions.set(bench.scene.positions.all())
-    return plan_freeze(user=owner, plan=plan)
+    return freeze_plan(user=owner, plan=plan)
 
 
 def test_each_kind_is_found_by_its_names(bench):
@@ -69,7 +69,7 @@ def test_an_address_leads_to_a_page_that_the_user_may_open(bench, settings):
         browser = Client()
         browser.force_login(user)
         for query in ("e", "bench", "pi0", "plate", "administration", "cups"):
-            for group in find(query=query, user=user, sight=sight_of(user)):
+            for group in find(query=query, user=user, sight=visibility_for_user(user)):
                 for one in group.items:
                     assert browser.get(one.address).status_code == 200, one
 
@@ -78,7 +78,7 @@ def test_the_nearest_comes_first_and_no_more_than_a_few(bench):
     for number in range(12):
         Station.objects.create(name=f"a-bench-{number}", robot="agilex_piper")
     Station.objects.create(name="bench", robot="agilex_piper")
-    group = find(query="bench", user=bench.operator, sight=sight_of(bench.operator))[0]
+    group = find(query="bench", user=bench.operator, sight=visibility_for_user(bench.operator))[0]
     assert [one.title for one in group.items[:3]] == ["bench", "bench-1", "a-bench-0"]
     assert (len(group.items), group.more) == (MOST, True)
 
@@ -86,13 +86,13 @@ def test_the_nearest_comes_first_and_no_more_than_a_few(bench):
 @pytest.mark.parametrize("query", ["", "   ", "x" * (LONGEST + 1)])
 def test_a_query_that_is_too_short_or_too_long_is_refused(bench, query):
     with pytest.raises(EvaError, match=f"allowed: 1 to {LONGEST}"):
-        find(query=query, user=bench.operator, sight=sight_of(bench.operator))
+        find(query=query, user=bench.operator, sight=visibility_for_user(bench.operator))
 
 
 def test_what_is_hidden_is_neither_found_nor_counted(bench):
     olga = builders.user("olga")
     plan = blind_plan(bench, olga)
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
     code = trial.handout.code
     browser = Client()
     browser.force_login(bench.operator)
@@ -103,7 +103,7 @@ def test_what_is_hidden_is_neither_found_nor_counted(bench):
     assert found("secret", bench.operator) == {}
     assert found("pi0", bench.operator) == {"Checkpoints": ["pi0-block"]}
     assert found(code.lower(), bench.operator)["Trials"] == [f"Trial {trial.pk} · {code}"]
-    look(plan, olga)
+    record_unblinding(plan, olga)
     assert found("secret", olga)["Checkpoints"] == list(NAMES)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from evaweb.jobs import doorbell, kinds
-from evaweb.jobs.kinds import Args, Work
+from evaweb.jobs.kinds import Args, JobContext
 
 
 class Toy:
@@ -15,9 +15,9 @@ class Toy:
 
     def __init__(self) -> None:
         self.asked: list[Args] = []
-        self.does: Callable[[Work], Args] = lambda work: {"seen": dict(work.args)}
+        self.does: Callable[[JobContext], Args] = lambda work: {"seen": dict(work.args)}
 
-    def __call__(self, work: Work) -> Args:
+    def __call__(self, work: JobContext) -> Args:
         self.asked.append(work.args)
         return self.does(work)
 
@@ -33,5 +33,5 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
 def rung(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The queues whose doorbell was rung; no broker hears of it."""
     queues: list[str] = []
-    monkeypatch.setattr(doorbell, "ring", queues.append)
+    monkeypatch.setattr(doorbell, "notify_workers", queues.append)
     return queues

@@ -27,7 +27,7 @@ def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_it_leaves_a_message_for_its_queue(broker: Path) -> None:
-    assert doorbell.ring("bench-1") is True
+    assert doorbell.notify_workers("bench-1") is True
     (message,) = (broker / "queue").iterdir()
     assert message.name.endswith(".bench-1.msg")
 
@@ -37,7 +37,7 @@ def test_a_broker_that_cannot_be_written_is_no_error_of_who_asks(
 ) -> None:
     (broker / "queue").rmdir()
     (broker / "queue").write_text("in the way")
-    assert doorbell.ring("lab") is False
+    assert doorbell.notify_workers("lab") is False
     assert "no doorbell for queue lab, a worker finds its jobs within seconds" in caplog.text
 
 

@@ -13,8 +13,8 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, NotAllowed
 from evaweb.jobs import database_retry, locks, services
-from evaweb.jobs.kinds import UnknownKind, Work
-from evaweb.jobs.locks import alone
+from evaweb.jobs.kinds import JobContext, UnknownKind
+from evaweb.jobs.locks import exclusive_job
 from evaweb.jobs.models import Job, JobStatus
 from tests.evaweb.conftest import person
 from tests.evaweb.jobs.conftest import Toy
@@ -43,17 +43,17 @@ def claim() -> Job:
     return claimed
 
 
-def break_down(work: Work) -> dict[str, object]:
+def break_down(work: JobContext) -> dict[str, object]:
     raise ValueError("rows.arrow is damaged")
 
 
 def test_a_job_is_done_and_keeps_its_result(toy: Toy) -> None:
     job = enqueue(a=1)
-    assert services.work("cpu") == 1
+    assert services.run_queue("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.result, job.attempts) == (JobStatus.DONE, {"seen": {"a": 1}}, 0)
     assert job.finished_at is not None
-    assert services.work("cpu") == 0
+    assert services.run_queue("cpu") == 0
 
 
 @pytest.mark.django_db(transaction=True)
@@ -64,21 +64,21 @@ def test_the_doorbell_rings_when_the_row_can_be_seen(toy: Toy, rung: list[str]) 
 
 def test_the_same_key_twice_is_one_job_with_the_newest_args(toy: Toy) -> None:
     assert enqueue(a=1).pk == enqueue(a=2).pk
-    services.work("cpu")
+    services.run_queue("cpu")
     assert toy.asked == [{"a": 2}]
 
 
 def test_what_is_asked_for_while_the_same_is_being_done_is_done_once_more_afterwards(toy: Toy) -> None:
     enqueue(a=1)
 
-    def ask_again(work: Work) -> dict[str, object]:
+    def ask_again(work: JobContext) -> dict[str, object]:
         if work.args["a"] == 1:
             enqueue(a=2)
             assert services.claim(queue="cpu", owner=uuid4()) is None, "two of one key at once"
         return {}
 
     toy.does = ask_again
-    assert services.work("cpu") == 2
+    assert services.run_queue("cpu") == 2
     assert toy.asked == [{"a": 1}, {"a": 2}]
 
 
@@ -90,7 +90,7 @@ def test_of_two_workers_one_gets_the_job(toy: Toy) -> None:
 
 def test_another_queue_is_left_alone(toy: Toy) -> None:
     enqueue()
-    assert services.work("gpu") == 0
+    assert services.run_queue("gpu") == 0
 
 
 def test_a_kind_that_nobody_knows_is_refused_when_it_is_asked_for(toy: Toy) -> None:
@@ -102,28 +102,28 @@ def test_an_error_is_kept_and_tried_again_later_until_the_last_attempt(toy: Toy)
     toy.does = break_down
     job = enqueue()
     for attempt in range(1, services.MOST_ATTEMPTS):
-        assert services.work("cpu") == 1
+        assert services.run_queue("cpu") == 1
         job.refresh_from_db()
         assert (job.status, job.attempts) == (JobStatus.QUEUED, attempt)
         assert job.error == "rows.arrow is damaged"
-        assert services.work("cpu") == 0, "it waits before it is tried again"
+        assert services.run_queue("cpu") == 0, "it waits before it is tried again"
         due(job)
-    services.work("cpu")
+    services.run_queue("cpu")
     job.refresh_from_db()
     assert (job.status, job.error) == (JobStatus.FAILED, "rows.arrow is damaged")
     toy.does = lambda work: {}
-    services.try_again(user=person("olga", "operator"), job=job)
-    assert services.work("cpu") == 1
+    services.retry_job(user=person("olga", "operator"), job=job)
+    assert services.run_queue("cpu") == 1
 
 
 def test_a_silent_worker_is_swept_and_its_job_done_once_by_another(toy: Toy) -> None:
     job = enqueue()
     silenced = claim()
-    assert services.sweep() == 0, "it was seen just now"
+    assert services.reclaim_stale_jobs() == 0, "it was seen just now"
     silent(job)
-    assert services.sweep() == 1
-    assert services.sweep() == 0
-    assert services.work("cpu") == 1
+    assert services.reclaim_stale_jobs() == 1
+    assert services.reclaim_stale_jobs() == 0
+    assert services.run_queue("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.DONE, 0, 1)
     assert services.job_done(job=silenced, result={"late": True}) is False
@@ -137,16 +137,16 @@ def test_the_clocks_of_workers_decide_nothing(
 ) -> None:
     toy.does = break_down
     enqueue()
-    services.work("cpu")
+    services.run_queue("cpu")
     now = timezone.now()
     off = now + timedelta(seconds=seconds)
     monkeypatch.setattr(timezone, "now", lambda: off)
     assert services.claim(queue="cpu", owner=uuid4()) is None, "it waits before it is tried again"
     Job.objects.update(not_before=None)
     job = claim()
-    assert services.sweep() == 0, "it was seen just now"
+    assert services.reclaim_stale_jobs() == 0, "it was seen just now"
     assert abs(job.seen_at - now) < timedelta(seconds=30)
-    assert services.seen(job=job)
+    assert services.heartbeat(job=job)
     assert services.job_done(job=job, result={})
     job.refresh_from_db()
     assert job.finished_at - job.created_at < timedelta(seconds=30)
@@ -155,19 +155,19 @@ def test_the_clocks_of_workers_decide_nothing(
 def test_a_worker_that_has_ended_is_not_waited_for_where_that_is_certain(toy: Toy) -> None:
     job = enqueue()
     claimed = claim()
-    with alone(job.key, claimed.owner):
+    with exclusive_job(job.key, claimed.owner):
         silent(job)
-        assert services.sweep() == 0, "it is at work, whatever its signs of life"
+        assert services.reclaim_stale_jobs() == 0, "it is at work, whatever its signs of life"
         left = locks._path(job.key).read_bytes()
     Job.objects.update(seen_at=Now())
-    assert services.sweep() == 0, "it has let go: its signs of life tell"
+    assert services.reclaim_stale_jobs() == 0, "it has let go: its signs of life tell"
     locks._path(job.key).write_bytes(left.replace(str(claimed.owner).encode(), str(uuid4()).encode()))
-    assert services.sweep() == 0, "the lock is one that somebody else has left"
+    assert services.reclaim_stale_jobs() == 0, "the lock is one that somebody else has left"
     locks._path(job.key).write_bytes(left[:36] + b" another kernel")
-    assert services.sweep() == 0, "locks of another machine may not reach here"
+    assert services.reclaim_stale_jobs() == 0, "locks of another machine may not reach here"
     locks._path(job.key).write_bytes(left)
-    assert services.sweep() == 1
-    assert services.work("cpu") == 1
+    assert services.reclaim_stale_jobs() == 1
+    assert services.run_queue("cpu") == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.DONE, 0, 1)
     assert not locks._path(job.key).exists()
@@ -176,14 +176,14 @@ def test_a_worker_that_has_ended_is_not_waited_for_where_that_is_certain(toy: To
 def test_two_of_one_key_are_never_at_work_on_one_disk(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locks, "_AGAIN_S", 0.0)
     job = enqueue()
-    with alone(job.key, uuid4()):
-        assert services.work("cpu") == 1
+    with exclusive_job(job.key, uuid4()):
+        assert services.run_queue("cpu") == 1
     assert toy.asked == []
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.QUEUED, 0, 0)
     assert "the worker that had it before is still at it" in job.progress
     due(job)
-    assert services.work("cpu") == 1
+    assert services.run_queue("cpu") == 1
     assert len(toy.asked) == 1
 
 
@@ -191,15 +191,15 @@ def test_a_worker_whose_job_was_taken_goes_no_further_with_it(toy: Toy) -> None:
     job = enqueue()
     written = []
 
-    def tell(work: Work) -> dict[str, object]:
+    def tell(work: JobContext) -> dict[str, object]:
         Job.objects.filter(pk=job.pk).update(owner=other)
-        work.tell("camera 1 of 3")
+        work.report_progress("camera 1 of 3")
         written.append("camera 2")
         return {}
 
     other = uuid4()
     toy.does = tell
-    services.work("cpu")
+    services.run_queue("cpu")
     job.refresh_from_db()
     assert (job.status, job.owner, job.attempts, job.progress) == (JobStatus.RUNNING, other, 0, "")
     assert written == []
@@ -211,7 +211,7 @@ def test_a_job_that_ends_every_worker_fails_in_the_end_and_lets_others_have_thei
         due(job)
         dead = claim()
         silent(job)
-        assert services.sweep() == 1
+        assert services.reclaim_stale_jobs() == 1
         assert death == 0 or services.claim(queue="cpu", owner=uuid4()) is None, "it waits for its next turn"
     job.refresh_from_db()
     assert (job.status, job.attempts) == (JobStatus.FAILED, 0)
@@ -219,8 +219,8 @@ def test_a_job_that_ends_every_worker_fails_in_the_end_and_lets_others_have_thei
         f"its worker {dead.owner} ended or went silent, which is number 8 of 8: "
         "the worker's log says what ended them; then try it again"
     )
-    services.try_again(user=person("olga", "operator"), job=job)
-    assert services.work("cpu") == 1
+    services.retry_job(user=person("olga", "operator"), job=job)
+    assert services.run_queue("cpu") == 1
 
 
 def test_deaths_of_workers_use_up_no_attempts(toy: Toy) -> None:
@@ -230,9 +230,9 @@ def test_deaths_of_workers_use_up_no_attempts(toy: Toy) -> None:
         due(job)
         claim()
         silent(job)
-        services.sweep()
+        services.reclaim_stale_jobs()
         due(job)
-        services.work("cpu")
+        services.run_queue("cpu")
         job.refresh_from_db()
         assert (job.attempts, job.deaths) == (errors, errors)
     assert job.status == JobStatus.FAILED
@@ -243,10 +243,10 @@ def test_a_stale_job_gives_way_to_one_that_was_asked_for_anew(toy: Toy) -> None:
     claim()
     silent(old)
     new = enqueue(a=2)
-    assert services.sweep() == 1
+    assert services.reclaim_stale_jobs() == 1
     old.refresh_from_db()
     assert old.status == JobStatus.FAILED
-    assert services.work("cpu") == 1
+    assert services.run_queue("cpu") == 1
     new.refresh_from_db()
     assert new.status == JobStatus.DONE
 
@@ -255,33 +255,33 @@ def test_a_sign_of_life_is_one_only_from_who_has_the_job(toy: Toy) -> None:
     job = enqueue()
     claimed = claim()
     silent(job)
-    assert services.seen(job=claimed) is True
-    assert services.sweep() == 0
+    assert services.heartbeat(job=claimed) is True
+    assert services.reclaim_stale_jobs() == 0
     claimed.owner = uuid4()
-    assert services.seen(job=claimed) is False
+    assert services.heartbeat(job=claimed) is False
 
 
 def test_what_an_ending_worker_puts_back_is_neither_an_error_nor_a_death(toy: Toy) -> None:
     job = enqueue()
     claimed = claim()
-    assert services.put_back(owner=uuid4()) == 0
-    assert services.put_back(owner=claimed.owner) == 1
+    assert services.requeue(owner=uuid4()) == 0
+    assert services.requeue(owner=claimed.owner) == 1
     job.refresh_from_db()
     assert (job.status, job.attempts, job.deaths) == (JobStatus.QUEUED, 0, 0)
-    assert services.work("cpu") == 1
+    assert services.run_queue("cpu") == 1
 
 
 def test_progress_is_shown_while_it_works_and_gone_afterwards(toy: Toy) -> None:
     job = enqueue()
 
-    def tell(work: Work) -> dict[str, object]:
-        work.tell("camera 1 of 3")
+    def tell(work: JobContext) -> dict[str, object]:
+        work.report_progress("camera 1 of 3")
         job.refresh_from_db()
         assert (job.status, job.progress) == (JobStatus.RUNNING, "camera 1 of 3")
         return {}
 
     toy.does = tell
-    services.work("cpu")
+    services.run_queue("cpu")
     job.refresh_from_db()
     assert (job.status, job.progress) == (JobStatus.DONE, "")
 
@@ -295,7 +295,7 @@ def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
     for name in ("claim", "job_done"):
         monkeypatch.setattr(services, name, locked_twice(getattr(services, name)))
     job = enqueue()
-    assert services.work("cpu") == 1
+    assert services.run_queue("cpu") == 1
     job.refresh_from_db()
     assert job.status == JobStatus.DONE
     assert len(toy.asked) == 1
@@ -324,7 +324,7 @@ def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         raise OperationalError("database is locked")
 
     with pytest.raises(OperationalError, match="locked"):
-        database_retry.patiently(away)
+        database_retry.retry_while_locked(away)
     assert len(attempts) == len(database_retry.WAITS_S) + 1
 
 
@@ -339,46 +339,46 @@ def ann() -> User:
 def test_a_job_that_waits_is_cancelled_at_once(toy: Toy, ann: User) -> None:
     job = services.cancel(user=ann, job=enqueue())
     assert (job.status, job.error, job.cancelled_by) == (JobStatus.FAILED, "cancelled by ann", ann)
-    assert services.work("cpu") == 0
+    assert services.run_queue("cpu") == 0
     assert toy.asked == []
 
 
 def test_a_job_that_runs_ends_at_its_next_step_and_can_be_repeated(toy: Toy, ann: User) -> None:
     steps = []
 
-    def walk(work: Work) -> dict[str, object]:
+    def walk(work: JobContext) -> dict[str, object]:
         for step in range(3):
             steps.append(step)
             if step == 1:
                 services.cancel(user=ann, job=Job.objects.get())
-            work.tell(f"step {step + 1} of 3")
+            work.report_progress(f"step {step + 1} of 3")
         return {}
 
     toy.does = walk
     job = enqueue()
-    services.work("cpu")
+    services.run_queue("cpu")
     job.refresh_from_db()
     assert steps == [0, 1]
     assert (job.status, job.error, job.attempts) == (JobStatus.FAILED, "cancelled by ann", 0)
     toy.does = lambda work: {}
-    services.try_again(user=person("olga", "operator"), job=job)
-    assert services.work("cpu") == 1
+    services.retry_job(user=person("olga", "operator"), job=job)
+    assert services.run_queue("cpu") == 1
 
 
 def test_what_is_cancelled_is_not_tried_again_after_an_error_or_a_death(toy: Toy, ann: User) -> None:
-    def cancelled(work: Work) -> dict[str, object]:
+    def cancelled(work: JobContext) -> dict[str, object]:
         services.cancel(user=ann, job=Job.objects.get())
         raise ValueError("rows.arrow is damaged")
 
     toy.does = cancelled
     job = enqueue()
-    services.work("cpu")
+    services.run_queue("cpu")
     job.refresh_from_db()
     assert (job.status, job.error) == (JobStatus.FAILED, "cancelled by ann")
     other = services.enqueue(kind="toy", key="toy:2", args={})
     services.cancel(user=ann, job=claim())
     silent(other)
-    services.sweep()
+    services.reclaim_stale_jobs()
     other.refresh_from_db()
     assert (other.status, other.error) == (JobStatus.FAILED, "cancelled by ann")
 
@@ -386,7 +386,7 @@ def test_what_is_cancelled_is_not_tried_again_after_an_error_or_a_death(toy: Toy
 def test_what_was_done_before_its_next_step_is_done(toy: Toy, ann: User) -> None:
     toy.does = lambda work: {"by": services.cancel(user=ann, job=Job.objects.get()).pk}
     job = enqueue()
-    services.work("cpu")
+    services.run_queue("cpu")
     job.refresh_from_db()
     assert job.status == JobStatus.DONE
     with pytest.raises(Conflict, match="nothing to cancel"):

@@ -48,7 +48,7 @@ def test_a_job_goes_into_the_queue_of_its_kind_which_is_one_that_workers_take() 
     }
     assert kinds.without_folder() == ["preflight"]
     assert enqueue("preflight").queue == "station"
-    assert services.work("cpu") == 0
+    assert services.run_queue("cpu") == 0
 
 
 @pytest.mark.parametrize("given", ["", ",", "lab", "cpu,,disk", "CPU"])
@@ -170,7 +170,7 @@ def test_what_a_swept_job_held_is_free(toy: Toy) -> None:
     one = at_work("one")
     services.hold(one, ["datasets/a"])
     Job.objects.filter(pk=one.pk).update(seen_at=Now() - timedelta(hours=1))
-    assert services.sweep() == 1
+    assert services.reclaim_stale_jobs() == 1
     again = services.claim(queue="cpu", owner=uuid4())
     assert again is not None
     services.hold(again, ["datasets/a"])
@@ -208,7 +208,7 @@ def test_where_there_are_several_machines_a_worker_ends_before_its_job_is_anothe
     ended: list[int] = []
     monkeypatch.setattr(services.os, "_exit", ended.append)
 
-    def taken(work: kinds.Work) -> kinds.Args:
+    def taken(work: kinds.JobContext) -> kinds.Args:
         Job.objects.update(owner=uuid4())
         while not ended:
             services.time.sleep(0.01)
@@ -216,6 +216,6 @@ def test_where_there_are_several_machines_a_worker_ends_before_its_job_is_anothe
 
     toy.does = taken
     enqueue()
-    services.work("cpu")
+    services.run_queue("cpu")
     assert ended == [1]
     assert Job.objects.get().status == JobStatus.RUNNING, "it is the other's"

@@ -219,21 +219,21 @@ def test_a_station_that_somebody_has_is_not_removed(monkeypatch):
         def status(self, timeout):
             return {"lease": {"holder": "web:ann:1"}}
 
-    monkeypatch.setattr(deployments, "wire_to", lambda name: Wire())
+    monkeypatch.setattr(deployments, "connection_to", lambda name: Wire())
     with pytest.raises(Conflict, match="web:ann:1 has real-1: it is given back first"):
         deployments.remove(name="real-1")
 
     def gone(name):
         raise StationGone("it does not answer")
 
-    monkeypatch.setattr(deployments, "wire_to", gone)
+    monkeypatch.setattr(deployments, "connection_to", gone)
     deployments.remove(name="real-1")
     assert deployments.kept() == []
 
 
 def test_a_lab_is_seen_as_long_as_it_runs(data):
     assert not deployments.lab_runs()
-    with lifetime.only_one(data):
+    with lifetime.hold_data_folder(data):
         assert deployments.lab_runs()
     assert not deployments.lab_runs()
 

@@ -81,7 +81,7 @@ def test_the_login_page_is_there_without_the_database(client, monkeypatch):
     def away():
         raise OperationalError("gone")
 
-    monkeypatch.setattr(first_account, "nobody_can_log_in", away)
+    monkeypatch.setattr(first_account, "has_no_accounts", away)
     first_account.offer()
     page = client.get("/login/").content.decode()
     assert "Log in" in page

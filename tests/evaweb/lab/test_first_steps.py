@@ -8,10 +8,10 @@ from evaweb.lab import deployments, first_steps, seed
 from evaweb.lab.deployments import Standing
 from evaweb.lab.first_steps import Progress, walk
 from evaweb.plans.models import CameraCheck
-from evaweb.roles import Role, grant
+from evaweb.roles import Role, set_role
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.trials.models import Scene
-from evaweb.trials.services import trial_score
+from evaweb.trials.services import score_trial
 from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db
@@ -26,7 +26,7 @@ def data(settings, tmp_path):
 @pytest.fixture
 def lea(client, alma):
     """An administrator's browser."""
-    grant(user=alma, role=Role.ADMIN)
+    set_role(user=alma, role=Role.ADMIN)
     client.force_login(alma)
     return client
 
@@ -67,10 +67,10 @@ def test_each_step_is_done_by_what_the_lab_has(monkeypatch, alma):
     scene = first_steps.starter_scene()
     assert now() == "trial"
     checkpoint = seed.demo_checkpoint(name="c", description="", policy={"url": "ws://127.0.0.1:1"})
-    bench = builders.Bench(station, scene, checkpoint, builders.user("ann"))
+    bench = builders.TrialBench(station, scene, checkpoint, builders.user("ann"))
     trial = bench.ended()
     assert now() == "trial"
-    trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, True, True, True))
+    score_trial(user=bench.operator, trial=trial, milestones=bench.ticks(True, True, True, True))
     assert now() == "nothing"
     monkeypatch.setattr(first_steps, "_snapshot", lambda station: {})
     assert now() == "nothing"  # a station that is switched off for the night begins nothing anew

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from evaweb.lab import lifetime
-from evaweb.lab.lab import a_lab
+from evaweb.lab.lab import open_lab
 from evaweb.lab.processes import LabError
 from tests.processes import PATIENCE_S
 
@@ -31,7 +31,10 @@ def test_a_port_that_stops_cannot_have_ends_a_lab_before_anything_starts(tmp_pat
     with _listening_above_a_free_one() as other:
         port = other.getsockname()[1]
         for ports in ((0, port), (port - 1, None)):
-            with pytest.raises(LabError, match=rf":{port}: .* with --stop-port"), a_lab("127.0.0.1", *ports):
+            with (
+                pytest.raises(LabError, match=rf":{port}: .* with --stop-port"),
+                open_lab("127.0.0.1", *ports),
+            ):
                 pass
     assert list(tmp_path.iterdir()) == []
 
@@ -57,12 +60,12 @@ def test_a_free_port_stays_free_after_the_look():
 
 def test_a_second_lab_on_the_same_folder_is_refused_with_the_first_ones_number(tmp_path):
     with (
-        lifetime.only_one(tmp_path),
+        lifetime.hold_data_folder(tmp_path),
         pytest.raises(LabError, match=f"process {os.getpid()}"),
-        lifetime.only_one(tmp_path),
+        lifetime.hold_data_folder(tmp_path),
     ):
         pass
-    with lifetime.only_one(tmp_path):
+    with lifetime.hold_data_folder(tmp_path):
         assert (tmp_path / "lab.lock").read_text() == str(os.getpid())
 
 
@@ -78,7 +81,7 @@ try:
         time.sleep(60)
     except Exception:
         print("caught on the way", flush=True)
-except lifetime.Ended:
+except lifetime.StopRequested:
     print("ending", flush=True)
     sys.stdin.readline()
     print("ended", flush=True)

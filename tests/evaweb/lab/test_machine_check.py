@@ -122,7 +122,7 @@ def test_a_station_that_runs_says_what_it_got_and_one_that_does_not_says_nothing
             raise StationGone(name)
         return SimpleNamespace(status=lambda timeout: got[name])
 
-    monkeypatch.setattr(machine_check, "wire_to", wire_to)
+    monkeypatch.setattr(machine_check, "connection_to", wire_to)
     (line,) = machine_check.stations()
     assert (line.name, line.state) == ("Station bench-1", State.LACKING)
     assert line.found == "control ordinary unlocked, reception ordinary"

@@ -7,9 +7,9 @@ import threading
 import pytest
 
 from evaweb.lab import once, patience
-from evaweb.lab.patience import STILL_S, NoReply, VisitFailed, until
-from evaweb.lab.visitor import LivePage, NotYet
-from tests.standing import standing
+from evaweb.lab.patience import STILL_S, DemoFailed, NoReply, wait_until
+from evaweb.lab.visitor import LivePage, StateTimeout
+from tests.standing import state_flags
 
 
 class Clock:
@@ -33,14 +33,14 @@ def clock(monkeypatch):
 
 
 def test_what_goes_on_is_waited_for_however_slow_it_is(clock):
-    found = until(lambda: int(clock.now // 120), lambda rows: rows == 50, "waiting for the dataset")
+    found = wait_until(lambda: int(clock.now // 120), lambda rows: rows == 50, "waiting for the dataset")
     assert found == 50
     assert clock.now > 30 * STILL_S
 
 
 def test_what_stands_still_is_an_error_that_says_what_was_waited_for_and_how_it_stands(clock):
-    with pytest.raises(VisitFailed, match=r"waiting for the dataset: no progress for 180 s; it is .*queued"):
-        until(lambda: {"job": "queued"}, lambda found: False, "waiting for the dataset")
+    with pytest.raises(DemoFailed, match=r"waiting for the dataset: no progress for 180 s; it is .*queued"):
+        wait_until(lambda: {"job": "queued"}, lambda found: False, "waiting for the dataset")
     assert clock.now < 2 * STILL_S
 
 
@@ -53,26 +53,26 @@ def test_a_lab_that_does_not_reply_is_asked_again_and_not_for_ever(clock):
             raise reply
         return reply
 
-    assert until(ask, bool, "scoring") == "scored"
+    assert wait_until(ask, bool, "scoring") == "scored"
 
     def mute():
         raise NoReply("http://127.0.0.1:1 does not answer: timed out")
 
-    with pytest.raises(VisitFailed, match=r"scoring: no progress for 180 s; it is http://.* timed out"):
-        until(mute, bool, "scoring")
+    with pytest.raises(DemoFailed, match=r"scoring: no progress for 180 s; it is http://.* timed out"):
+        wait_until(mute, bool, "scoring")
 
 
 def test_a_refusal_is_told_at_once(clock):
     def refused():
-        raise VisitFailed("HTTP 409: trial 1 is running")
+        raise DemoFailed("HTTP 409: trial 1 is running")
 
-    with pytest.raises(VisitFailed, match="trial 1 is running"):
-        until(refused, bool, "scoring")
+    with pytest.raises(DemoFailed, match="trial 1 is running"):
+        wait_until(refused, bool, "scoring")
     assert clock.now == 0.0
 
 
 def station(clock: Clock, at="running", **said):
-    state = {"boot": "b", "sequence": 3, **standing(at), "reason": "", "stages": [], "truth": {}}
+    state = {"boot": "b", "sequence": 3, **state_flags(at), "reason": "", "stages": [], "truth": {}}
     return state | {"clock": clock.now, "lease": {"epoch": 1}, "run": {"number": 1, "elapsed": 0.0}} | said
 
 
@@ -88,7 +88,7 @@ class Page(LivePage):
         self._state = self._says()
         if reached(self._state):
             return self._state
-        raise NotYet(what)
+        raise StateTimeout(what)
 
     def command(self, kind, trial=None):
         self.asked.append(kind)
@@ -113,14 +113,14 @@ def test_a_run_on_a_slow_machine_is_watched_to_its_end_by_its_own_clock(clock):
 )
 def test_a_run_that_stands_still_or_never_ends_is_an_error(clock, elapsed, fault):
     page = Page(clock, lambda: station(clock, run={"number": 1, "elapsed": elapsed(clock)}))
-    with pytest.raises(VisitFailed, match=fault):
+    with pytest.raises(DemoFailed, match=fault):
         once.run_to_its_end(page, 1, 40.0)
 
 
 def test_that_the_clock_of_the_station_goes_on_is_no_progress_of_a_set_up(clock):
     stages = [{"name": "connect", "state": "active", "seconds": 0.0}]
     page = Page(clock, lambda: station(clock, "setting_up", stages=stages))
-    with pytest.raises(VisitFailed, match="setting up: no progress for 180 s; it is setting_up"):
+    with pytest.raises(DemoFailed, match="setting up: no progress for 180 s; it is setting_up"):
         once.set_up_and_run(page, 1)
     assert page.asked == ["setup"]
 
@@ -133,14 +133,14 @@ def test_a_publication_that_has_failed_is_told_with_its_error(clock):
                 {"items": [failed]} if path.startswith("jobs") else {"dataset_index": None, "duration_s": 1.0}
             )
 
-    with pytest.raises(VisitFailed, match="waiting for the dataset: job publish:u has failed: disk full"):
+    with pytest.raises(DemoFailed, match="waiting for the dataset: job publish:u has failed: disk full"):
         once._published(Visitor(), "u")
 
 
 def test_an_answer_about_an_earlier_lease_ends_no_later_one(clock):
     page = Page(clock, dict)
     page.epoch, page._failure, page._changed = 2, "", threading.Condition()
-    page._told({"type": "renewed", "ok": False, "lost": True, "reason": "claim it first", "epoch": 1})
+    page._on_message({"type": "renewed", "ok": False, "lost": True, "reason": "claim it first", "epoch": 1})
     assert page._failure == ""
-    page._told({"type": "renewed", "ok": False, "lost": True, "reason": "claim it first", "epoch": 2})
+    page._on_message({"type": "renewed", "ok": False, "lost": True, "reason": "claim it first", "epoch": 2})
     assert page._failure == "the lease was lost: claim it first"

@@ -5,7 +5,7 @@ import pytest
 from evaweb.lab import deployments, pickup, simulated
 from evaweb.lab.deployments import Standing
 from evaweb.lab.pickup import Pickup
-from evaweb.lab.processes import LabError, Program
+from evaweb.lab.processes import LabError, ProgramSpec
 from evaweb.lab.simulated import POLICIES, Benches
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint
@@ -204,7 +204,7 @@ def test_an_address_without_a_port_is_no_free_port(url):
 
 def test_programs_that_it_did_not_start_are_left_alone(lab):
     started, found = lab
-    others = [Program("station-tabletop", ("-m", "runtime")), Program("bench-tabletop", ())]
+    others = [ProgramSpec("station-tabletop", ("-m", "runtime")), ProgramSpec("bench-tabletop", ())]
     started.programs += others
     parts = {"transport": {"kind": "zmq"}, "policy": {"kind": "openpi"}}
     deployments.write_draft(name="tabletop", robot="ur5e", task="", parts=parts)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from evaweb.lab import programs
-from evaweb.lab.processes import LabError, Processes, Program, processor_s
-from evaweb.listening import PortTaken, listen
+from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec, processor_s
+from evaweb.listening import PortTaken, open_listener
 from tests.processes import PATIENCE_S, alive, eventually
 
 ANSWERS = """
@@ -26,18 +26,18 @@ STUBBORN = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n
 
 @pytest.fixture
 def processes(tmp_path):
-    made = Processes(tmp_path, tmp_path / "logs", os.environ)
+    made = ChildProcesses(tmp_path, tmp_path / "logs", os.environ)
     yield made
     made.end()
 
 
 def test_a_program_that_announces_is_ready_when_it_says_where_it_is(processes):
-    found = processes.start(Program("one", ("-c", SAYS, "first"), announces=True))
+    found = processes.start(ProgramSpec("one", ("-c", SAYS, "first"), announces=True))
     assert found == {"url": "here first"}
 
 
 def test_what_dies_is_started_again_where_it_was(processes):
-    again = Program(
+    again = ProgramSpec(
         "one", ("-c", SAYS, "first"), announces=True, again=lambda found: ("-c", SAYS, found["url"])
     )
     processes.start(again)
@@ -51,23 +51,25 @@ def test_what_dies_is_started_again_where_it_was(processes):
 
 
 def test_a_port_of_ours_is_never_free_and_who_calls_is_answered_by_the_next_process(processes):
-    with listen("127.0.0.1", 0) as listener:
+    with open_listener("127.0.0.1", 0) as listener:
         descriptor, address = listener.fileno(), listener.getsockname()
         arguments = ("-c", ANSWERS, str(descriptor))
-        processes.start(Program("one", arguments, announces=True, patience_s=0.1, descriptors=(descriptor,)))
+        processes.start(
+            ProgramSpec("one", arguments, announces=True, patience_s=0.1, descriptors=(descriptor,))
+        )
         before = processes.pids()["one"]
         os.kill(before, signal.SIGKILL)
         eventually(lambda: not alive(before), "its end")
         with pytest.raises(PortTaken, match="cannot listen"):
-            listen(*address)
+            open_listener(*address)
         with socket.create_connection(address, PATIENCE_S) as caller:
             processes.watch()
             assert caller.recv(4) == b"here"
 
 
 def test_what_dies_too_often_rests_and_takes_nobody_with_it(processes, caplog):
-    processes.start(Program("one", ("-c", "raise SystemExit('the disk is on fire')")))
-    processes.start(Program("two", ("-c", WAITS)))
+    processes.start(ProgramSpec("one", ("-c", "raise SystemExit('the disk is on fire')")))
+    processes.start(ProgramSpec("two", ("-c", WAITS)))
     two = processes.pids()["two"]
 
     def rests():
@@ -88,20 +90,20 @@ def test_what_dies_too_often_rests_and_takes_nobody_with_it(processes, caplog):
 
 def test_a_program_that_does_not_start_is_named_with_what_it_said(processes):
     with pytest.raises(LabError, match="one did not start: no such robot"):
-        processes.start(Program("one", ("-c", "raise SystemExit('no such robot')"), announces=True))
+        processes.start(ProgramSpec("one", ("-c", "raise SystemExit('no such robot')"), announces=True))
 
 
 def test_a_program_that_says_nothing_is_given_up(processes):
     with pytest.raises(LabError, match=r"one does not get ready \(.* s of the processor, nothing for"):
-        processes.start(Program("one", ("-c", WAITS), announces=True), ready_s=0.5)
+        processes.start(ProgramSpec("one", ("-c", WAITS), announces=True), ready_s=0.5)
 
 
 def test_one_that_is_getting_ready_is_looked_at_while_others_are_watched(processes):
     begun = processes.starting(
-        Program("slow", ("-c", f"import time; time.sleep(0.3)\n{SAYS}", "there"), announces=True)
+        ProgramSpec("slow", ("-c", f"import time; time.sleep(0.3)\n{SAYS}", "there"), announces=True)
     )
     next(begun)
-    processes.start(Program("one", ("-c", WAITS)))
+    processes.start(ProgramSpec("one", ("-c", WAITS)))
     before = processes.pids()
     os.kill(before["one"], signal.SIGKILL)
     eventually(lambda: not alive(before["one"]), "its end")
@@ -120,18 +122,18 @@ def test_one_that_is_getting_ready_is_looked_at_while_others_are_watched(process
 
 def test_one_that_does_not_get_ready_is_ended_and_may_be_started_anew(processes):
     with pytest.raises(LabError, match="one did not start: no such robot"):
-        processes.start(Program("one", ("-c", "raise SystemExit('no such robot')"), announces=True))
+        processes.start(ProgramSpec("one", ("-c", "raise SystemExit('no such robot')"), announces=True))
     assert processes.pids() == {}
-    assert processes.start(Program("one", ("-c", SAYS, "again"), announces=True)) == {"url": "here again"}
+    assert processes.start(ProgramSpec("one", ("-c", SAYS, "again"), announces=True)) == {"url": "here again"}
     with pytest.raises(LabError, match="one is a program of this lab already"):
-        processes.start(Program("one", ("-c", WAITS)))
+        processes.start(ProgramSpec("one", ("-c", WAITS)))
 
 
 def test_a_slow_one_is_waited_for_as_long_as_it_works(processes, monkeypatch):
     spent = iter(range(1, 40))
     monkeypatch.setattr("evaweb.lab.processes.processor_s", lambda pid: float(next(spent)))
     slow = "import time; time.sleep(1); " + SAYS.replace("import sys\n", "import sys; ", 1)
-    told = processes.start(Program("slow", ("-c", slow), announces=True), ready_s=0.0)
+    told = processes.start(ProgramSpec("slow", ("-c", slow), announces=True), ready_s=0.0)
     assert told["url"].startswith("here")
 
 
@@ -139,7 +141,7 @@ def test_a_slow_one_is_waited_for_as_long_as_it_works(processes, monkeypatch):
 def test_one_that_only_works_is_given_up(processes, monkeypatch):
     monkeypatch.setattr("evaweb.lab.processes._MOST_PROCESSOR_S", 0.2)
     with pytest.raises(LabError, match="busy does not get ready"):
-        processes.start(Program("busy", ("-c", "while True: pass"), announces=True))
+        processes.start(ProgramSpec("busy", ("-c", "while True: pass"), announces=True))
 
 
 def test_the_time_on_the_processor_is_that_of_the_process():
@@ -150,8 +152,8 @@ def test_the_time_on_the_processor_is_that_of_the_process():
 
 
 def test_all_end_with_their_lifelines_and_the_stubborn_are_killed(processes):
-    processes.start(Program("one", ("-c", WAITS)))
-    processes.start(Program("two", ("-c", STUBBORN), patience_s=0.2))
+    processes.start(ProgramSpec("one", ("-c", WAITS)))
+    processes.start(ProgramSpec("two", ("-c", STUBBORN), patience_s=0.2))
     pids = processes.pids().values()
     processes.end()
     assert not any(alive(pid) for pid in pids)
@@ -159,7 +161,7 @@ def test_all_end_with_their_lifelines_and_the_stubborn_are_killed(processes):
 
 
 def test_one_that_is_dropped_holds_up_nobody_and_is_killed_when_its_time_is_over(processes, caplog):
-    processes.start(Program("one", ("-c", STUBBORN), patience_s=0.2))
+    processes.start(ProgramSpec("one", ("-c", STUBBORN), patience_s=0.2))
     one = processes.pids()["one"]
     processes.drop("one")
     assert processes.pids() == {}
@@ -175,7 +177,7 @@ def test_one_that_is_dropped_holds_up_nobody_and_is_killed_when_its_time_is_over
 
 
 def test_one_that_is_dropped_has_ended_when_all_end(processes):
-    processes.start(Program("one", ("-c", WAITS)))
+    processes.start(ProgramSpec("one", ("-c", WAITS)))
     one = processes.pids()["one"]
     processes.drop("one")
     processes.end()
@@ -185,9 +187,9 @@ def test_one_that_is_dropped_has_ended_when_all_end(processes):
 @pytest.mark.slow
 def test_they_end_with_us_even_when_we_are_killed(tmp_path):
     script = (
-        "import os, sys, time\nfrom pathlib import Path\nfrom evaweb.lab.processes import Processes, Program\n"
-        f"p = Processes(Path({str(tmp_path)!r}), Path({str(tmp_path)!r}), os.environ)\n"
-        f"p.start(Program('one', ('-c', {WAITS!r})))\n"
+        "import os, sys, time\nfrom pathlib import Path\nfrom evaweb.lab.processes import ChildProcesses, ProgramSpec\n"
+        f"p = ChildProcesses(Path({str(tmp_path)!r}), Path({str(tmp_path)!r}), os.environ)\n"
+        f"p.start(ProgramSpec('one', ('-c', {WAITS!r})))\n"
         f"Path({str(tmp_path / 'pid')!r}).write_text(str(p.pids()['one']))\ntime.sleep(600)\n"
     )
     import subprocess
@@ -213,10 +215,10 @@ def test_the_process_for_stops_has_a_socket_of_the_labs_and_gives_way_to_nobody(
 def test_the_webs_secrets_reach_the_web_and_nobody_else(tmp_path):
     says = "import json, os, sys\nprint(json.dumps(dict(os.environ)), flush=True)\nsys.stdin.read()\n"
     secrets = {"EVA_SECRET_KEY": "canary", "HF_TOKEN": "canary"}
-    made = Processes(tmp_path, tmp_path / "logs", os.environ | secrets)
+    made = ChildProcesses(tmp_path, tmp_path / "logs", os.environ | secrets)
     try:
-        web = made.start(Program("web", ("-c", says), announces=True, of_web=True))
-        station = made.start(Program("station", ("-c", says), announces=True))
+        web = made.start(ProgramSpec("web", ("-c", says), announces=True, of_web=True))
+        station = made.start(ProgramSpec("station", ("-c", says), announces=True))
         assert {name: web[name] for name in secrets} == secrets
         assert not secrets.keys() & station.keys()
         assert "canary" not in Path(f"/proc/{made.pids()['station']}/environ").read_text()

@@ -20,11 +20,11 @@ def test_a_login_works_with_its_fresh_password_and_the_old_one_no_more():
 
 
 def test_nobody_can_log_in_until_there_is_an_account_that_is_switched_on():
-    assert seed.nobody_can_log_in()
+    assert seed.has_no_accounts()
     seed.demo_login(username="operator", role=Role.OPERATOR)
-    assert not seed.nobody_can_log_in()
+    assert not seed.has_no_accounts()
     User.objects.update(is_active=False)
-    assert seed.nobody_can_log_in()
+    assert seed.has_no_accounts()
 
 
 def test_a_second_start_keeps_what_an_administrator_changed():

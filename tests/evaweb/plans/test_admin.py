@@ -6,9 +6,9 @@ from django.forms import JSONField
 from django.urls import reverse
 
 from evaweb.plans.counting import ENDS
-from evaweb.plans.exchange import exported
+from evaweb.plans.exchange import export_toml
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.trials.admin import Table
 from tests.evaweb.trials import builders
 
@@ -49,7 +49,7 @@ def test_a_draft_is_edited_and_a_frozen_plan_only_read(client, admin, draft):
     assert client.post(page, form_of(draft, repetitions=7)).status_code == 302
     draft.refresh_from_db()
     assert (draft.repetitions, draft.strategy) == (7, None)
-    plan_freeze(user=admin, plan=draft)
+    freeze_plan(user=admin, plan=draft)
     assert 'name="repetitions"' not in client.get(page).content.decode()
     client.post(page, form_of(draft, repetitions=9))
     draft.refresh_from_db()
@@ -89,7 +89,7 @@ def test_positions_of_several_scenes_are_told_apart_by_their_scene(client, admin
 
 
 def test_the_key_is_on_no_page_of_the_administration(client, admin, draft):
-    plan = plan_freeze(user=admin, plan=draft)
+    plan = freeze_plan(user=admin, plan=draft)
     for name, given in (("changelist", []), ("change", [plan.pk]), ("history", [plan.pk]), ("export", [])):
         shown = client.get(reverse(f"admin:plans_plan_{name}", args=given)).content.decode()
         assert bytes(plan.key).hex() not in shown
@@ -97,7 +97,7 @@ def test_the_key_is_on_no_page_of_the_administration(client, admin, draft):
 
 def test_files_go_out_and_in(client, admin, draft):
     text = client.get(reverse("admin:plans_plan_export")).content.decode()
-    assert text == exported(plans=[draft])
+    assert text == export_toml(plans=[draft])
     upload = SimpleUploadedFile("lab.toml", text.replace('title = "Blocks"', 'title = "Cubes"').encode())
     page = client.post(reverse("admin:plans_plan_import"), {"file": upload}, follow=True).content.decode()
     assert "Plan blocks: draft changed" in page
@@ -113,7 +113,7 @@ def test_the_action_exports_what_was_chosen(client, admin, draft):
     chosen = {"action": "export", "_selected_action": [draft.pk]}
     answer = client.post(reverse("admin:plans_plan_changelist"), chosen)
     assert answer["Content-Disposition"] == 'attachment; filename="blocks.toml"'
-    assert answer.content.decode() == exported(plans=[draft])
+    assert answer.content.decode() == export_toml(plans=[draft])
 
 
 def test_operators_do_not_come_in(client, db):
@@ -139,6 +139,6 @@ def test_the_command_reads_and_writes_files(admin, draft, tmp_path, capsys):
 def test_a_frozen_plan_lists_its_positions_scene_by_scene(client, admin, draft):
     other = builders.scene("fold-towel")
     draft.positions.add(other.positions.get(number=1))
-    plan_freeze(user=admin, plan=draft)
+    freeze_plan(user=admin, plan=draft)
     shown = client.get(reverse("admin:plans_plan_change", args=[draft.pk])).content.decode()
     assert "block on plate: 1; 2<br>fold towel: 1" in shown

@@ -4,10 +4,10 @@ import pytest
 
 from evaweb.errors import Conflict, EvaError
 from evaweb.plans import services as plans
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.design import counted_now, kept_blocks, tried
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.design import counted_now, current_pairs, kept_blocks
 from evaweb.plans.models import Plan, PlanState
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.trials import services, voids
 from evaweb.trials.models import Score, Trial, VoidRequest
 from tests.evaweb.test_races import at_once
@@ -23,7 +23,7 @@ def lab(transactional_db):
 
 @pytest.fixture
 def plan(lab, draft, owner):
-    return plan_freeze(user=owner, plan=draft)
+    return freeze_plan(user=owner, plan=draft)
 
 
 @pytest.fixture
@@ -33,12 +33,12 @@ def bob(lab):
 
 def score(bench, trial, success, **said):
     ticks = bench.ticks(True, success, success)
-    return services.trial_score(user=bench.operator, trial=trial, milestones=ticks, **said)
+    return services.score_trial(user=bench.operator, trial=trial, milestones=ticks, **said)
 
 
 def tried_once(bench, plan, success=False):
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-    builders.over(trial, 9.0)
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.finished_trial(trial, 9.0)
     score(bench, trial, success)
     return Trial.objects.get(pk=trial.pk)
 
@@ -64,7 +64,7 @@ def require_whole(plan):
     later = Score.objects.filter(trial__evaluation=plan.evaluation_id, scored_at__gt=plan.revealed_at)
     if later.exists():
         assert all(row.reason for row in later)
-        assert kept_blocks(plan) == tried(plan).at_first
+        assert kept_blocks(plan) == current_pairs(plan).at_first
     else:
         assert {name: plan.at_reveal[name] for name in ("blocks", "arms")} == counted_now(plan)
 
@@ -73,16 +73,16 @@ def require_whole(plan):
 def act(request, bench, plan, owner, failed, bob):
     """What is done beside the reveal of the closed plan."""
     if request.param == "refusal":
-        voids.trial_void(user=bench.operator, trial=failed, reason=WHY)
+        voids.void_trial(user=bench.operator, trial=failed, reason=WHY)
         tried_once(bench, plan, success=True)  # again
-    plan_close(user=owner, plan=plan, reason="enough")
+    close_plan(user=owner, plan=plan, reason="enough")
     if request.param == "refusal":
-        return lambda: voids.void_answer(user=bob, trial=failed, agree=False, reason="it had not")
+        return lambda: voids.answer_void(user=bob, trial=failed, agree=False, reason="it had not")
     return lambda: score(bench, failed, True, reason="the wrong key")
 
 
 def test_what_is_said_at_the_moment_of_the_reveal_is_before_it_or_after_it(plan, owner, act):
-    said(at_once(act, lambda: plan_reveal(user=owner, plan=plan)))
+    said(at_once(act, lambda: reveal_plan(user=owner, plan=plan)))
     require_whole(plan)
 
 
@@ -94,7 +94,7 @@ def test_what_is_said_while_a_reveal_is_worked_out_is_in_it(plan, owner, act, mo
         return revealed(*given)
 
     monkeypatch.setattr(plans, "_revealed", meanwhile)
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     require_whole(plan)
     assert counted_now(plan) != before
 
@@ -102,7 +102,7 @@ def test_what_is_said_while_a_reveal_is_worked_out_is_in_it(plan, owner, act, mo
 def test_of_a_correction_and_a_void_at_one_moment_one_waits_for_the_other(bench, plan, failed, bob):
     found = at_once(
         lambda: score(bench, failed, True, reason="the wrong key"),
-        lambda: voids.trial_void(user=bob, trial=failed, reason=WHY),
+        lambda: voids.void_trial(user=bob, trial=failed, reason=WHY),
     )
     refused = said(found)
     failed.refresh_from_db()
@@ -113,7 +113,7 @@ def test_of_a_correction_and_a_void_at_one_moment_one_waits_for_the_other(bench,
 def test_two_voids_of_one_trial_are_one_question(bench, plan, failed, bob):
     found = at_once(
         *[
-            lambda user=user: voids.trial_void(user=user, trial=failed, reason=WHY)
+            lambda user=user: voids.void_trial(user=user, trial=failed, reason=WHY)
             for user in (bench.operator, bob)
         ]
     )
@@ -122,23 +122,23 @@ def test_two_voids_of_one_trial_are_one_question(bench, plan, failed, bob):
 
 
 def test_a_score_given_twice_at_one_moment_is_one(bench, plan):
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-    builders.over(trial, 9.0)
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.finished_trial(trial, 9.0)
     assert not said(at_once(*[lambda: score(bench, trial, True)] * 4))
     assert trial.scores.count() == 1
 
 
 def test_a_score_at_the_moment_of_the_close_counts(bench, plan, owner):
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-    builders.over(trial, 9.0)
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.finished_trial(trial, 9.0)
     found = at_once(
-        lambda: score(bench, trial, True), lambda: plan_close(user=owner, plan=plan, reason="enough")
+        lambda: score(bench, trial, True), lambda: close_plan(user=owner, plan=plan, reason="enough")
     )
     if said(found):  # it came first, and waits for the score
-        plan_close(user=owner, plan=plan, reason="enough")
+        close_plan(user=owner, plan=plan, reason="enough")
     trial.refresh_from_db()
     assert trial.status == "scored"
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     require_whole(plan)
 
 
@@ -146,7 +146,7 @@ def test_two_stations_that_ask_at_one_moment_get_two_slots(bench, plan):
     other = builders.Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
     users = bench.operator, builders.user("bob")
     asks = [
-        lambda user=user, station=station: hand_out(user=user, station=station, plan=plan)
+        lambda user=user, station=station: allocate_trial(user=user, station=station, plan=plan)
         for user, station in zip(users, (bench.station, other), strict=True)
     ]
     found = at_once(*asks)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from evaweb.errors import Conflict
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.draft_checks import problems
-from evaweb.plans.exchange import exported, imported
+from evaweb.plans.exchange import export_toml, import_file
 from evaweb.plans.models import CountsAs, Plan
-from evaweb.plans.services import plan_amend, plan_close, plan_freeze
+from evaweb.plans.services import amend_plan, close_plan, freeze_plan
 from evaweb.results.reports.recompute.scenes import ending_faults, scene_faults
 from evaweb.results.reports.tables import outcome_pages, score_pages
 from evaweb.tabular_export import plain
@@ -26,22 +26,22 @@ def declared(draft, owner):
 
     def declare(**counts):
         Plan.objects.filter(pk=draft.pk).update(**counts)
-        return plan_freeze(user=owner, plan=Plan.objects.get(pk=draft.pk))
+        return freeze_plan(user=owner, plan=Plan.objects.get(pk=draft.pk))
 
     return declare
 
 
 def ended(bench, plan, reason, status="interrupted"):
     """The next trial, as a run leaves it that ended so."""
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-    builders.over(trial, 10.0, status="finished" if status == "ended" else "interrupted")
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.finished_trial(trial, 10.0, status="finished" if status == "ended" else "interrupted")
     Trial.objects.filter(pk=trial.pk).update(status=status, reason=reason)
     return Trial.objects.get(pk=trial.pk)
 
 
 def scored(bench, trial, reached, **said):
     ticks = bench.ticks(True, reached, reached)
-    return services.trial_score(user=bench.operator, trial=trial, milestones=ticks, **said)
+    return services.score_trial(user=bench.operator, trial=trial, milestones=ticks, **said)
 
 
 @pytest.mark.parametrize(
@@ -59,14 +59,14 @@ def test_what_is_a_failure_by_the_plan_is_scored_as_one_and_stays_one(bench, dec
         scored(bench, trial, True, success=True)
     if status == "interrupted":
         with pytest.raises(Conflict, match="score it before the next one"):
-            hand_out(user=bench.operator, station=bench.station, plan=plan)
+            allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     assert "a failure by the plan, whatever was reached" in services.failing(trial)
     honest = scored(bench, trial, True)
     assert (honest.success, honest.score) == (False, 1.0)
     again = Trial.objects.get(pk=trial.pk)
     with pytest.raises(Conflict, match="that is a failure"):
         scored(bench, again, True, success=True, reason="it had it after all")
-    assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 1
+    assert allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 1
 
 
 @pytest.mark.parametrize(("name", "reason"), [("on_estop", ESTOP), ("on_interruption", FAULT)])
@@ -76,7 +76,7 @@ def test_what_is_repeated_by_the_plan_is_not_scored(bench, declared, name, reaso
     for success in (True, False):
         with pytest.raises(Conflict, match="by Blocks v1 it is repeated, and not scored"):
             scored(bench, trial, success)
-    assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 2
+    assert allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 2
 
 
 def test_what_the_plan_says_of_one_end_is_said_of_no_other(bench, declared):
@@ -92,12 +92,12 @@ def test_it_is_frozen_amended_and_exported_with_the_plan(bench, declared, owner)
         "on_interruption": "judged",
         "on_timeout": "judged",
     }
-    text = exported(plans=[plan])
+    text = export_toml(plans=[plan])
     assert 'on_estop = "failure"' in text
-    again = plan_amend(user=owner, plan=plan, reason="more")
+    again = amend_plan(user=owner, plan=plan, reason="more")
     assert again.on_estop == "failure"
     Plan.objects.filter(pk=again.pk).update(on_estop="judged")
-    imported(user=builders.user("alma", "admin"), text=text)
+    import_file(user=builders.user("alma", "admin"), text=text)
     again.refresh_from_db()
     assert again.on_estop == "failure"
 
@@ -107,7 +107,7 @@ def test_exports_say_what_ended_each_run_and_the_reports_program_holds_it_agains
     ended(bench, plan, ESTOP)
     scored(bench, ended(bench, plan, TIME, "ended"), True)
     scored(bench, ended(bench, plan, "stopped by the operator", "ended"), True)
-    voids.trial_void(user=bench.operator, trial=ended(bench, plan, FAULT), reason="the e-stop box fell on it")
+    voids.void_trial(user=bench.operator, trial=ended(bench, plan, FAULT), reason="the e-stop box fell on it")
     (page,) = outcome_pages(plan)
     assert [row["ended_by"] for row in page] == ["estop", "timeout", "", ""]
     rows = [{name: plain(value) for name, value in row.items()} for row in page]
@@ -138,9 +138,9 @@ def test_what_is_a_failure_by_the_plan_is_not_voided_away_before_its_score(bench
     plan = declared(on_estop=CountsAs.FAILURE)
     trial = ended(bench, plan, ESTOP)
     with pytest.raises(Conflict, match="that is a failure; score it before the next one"):
-        voids.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
+        voids.void_trial(user=bench.operator, trial=trial, reason="the plate had slipped")
     scored(bench, trial, False)
-    asked = voids.trial_void(
+    asked = voids.void_trial(
         user=bench.operator, trial=Trial.objects.get(pk=trial.pk), reason="it had slipped"
     )
     assert asked.status == "void_asked"
@@ -150,17 +150,17 @@ def test_a_plan_is_not_closed_before_its_failures_are_scored(bench, declared, ow
     plan = declared(on_estop=CountsAs.FAILURE, on_interruption=CountsAs.REPEATED)
     trial = ended(bench, plan, ESTOP)
     with pytest.raises(Conflict, match=r"1 trials of Blocks v1 are not finished, .* is interrupted: score"):
-        plan_close(user=owner, plan=plan, reason="enough")
+        close_plan(user=owner, plan=plan, reason="enough")
     scored(bench, trial, False)
     ended(bench, plan, FAULT)
-    assert plan_close(user=owner, plan=plan, reason="enough").state == "closed"
+    assert close_plan(user=owner, plan=plan, reason="enough").state == "closed"
 
 
 def test_what_left_no_row_is_repeated_whatever_the_plan_says(bench, declared):
     plan = declared(on_interruption=CountsAs.FAILURE)
     trial = ended(bench, plan, FAULT)
     Trial.objects.filter(pk=trial.pk).update(episode=None)
-    assert hand_out(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 2
+    assert allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial.attempt == 2
 
 
 def test_a_failure_by_the_plan_keeps_no_partial_credit(draft):

@@ -7,9 +7,9 @@ from django.urls import reverse
 from evaweb.blinding import HIDDEN
 from evaweb.episodes.models import Episode
 from evaweb.jobs.models import Job
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from tests.evaweb.trials import builders
 
 
@@ -26,8 +26,10 @@ def boss(db):
 @pytest.fixture
 def jobs(bench, draft, owner):
     """A failed one of a blind trial, a failed one of a run in Debug, and one of the whole disk."""
-    plan = plan_freeze(user=owner, plan=draft)
-    trial = builders.over(hand_out(user=bench.operator, station=bench.station, plan=plan).trial)
+    plan = freeze_plan(user=owner, plan=draft)
+    trial = builders.finished_trial(
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    )
     recorded = trial.episode
     other = Episode.objects.create(station=bench.station, status="finished", mode="async", frames=9)
     failed = {"status": "failed", "error": "ws://secret is away"}
@@ -63,8 +65,8 @@ def test_of_a_blind_trial_neither_key_nor_times_nor_words_are_shown(jobs, bench,
     bench_trial = plan.handouts.get().trial
     bench_trial.status = "voided"
     bench_trial.save()
-    plan_close(user=owner, plan=plan, reason="enough")
-    plan_reveal(user=owner, plan=plan)
+    close_plan(user=owner, plan=plan, reason="enough")
+    reveal_plan(user=owner, plan=plan)
     listed, page, _ = rows(boss)
     assert (listed[blind.pk]["error"], listed[blind.pk]["key"]) == ("ws://secret is away", blind.key)
     assert "ws://secret is away" in page

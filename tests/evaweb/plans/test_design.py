@@ -6,41 +6,41 @@ from django.db import IntegrityError, transaction
 from evaweb.canonical import digest
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import services
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.blinding_rules import look
-from evaweb.plans.design import dropped_of, findings_of, frozen, tried
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.blinding_rules import record_unblinding
+from evaweb.plans.design import current_pairs, dropped_of, findings_of, frozen_design
 from evaweb.plans.documents import UnevenError, document_of
 from evaweb.plans.models import Plan, PlanState
-from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
-from evaweb.results.analysis.caching import analysis_of, corrected_of
-from evaweb.results.analysis.filters import Chosen
+from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
+from evaweb.results.analysis.caching import cached_analysis, corrected_of
+from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.would_be import would_be
+from evaweb.results.presentation.would_be import headline_alternatives
 from evaweb.stations.models import Station
-from evaweb.statistics.designs import conclude, in_blocks
+from evaweb.statistics.designs import evaluate_design, in_blocks
 from evaweb.trials import services as trials
 from evaweb.trials import voids
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 BETTER = "pi0-new"  # succeeds always; the other one never
 
 
 def frozen_plan(draft, owner, **changed):
     Plan.objects.filter(pk=draft.pk).update(**changed)
-    return plan_freeze(user=owner, plan=Plan.objects.get(pk=draft.pk))
+    return freeze_plan(user=owner, plan=Plan.objects.get(pk=draft.pk))
 
 
 def handed(bench, plan, station=None):
-    return hand_out(user=bench.operator, station=station or bench.station, plan=plan).trial
+    return allocate_trial(user=bench.operator, station=station or bench.station, plan=plan).trial
 
 
 def scored(bench, trial, success=None, **said):
     won = trial.checkpoint.name == BETTER if success is None else success
     if trial.episode is None:
-        builders.over(trial, 10.0)
-    trials.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, won, won), **said)
+        builders.finished_trial(trial, 10.0)
+    trials.score_trial(user=bench.operator, trial=trial, milestones=bench.ticks(True, won, won), **said)
 
 
 def carry_out(bench, plan, count):
@@ -76,7 +76,7 @@ def test_the_boundary_is_part_of_what_is_frozen(early):
     said = early.document["stopping"]
     assert (said["rule"], said["pairs"], said["outcome"], said["margin"]) == ("early", 20, "success", None)
     assert len(said["boundary"]) == 20
-    assert frozen(early.document).boundary.error()[1] <= 0.05
+    assert frozen_design(early.document).boundary.error()[1] <= 0.05
     assert early.digest == digest(early.document)
 
 
@@ -92,7 +92,9 @@ def test_it_ends_by_itself_as_soon_as_a_boundary_is_crossed_and_says_not_for_whi
 
 def test_a_score_that_was_mistyped_can_be_corrected_before_the_next_trial_is_asked_for(bench, early):
     needed = next(
-        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+        n
+        for n in range(1, 21)
+        if evaluate_design(frozen_design(early.document), in_blocks([(1.0, 0.0)] * n)).ended
     )
     carry_out(bench, early, 2 * needed)
     assert (early.state, findings_of(early).ended) == (PlanState.FROZEN, "boundary")
@@ -112,7 +114,7 @@ def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothi
     early.refresh_from_db()
     assert early.state == PlanState.FROZEN
     assert (
-        tried(early).counted == []
+        current_pairs(early).counted == []
     )  # the first block is not made: what was finished before it does not enter
     scored(bench, waiting)
     with pytest.raises(Conflict, match="has ended"):
@@ -120,12 +122,14 @@ def test_a_trial_that_is_under_way_elsewhere_is_finished_first_and_changes_nothi
     early.refresh_from_db()
     assert early.state == PlanState.CLOSED
     assert findings_of(early).at < 11
-    assert len(tried(early).counted) == 11
+    assert len(current_pairs(early).counted) == 11
 
 
 def test_while_its_last_trial_runs_no_other_is_handed_out(bench, early, other):
     needed = next(
-        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+        n
+        for n in range(1, 21)
+        if evaluate_design(frozen_design(early.document), in_blocks([(1.0, 0.0)] * n)).ended
     )
     carry_out(bench, early, 2 * needed - 1)
     late = handed(bench, early, other)  # of the next block
@@ -135,7 +139,7 @@ def test_while_its_last_trial_runs_no_other_is_handed_out(bench, early, other):
         Conflict, match=f"has ended: a boundary of its design was crossed, after {needed} pairs"
     ):
         handed(bench, early)
-    trials.trial_abandon(user=bench.operator, trial=late)
+    trials.abandon_trial(user=bench.operator, trial=late)
     with pytest.raises(Conflict, match="has ended"):
         handed(bench, early)
     early.refresh_from_db()
@@ -147,7 +151,9 @@ def test_whatever_is_corrected_after_an_ask_has_found_its_end_the_next_ask_finds
 ):
     """Else who corrects a score to and fro, with a trial left prepared elsewhere, knows which checkpoint it was of."""
     needed = next(
-        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+        n
+        for n in range(1, 21)
+        if evaluate_design(frozen_design(early.document), in_blocks([(1.0, 0.0)] * n)).ended
     )
     carry_out(bench, early, 2 * needed - 1)
     late = handed(bench, early, other)
@@ -161,7 +167,7 @@ def test_whatever_is_corrected_after_an_ask_has_found_its_end_the_next_ask_finds
         with pytest.raises(Conflict, match=ended):
             handed(bench, early)
         scored(bench, trial, success=won, reason="it was not")
-    trials.trial_abandon(user=bench.operator, trial=late)
+    trials.abandon_trial(user=bench.operator, trial=late)
     early.refresh_from_db()
     assert (early.state, early.closed_because) == (PlanState.CLOSED, ended.removeprefix("has ended: "))
     assert [event.what for event in early.events.all()].count("ended") == 1
@@ -169,7 +175,9 @@ def test_whatever_is_corrected_after_an_ask_has_found_its_end_the_next_ask_finds
 
 def test_while_its_station_has_a_trial_to_finish_an_ask_says_that_and_nothing_of_the_design(bench, early):
     needed = next(
-        n for n in range(1, 21) if conclude(frozen(early.document), in_blocks([(1.0, 0.0)] * n)).ended
+        n
+        for n in range(1, 21)
+        if evaluate_design(frozen_design(early.document), in_blocks([(1.0, 0.0)] * n)).ended
     )
     carry_out(bench, early, 2 * needed - 1)
     last = handed(bench, early)
@@ -209,7 +217,7 @@ def test_closed_before_its_design_ended_it_concludes_nothing(bench, draft, owner
     plan = frozen_plan(draft, owner, stopping="evidence", repetitions=20)
     carry_out(bench, plan, 6)
     assert headline(plan).sentence.endswith("3 of 40 pairs are made, and the design goes on")
-    plan_close(user=owner, plan=plan, reason="the gripper broke")
+    close_plan(user=owner, plan=plan, reason="the gripper broke")
     said = f"{BETTER} and pi0-block were not compared: closed after 3 of 40 pairs, before the design ended"
     assert headline(plan).sentence == said
 
@@ -226,23 +234,23 @@ def test_a_fixed_number_says_nothing_before_its_end_however_clear_it_is(bench, d
 
 def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early, owner):
     until_it_ends(bench, early)
-    plan_reveal(user=owner, plan=early)
+    reveal_plan(user=owner, plan=early)
     before = headline(early)
     assert before.corrected == ""
     apart = ("digest", "at", "by", "commitment", "key")
     held = {name: value for name, value in early.at_reveal.items() if name not in apart}
     assert early.at_reveal["digest"] == digest({"plan": early.digest, **held})
-    figures = analysis_of(early)
-    assert corrected_of(early, Chosen()) == {}
+    figures = cached_analysis(early)
+    assert corrected_of(early, TrialFilter()) == {}
     for handout in early.handouts.all():
         scored(bench, handout.trial, success=True, reason="looked again")
     after = headline(early)
     assert after.sentence == before.sentence
     assert after.corrected.startswith(f"{BETTER} and pi0-block would not be compared yet")
-    now = analysis_of(early)
+    now = cached_analysis(early)
     assert [arm.success for arm in now.arms] == [arm.success for arm in figures.arms]
     assert (now.letters, now.comparisons) == (figures.letters, figures.comparisons)
-    corrected = corrected_of(early, Chosen())
+    corrected = corrected_of(early, TrialFilter())
     assert {name: found.successes == found.n for name, found in corrected.items()} == {"pi0-block": True}
     with pytest.raises(IntegrityError, match="never changed"), transaction.atomic():
         Plan.objects.filter(pk=early.pk).update(at_reveal=None)
@@ -265,7 +273,7 @@ def test_what_counts_of_a_plan_that_is_not_blind_is_kept_at_its_close(
     scored(bench, trial, success=False, reason="looked again")
     assert headline(plan).sentence == said.sentence
     assert "3/4 against 0/4" in headline(plan).corrected
-    plan = plan_reveal(user=owner, plan=plan)
+    plan = reveal_plan(user=owner, plan=plan)
     assert plan.at_reveal == kept
     assert "what counts is that of the close of" in plan.events.get(what="revealed").text
 
@@ -273,20 +281,20 @@ def test_what_counts_of_a_plan_that_is_not_blind_is_kept_at_its_close(
 def test_a_user_who_has_looked_changes_no_score_before_the_reveal(bench, early, owner):
     carry_out(bench, early, 4)
     trial = early.handouts.first().trial
-    look(early, owner)
+    record_unblinding(early, owner)
     for what in (
-        lambda: trials.trial_score(
+        lambda: trials.score_trial(
             user=owner, trial=trial, milestones=bench.ticks(True, False, False), reason="looked again"
         ),
-        lambda: voids.trial_void(user=owner, trial=trial, reason="it looks bad"),
+        lambda: voids.void_trial(user=owner, trial=trial, reason="it looks bad"),
     ):
         with pytest.raises(NotAllowed, match="you have seen results"):
             what()
-    plan_close(user=owner, plan=early, reason="enough")
-    again = plan_amend(user=owner, plan=early, reason="more trials")
-    plan_freeze(user=owner, plan=again)
+    close_plan(user=owner, plan=early, reason="enough")
+    again = amend_plan(user=owner, plan=early, reason="more trials")
+    freeze_plan(user=owner, plan=again)
     with pytest.raises(NotAllowed, match="you have seen results"):
-        hand_out(user=owner, station=bench.station, plan=again)
+        allocate_trial(user=owner, station=bench.station, plan=again)
 
 
 def test_a_correction_before_the_reveal_is_told_beside_the_headline(bench, draft, owner):
@@ -294,7 +302,7 @@ def test_a_correction_before_the_reveal_is_told_beside_the_headline(bench, draft
     carry_out(bench, plan, 16)
     first = next(h.trial for h in plan.handouts.all() if h.trial.checkpoint.name == BETTER)
     scored(bench, first, success=False, reason="it fell later")
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     said = headline(plan)
     assert "7/8 against 0/8" in said.sentence
     assert "8/8 against 0/8" in said.at_first
@@ -314,8 +322,8 @@ def test_the_better_one_is_named_first_with_its_numbers(bench, draft, owner):
 def test_versions_before_it_are_told(bench, draft, owner):
     plan = frozen_plan(draft, owner, repetitions=4)
     carry_out(bench, plan, 6)
-    again = plan_amend(user=owner, plan=plan, reason="another lamp")
-    again = plan_freeze(user=owner, plan=again)
+    again = amend_plan(user=owner, plan=plan, reason="another lamp")
+    again = freeze_plan(user=owner, plan=again)
     carry_out(bench, again, 16)
     (told,) = headline(again).versions
     assert told.startswith(f"Version 1: {BETTER} and pi0-block were not compared: closed after 3 of 8 pairs")
@@ -327,16 +335,16 @@ def test_versions_before_it_are_told(bench, draft, owner):
 def test_a_second_reveal_of_a_database_that_was_put_back_keeps_the_first(bench, draft, owner):
     plan = frozen_plan(draft, owner, repetitions=4)
     carry_out(bench, plan, 16)
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     first = plan.at_reveal
-    with unguarded("plans"):
+    with without_triggers("plans"):
         Plan.objects.filter(pk=plan.pk).update(
             state=PlanState.CLOSED, at_reveal=None, revealed_at=None, revealed_by=None
         )
     for handout in plan.handouts.all():
         scored(bench, handout.trial, success=True, reason="looked again")
     plan.refresh_from_db()
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     assert plan.at_reveal == first
     assert "what counts is that of the reveal of" in plan.events.filter(what="revealed").last().text
     assert "8/8 against 8/8" in headline(plan).corrected
@@ -350,15 +358,15 @@ def test_checkpoints_that_swapped_their_names_run_nothing_and_reveal_nothing(ben
         Checkpoint.objects.filter(pk=row.pk).update(name=name)
     with pytest.raises(Conflict, match="was renamed since"):
         handed(bench, plan)
-    plan_close(user=owner, plan=plan, reason="enough")
+    close_plan(user=owner, plan=plan, reason="enough")
     with pytest.raises(EvaError, match="not called what they were"):
-        plan_reveal(user=owner, plan=plan)
+        reveal_plan(user=owner, plan=plan)
 
 
 def test_what_is_kept_of_a_revealed_plan_stays(bench, draft, owner):
     plan = frozen_plan(draft, owner, repetitions=1)
     carry_out(bench, plan, 4)
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     for change in ({"closed_because": "enough"}, {"revealed_at": None}, {"owner": bench.operator}):
         with pytest.raises(IntegrityError), transaction.atomic():
             Plan.objects.filter(pk=plan.pk).update(**change)
@@ -385,17 +393,17 @@ def test_designs_that_cannot_be_are_said_before_the_freeze(draft, owner):
 
 
 def test_an_amendment_keeps_the_design(early, owner):
-    made = plan_amend(user=owner, plan=early, reason="the plate was replaced")
+    made = amend_plan(user=owner, plan=early, reason="the plate was replaced")
     assert (made.stopping, made.outcome, made.margin, made.look_after) == ("early", "success", None, [])
 
 
 def test_a_plan_from_before_there_were_boundaries_is_read(bench, early):
     document = {**early.document, "stopping": {"rule": "evidence", "alpha": 0.05}}
-    found = frozen(document)
+    found = frozen_design(document)
     assert (found.rule, found.blocks, found.boundary) == ("evidence", 20, None)
     del document["comparisons"]
-    assert frozen({**document, "comparison": [BETTER, "pi0-block"]}) == found
-    assert frozen({**document, "comparison": None}) is None
+    assert frozen_design({**document, "comparison": [BETTER, "pi0-block"]}) == found
+    assert frozen_design({**document, "comparison": None}) is None
 
 
 def test_a_plan_does_not_close_itself_on_a_repetition_whose_trial_may_count_yet(bench, early, owner):
@@ -404,14 +412,14 @@ def test_a_plan_does_not_close_itself_on_a_repetition_whose_trial_may_count_yet(
         scored(bench, first)
         first = handed(bench, early)
     scored(bench, first, success=False)
-    voids.trial_void(user=bench.operator, trial=first, reason="the plate had slipped")
+    voids.void_trial(user=bench.operator, trial=first, reason="the plate had slipped")
     while findings_of(early).ended != "boundary":
         scored(bench, handed(bench, early))
     with pytest.raises(Conflict, match=f"closed once the void of trial {first.pk} is answered"):
         handed(bench, early)
     early.refresh_from_db()
     assert early.state == PlanState.FROZEN
-    voids.void_answer(user=builders.user("sam"), trial=first, agree=False, reason="it had not")
+    voids.answer_void(user=builders.user("sam"), trial=first, agree=False, reason="it had not")
     assert findings_of(early).ended == ""  # with the failure it goes on
     scored(bench, handed(bench, early))
 
@@ -423,12 +431,12 @@ def test_the_worst_of_what_was_thrown_away_is_held_against_what_the_reveal_kept(
     while thrown.checkpoint.name != BETTER:
         scored(bench, thrown)
         thrown = handed(bench, plan)
-    builders.over(thrown, 9.0)
-    voids.trial_void(user=bench.operator, trial=thrown, reason="the plate had slipped")
+    builders.finished_trial(thrown, 9.0)
+    voids.void_trial(user=bench.operator, trial=thrown, reason="the plate had slipped")
     while plan.state == PlanState.FROZEN:
         scored(bench, handed(bench, plan))
         plan.refresh_from_db()
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     plan.refresh_from_db()
     before = headline(plan).worst
     assert "9/10 against 0/10" in before
@@ -493,7 +501,7 @@ def test_all_checkpoints_are_compared_and_one_that_was_found_worse_is_tried_no_m
     assert said.letters == ((BETTER, "a"), ("pi0-third", "b"), ("pi0-block", "b"))
     assert "shared by 3 comparisons" in said.method
     assert "pi0" not in plan.closed_because
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     assert headline(plan).sentences == said.sentences
 
 
@@ -533,7 +541,7 @@ def test_while_a_trial_is_repeated_a_dropped_checkpoint_stays_dropped(bench, thr
     of_it = plan.handouts.filter(slot__checkpoint__name=name).order_by("number")
     others = plan.handouts.exclude(slot__checkpoint__name=name).order_by("number")
     for voided in (others.first(), of_it.first()):
-        voids.trial_void(user=bench.operator, trial=voided.trial, reason="a camera had moved")
+        voids.void_trial(user=bench.operator, trial=voided.trial, reason="a camera had moved")
         assert dropped_of(plan) == {name: at}
         elsewhere = other if voided.trial.station == bench.station else bench.station
         following = handed(bench, plan, elsewhere)
@@ -577,18 +585,18 @@ def test_doubts_of_a_plan_that_dropped_a_checkpoint_are_judged_comparison_by_com
     while plan.state == PlanState.FROZEN:
         user = bench.operator if dropped_of(plan) else bob
         try:
-            trial = hand_out(user=user, station=bench.station, plan=plan).trial
+            trial = allocate_trial(user=user, station=bench.station, plan=plan).trial
         except Conflict:
             break
-        builders.over(trial, 9.0)
+        builders.finished_trial(trial, 9.0)
         if thrown is None and dropped_of(plan) and trial.checkpoint.name == BETTER:
-            thrown = voids.trial_void(user=user, trial=trial, reason="the plate had slipped")
+            thrown = voids.void_trial(user=user, trial=trial, reason="the plate had slipped")
             continue
-        trials.trial_score(user=user, trial=trial, milestones=bench.ticks(True, won(trial), won(trial)))
+        trials.score_trial(user=user, trial=trial, milestones=bench.ticks(True, won(trial), won(trial)))
         plan.refresh_from_db()
-    plan_reveal(user=owner, plan=Plan.objects.get(pk=plan.pk))
+    reveal_plan(user=owner, plan=Plan.objects.get(pk=plan.pk))
     plan.refresh_from_db()
-    ways = {row["what"]: row for row in would_be(plan, {})}
+    ways = {row["what"]: row for row in headline_alternatives(plan, {})}
     worst = ways.pop("attempts discarded unscored counted against it")
     assert f"{BETTER} and pi0-third" in worst["sentence"]
     assert not any("closed after" in row["sentence"] or "go on" in row["sentence"] for row in ways.values())
@@ -609,7 +617,7 @@ def test_each_checkpoint_is_compared_with_the_first_at_its_share_of_alpha(bench,
     assert plan.document["comparisons"] == [["pi0-block", "pi0-third"], [BETTER, "pi0-third"]]
     carry_out_three(bench, plan)
     found = findings_of(plan)
-    assert [one.at for one in found.each] == [12, 12]
+    assert [one.ended_at_pair for one in found.each] == [12, 12]
     assert all(one.p is not None for one in found.each)
     assert [one.winner for one in found.each] == [
         "second" if found.each[0].p <= 0.025 else None,
@@ -636,7 +644,7 @@ def test_checkpoints_in_random_order_are_judged_by_the_numbers_that_were_drawn(b
     assert numbers == [1, 2]  # which tells not whether both are of one checkpoint
     assert headline(plan).sentence.startswith(f"{BETTER} succeeded more often than pi0-block: ")
     assert headline(plan).sentence.endswith(f"after {made // 2} of 40 blocks")
-    again = plan_amend(user=owner, plan=plan, reason="another lamp")
+    again = amend_plan(user=owner, plan=plan, reason="another lamp")
     frozen_plan(again, owner, repetitions=15)
     told = again.events.get(what="frozen").text
     assert "repetitions: 20 -> 15" in told

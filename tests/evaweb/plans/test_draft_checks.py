@@ -2,7 +2,7 @@ import pytest
 
 from evaweb.errors import EvaError
 from evaweb.plans.draft_checks import problems, thoughts
-from evaweb.plans.services import plan_amend, plan_freeze
+from evaweb.plans.services import amend_plan, freeze_plan
 from evaweb.trials.models import Checkpoint, Milestone
 
 
@@ -17,17 +17,17 @@ def test_all_that_is_in_the_way_is_said_and_a_freeze_says_the_first_of_it(draft,
     found = list(problems(draft))
     assert [row.step for row in found] == ["conditions", "arms", "arms", "arms"]
     with pytest.raises(EvaError, match="has no position: choose initial conditions"):
-        plan_freeze(user=owner, plan=draft)
+        freeze_plan(user=owner, plan=draft)
     assert found[0].text == f"{draft} has no position: choose initial conditions"
 
 
 def test_a_freeze_names_no_checkpoint_that_is_hidden_from_who_asks_for_it(draft, owner):
     """The owner's amendment is of the checkpoints that they compare blind."""
-    frozen = plan_freeze(user=owner, plan=draft)
-    made = plan_amend(user=owner, plan=frozen, reason="a checkpoint was switched off")
+    frozen = freeze_plan(user=owner, plan=draft)
+    made = amend_plan(user=owner, plan=frozen, reason="a checkpoint was switched off")
     Checkpoint.objects.filter(name="pi0-new").update(active=False)
     with pytest.raises(EvaError) as refused:
-        plan_freeze(user=owner, plan=made)
+        freeze_plan(user=owner, plan=made)
     assert str(refused.value) == "checkpoint a hidden checkpoint is switched off"
 
 

@@ -1,10 +1,10 @@
 import pytest
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.drafting import HIDDEN, digest_of, merged, values_of
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_change, plan_draft, plan_freeze
+from evaweb.plans.services import freeze_plan, plan_change, plan_draft
 from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
 
@@ -49,7 +49,7 @@ def test_a_draft_is_written_by_its_owner_and_administrators_and_never_once_it_is
     with pytest.raises(NotAllowed):
         plan_change(user=owner, plan=draft, was=was, wanted={"owner": other.pk})
     plan_change(user=admin, plan=draft, was=was, wanted={"owner": other.pk})
-    plan = plan_freeze(user=admin, plan=draft)
+    plan = freeze_plan(user=admin, plan=draft)
     with pytest.raises(Conflict, match="only a draft is edited"):
         plan_change(user=admin, plan=plan, was=was, wanted={"alpha": 0.01})
 
@@ -60,10 +60,10 @@ def test_a_control_that_is_hidden_from_who_changes_the_comparison_stays_the_cont
     blind = Plan.objects.create(name="blind", title="Blind", owner=owner, repetitions=1)
     blind.checkpoints.set([base, new])
     blind.positions.set(draft.positions.all())
-    plan_freeze(user=owner, plan=blind)
+    freeze_plan(user=owner, plan=blind)
     draft.checkpoints.add(third)
     for comparing, first, second in (("control", base, None), ("pair", None, base)):
-        was = values_of(draft, sight_of(owner))
+        was = values_of(draft, visibility_for_user(owner))
         assert was["control"] == HIDDEN
         plan_change(user=owner, plan=draft, was=was, wanted={"comparing": comparing})
         draft.refresh_from_db()

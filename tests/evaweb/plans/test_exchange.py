@@ -5,9 +5,9 @@ from django.core.exceptions import ValidationError
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.documents import document_of
-from evaweb.plans.exchange import exported, imported
+from evaweb.plans.exchange import export_toml, import_file
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.trials.models import Checkpoint, Milestone, Scene
 from tests.evaweb.trials import builders
 
@@ -23,9 +23,9 @@ def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
     draft.strategy = {"kind": "async", "blend_window": 4}
     draft.stations.add(builders.Station.objects.get(name="bench-1"))
     draft.save()
-    text = exported(plans=[draft])
+    text = export_toml(plans=[draft])
     before = document_of(draft, KEY)
-    assert imported(user=admin, text=text) == [
+    assert import_file(user=admin, text=text) == [
         "scene block-on-plate: the same",
         "checkpoint pi0-block: the same",
         "checkpoint pi0-new: the same",
@@ -36,12 +36,12 @@ def test_what_was_exported_is_the_same_when_it_is_read_again(draft, admin):
 
 def test_another_lab_reads_it(draft, admin):
     Scene.objects.update(failure_required=True)
-    text = exported(plans=[draft])
+    text = export_toml(plans=[draft])
     before = document_of(draft, KEY)
     draft.delete()
     Scene.objects.all().delete()
     Checkpoint.objects.all().delete()
-    assert [line.split(": ")[1] for line in imported(user=admin, text=text)] == [
+    assert [line.split(": ")[1] for line in import_file(user=admin, text=text)] == [
         "new",
         "new",
         "new",
@@ -51,34 +51,34 @@ def test_another_lab_reads_it(draft, admin):
     assert found.owner == admin
     assert Scene.objects.get().failure_required
     assert document_of(found, KEY) == {**before, "owner": "adam"}
-    assert plan_freeze(user=admin, plan=found).slots.count() == 12
+    assert freeze_plan(user=admin, plan=found).slots.count() == 12
 
 
 def test_what_trials_were_made_with_is_not_changed_by_a_file(bench, admin):
-    text = exported(scenes=[bench.scene]).replace("points = 2", "points = 3")
-    assert imported(user=admin, text=text) == ["scene block-on-plate: changed"]
+    text = export_toml(scenes=[bench.scene]).replace("points = 2", "points = 3")
+    assert import_file(user=admin, text=text) == ["scene block-on-plate: changed"]
     assert list(bench.scene.milestones.values_list("points", flat=True)) == [1, 1, 3]
     bench.scored()
     with pytest.raises(Conflict, match=r"is in use .*milestone\[2\]\.points: 3 -> 4"):
-        imported(user=admin, text=text.replace("points = 3", "points = 4"))
-    policy = exported(checkpoints=[bench.checkpoint]).replace("8000", "8009")
+        import_file(user=admin, text=text.replace("points = 3", "points = 4"))
+    policy = export_toml(checkpoints=[bench.checkpoint]).replace("8000", "8009")
     with pytest.raises(Conflict, match="checkpoint pi0-block is in use"):
-        imported(user=admin, text=policy)
+        import_file(user=admin, text=policy)
 
 
 def test_a_new_scene_with_the_same_milestone_twice_is_refused_and_an_old_one_stays(bench, admin):
     Milestone.objects.filter(scene=bench.scene, text="lifted").update(text="held")
-    text = exported(scenes=[bench.scene])
-    assert imported(user=admin, text=text) == ["scene block-on-plate: the same"]
+    text = export_toml(scenes=[bench.scene])
+    assert import_file(user=admin, text=text) == ["scene block-on-plate: the same"]
     with pytest.raises(EvaError, match="scene other: two milestones are 'held'; allowed: different words"):
-        imported(user=admin, text=text.replace('name = "block-on-plate"', 'name = "other"'))
+        import_file(user=admin, text=text.replace('name = "block-on-plate"', 'name = "other"'))
     assert not Scene.objects.filter(name="other").exists()
 
 
 def test_a_frozen_plan_is_not_changed_by_a_file(draft, owner, admin):
-    text = exported(plans=[plan_freeze(user=owner, plan=draft)])
+    text = export_toml(plans=[freeze_plan(user=owner, plan=draft)])
     with pytest.raises(Conflict, match="plan blocks is running: amend it"):
-        imported(user=admin, text=text)
+        import_file(user=admin, text=text)
 
 
 @pytest.mark.parametrize(
@@ -109,17 +109,17 @@ def test_a_frozen_plan_is_not_changed_by_a_file(draft, owner, admin):
 def test_a_file_that_cannot_be_taken_is_refused_whole(bench, admin, text, said):
     good = "[[checkpoint]]\nname='good'\n"
     with pytest.raises(EvaError, match=said):
-        imported(user=admin, text=good + text)
+        import_file(user=admin, text=good + text)
     assert not Checkpoint.objects.filter(name="good").exists()
 
 
 def test_only_administrators_import(bench):
     with pytest.raises(NotAllowed):
-        imported(user=bench.operator, text="")
+        import_file(user=bench.operator, text="")
 
 
 def test_the_export_is_toml_that_people_read(draft):
-    read = tomllib.loads(exported(plans=[draft]))
+    read = tomllib.loads(export_toml(plans=[draft]))
     assert set(read) == {"scene", "checkpoint", "plan"}
     assert read["scene"][0]["position"][0]["bench"] == {"block": [0.1, 0.3, 0], "plate": [-0.1, 0.3]}
     assert read["plan"][0]["comparison"] == ["pi0-new", "pi0-block"]
@@ -132,14 +132,14 @@ def test_several_comparisons_and_random_order_travel(draft, admin):
         ({"comparing": "pair", "first": draft.first, "second": draft.second, "allocation": "random"}, None),
     ):
         Plan.objects.filter(pk=draft.pk).update(**changed)
-        text = exported(plans=[Plan.objects.get(pk=draft.pk)])
+        text = export_toml(plans=[Plan.objects.get(pk=draft.pk)])
         assert wanted is None or tomllib.loads(text)["plan"][0]["comparison"] == wanted
         Plan.objects.filter(pk=draft.pk).update(comparing="pair", drop_arms=False, allocation="paired")
-        assert "plan blocks: draft changed" in imported(user=admin, text=text)
+        assert "plan blocks: draft changed" in import_file(user=admin, text=text)
         again = Plan.objects.get(pk=draft.pk)
         assert {name: getattr(again, name) for name in changed} == changed
     with pytest.raises(EvaError, match="comparing = 'all'; allowed: 0 checkpoints"):
-        imported(user=admin, text=text.replace('comparing = "pair"', 'comparing = "all"'))
+        import_file(user=admin, text=text.replace('comparing = "pair"', 'comparing = "all"'))
 
 
 def test_weights_lineage_and_tags_travel_the_older_before_the_younger(draft, admin):
@@ -147,16 +147,18 @@ def test_weights_lineage_and_tags_travel_the_older_before_the_younger(draft, adm
     Checkpoint.objects.filter(name="pi0-new").update(
         parent=old, digest="sha256:0123abcd", tags=["block", "v2"]
     )
-    text = exported(plans=[draft])
+    text = export_toml(plans=[draft])
     assert [row["name"] for row in tomllib.loads(text)["checkpoint"]] == ["pi0-block", "zero", "pi0-new"]
-    assert set(imported(user=admin, text=exported(checkpoints=[Checkpoint.objects.get(name="pi0-new")]))) == {
+    assert set(
+        import_file(user=admin, text=export_toml(checkpoints=[Checkpoint.objects.get(name="pi0-new")]))
+    ) == {
         "checkpoint zero: the same",
         "checkpoint pi0-new: the same",
     }
     draft.delete()
     Checkpoint.objects.filter(name="pi0-new").delete()
     Checkpoint.objects.all().delete()
-    imported(user=admin, text=text)
+    import_file(user=admin, text=text)
     found = Checkpoint.objects.get(name="pi0-new")
     assert (found.lineage, found.digest, found.tags) == (
         [Checkpoint.objects.get(name="zero")],
@@ -176,7 +178,7 @@ def test_weights_lineage_and_tags_travel_the_older_before_the_younger(draft, adm
 )
 def test_weights_lineage_and_tags_that_cannot_be_are_named(admin, line, says):
     with pytest.raises(EvaError, match=says):
-        imported(user=admin, text=f'[[checkpoint]]\nname = "a"\n{line}\n')
+        import_file(user=admin, text=f'[[checkpoint]]\nname = "a"\n{line}\n')
     assert not Checkpoint.objects.exists()
 
 

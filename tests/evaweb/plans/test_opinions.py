@@ -4,13 +4,13 @@ import pytest
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.blinding import sight_of
+from evaweb.blinding import visibility_for_user
 from evaweb.episodes.selectors import episode_get, episode_list, tag_counts
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.results.ratings import judging
-from evaweb.reviews.services import review_add, segment_put, tags_change
+from evaweb.reviews.services import add_review, save_segment, tags_change
 from evaweb.trials import services
 from tests.evaweb.trials import builders
 
@@ -23,15 +23,15 @@ def bob(db):
 @pytest.fixture
 def trial(bench, draft, owner, bob):
     """One of a blind plan, run and scored by ann; bob has said three things of it, and she one."""
-    frozen = plan_freeze(user=owner, plan=draft)
-    made = hand_out(user=bench.operator, station=bench.station, plan=frozen).trial
-    builders.over(made, 9.0, cameras=["front"])
-    services.trial_score(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
+    frozen = freeze_plan(user=owner, plan=draft)
+    made = allocate_trial(user=bench.operator, station=bench.station, plan=frozen).trial
+    builders.finished_trial(made, 9.0, cameras=["front"])
+    services.score_trial(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
     tags_change(user=bob, episode=made.episode, add=["slips"])
     tags_change(user=bench.operator, episode=made.episode, add=["dark"])
-    review_add(user=bob, episode=made.episode, verdict="fail", note="it slips here", frame=12)
-    segment_put(user=bob, episode=made.episode, first=3, last=9, label="reach")
-    review_add(user=bench.operator, episode=made.episode, verdict="note", note="the lamp was off")
+    add_review(user=bob, episode=made.episode, verdict="fail", note="it slips here", frame=12)
+    save_segment(user=bob, episode=made.episode, first=3, last=9, label="reach")
+    add_review(user=bench.operator, episode=made.episode, verdict="note", note="the lamp was off")
     return made
 
 
@@ -53,10 +53,12 @@ def test_before_the_reveal_everybody_reads_their_own(bench, trial, owner, bob):
         None,
         "it slips here",
     )
-    ann, row = sight_of(bench.operator), episode_get(uuid=trial.episode.uuid)
+    ann, row = visibility_for_user(bench.operator), episode_get(uuid=trial.episode.uuid)
     assert (ann.tags_of(row), tag_counts(sight=ann)) == (["dark"], {"dark": 1})
     assert [episode_list(tag=tag, sight=ann).count() for tag in ("dark", "slips")] == [1, 0]
-    assert [episode_list(review="fail", sight=sight_of(user)).count() for user in (bench.operator, bob)] == [
+    assert [
+        episode_list(review="fail", sight=visibility_for_user(user)).count() for user in (bench.operator, bob)
+    ] == [
         0,
         1,
     ]
@@ -65,19 +67,22 @@ def test_before_the_reveal_everybody_reads_their_own(bench, trial, owner, bob):
     page = browser.get("/replay/").content.decode()
     assert ("What others say of a blind trial" in page, "slips" in page) == (True, False)
     plan = Plan.objects.get()
-    plan_close(user=owner, plan=plan, reason="enough")
-    plan_reveal(user=owner, plan=plan)
+    close_plan(user=owner, plan=plan, reason="enough")
+    reveal_plan(user=owner, plan=plan)
     assert words(bench.operator, trial.episode) == (["the lamp was off", "it slips here"], 1, 0)
-    assert sight_of(bench.operator).tags_of(episode_get(uuid=trial.episode.uuid)) == ["dark", "slips"]
+    assert visibility_for_user(bench.operator).tags_of(episode_get(uuid=trial.episode.uuid)) == [
+        "dark",
+        "slips",
+    ]
 
 
 def test_whoever_may_be_asked_to_rate_it_again_reads_their_own_first(bench, draft, owner, bob):
     Plan.objects.filter(pk=draft.pk).update(blind=False, second_rater_share=1.0)
-    frozen = plan_freeze(user=owner, plan=Plan.objects.get())
-    made = hand_out(user=bench.operator, station=bench.station, plan=frozen).trial
-    builders.over(made, 9.0, cameras=["front"])
-    review_add(user=bench.operator, episode=made.episode, verdict="note", note="it slips")
-    services.trial_score(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
+    frozen = freeze_plan(user=owner, plan=Plan.objects.get())
+    made = allocate_trial(user=bench.operator, station=bench.station, plan=frozen).trial
+    builders.finished_trial(made, 9.0, cameras=["front"])
+    add_review(user=bench.operator, episode=made.episode, verdict="note", note="it slips")
+    services.score_trial(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
     vic = builders.user("vic", "viewer")
     assert [words(user, made.episode)[0] for user in (bob, vic)] == [[], ["it slips"]]
     judging.Rating.objects.create(

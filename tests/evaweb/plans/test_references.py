@@ -13,12 +13,12 @@ from django.urls import reverse
 
 from evaweb.errors import EvaError
 from evaweb.plans import pictures, references
-from evaweb.plans.exchange import exported, exported_with_pictures, imported
+from evaweb.plans.exchange import export_archive, export_toml, import_file
 from evaweb.plans.models import Reference
 from evaweb.plans.references import unpacked
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def taken(bench, owner):
         ("left", 3, first),
         ("top", 4, None),
     ):
-        name = pictures.keep(jpeg(seed))
+        name = pictures.store_image(jpeg(seed))
         Reference.objects.create(
             station=bench.station, position=position, camera=camera, picture=name, by=owner
         )
@@ -44,7 +44,7 @@ def taken(bench, owner):
 
 
 def lose():
-    with unguarded("plans"):
+    with without_triggers("plans"):
         Reference.objects.all().delete()
 
 
@@ -55,7 +55,7 @@ def elsewhere(settings, tmp_path):
 
 def take(content, user):
     text, found = unpacked(content)
-    return imported(user=user, text=text, pictures=found)
+    return import_file(user=user, text=text, pictures=found)
 
 
 def archive(**files):
@@ -67,7 +67,7 @@ def archive(**files):
 
 
 def test_the_toml_names_the_newest_picture_of_each_camera_at_each_position(taken):
-    rows = tomllib.loads(exported(scenes=[taken.scene]))["reference"]
+    rows = tomllib.loads(export_toml(scenes=[taken.scene]))["reference"]
     where = {"scene": taken.scene.name, "position": 1, "station": "bench-1"}
     digests = [hashlib.sha256(jpeg(seed)).hexdigest() for seed in (3, 2)]
     assert rows == [
@@ -77,7 +77,7 @@ def test_the_toml_names_the_newest_picture_of_each_camera_at_each_position(taken
 
 
 def test_another_lab_gets_them_with_the_archive(taken, admin, settings, tmp_path):
-    content = exported_with_pictures(scenes=[taken.scene])
+    content = export_archive(scenes=[taken.scene])
     with zipfile.ZipFile(io.BytesIO(content)) as made:
         assert len(made.namelist()) == 3
     lose()
@@ -85,15 +85,15 @@ def test_another_lab_gets_them_with_the_archive(taken, admin, settings, tmp_path
     line = f"reference pictures of scene {taken.scene.name}: "
     assert take(content, admin) == [f"scene {taken.scene.name}: the same", line + "2 new"]
     found = {row.camera: row for row in Reference.objects.all()}
-    assert pictures.kept(found["top"].picture) == jpeg(2)
+    assert pictures.load_image(found["top"].picture) == jpeg(2)
     assert (found["top"].by, found["top"].position.number) == (admin, 1)
     assert take(content, admin)[1] == line + "2 the same"
     assert Reference.objects.count() == 2
 
 
 def test_what_a_lab_has_itself_stays(taken, admin):
-    content = exported_with_pictures(scenes=[taken.scene])
-    own = pictures.keep(jpeg(9))
+    content = export_archive(scenes=[taken.scene])
+    own = pictures.store_image(jpeg(9))
     first = taken.scene.positions.get(number=1)
     Reference.objects.create(station=taken.station, position=first, camera="top", picture=own, by=admin)
     assert take(content, admin)[1].endswith(": 1 the same, 1 left out, because this lab has its own")
@@ -101,13 +101,13 @@ def test_what_a_lab_has_itself_stays(taken, admin):
 
 
 def test_without_the_archive_and_without_the_station_it_is_said(taken, admin, settings, tmp_path):
-    text = exported(scenes=[taken.scene])
+    text = export_toml(scenes=[taken.scene])
     lose()
     elsewhere(settings, tmp_path)
-    assert imported(user=admin, text=text)[1].endswith(
+    assert import_file(user=admin, text=text)[1].endswith(
         "2 left out, because the file lacks their pictures: import the archive"
     )
-    other = imported(user=admin, text=text.replace('station = "bench-1"', 'station = "far"'))
+    other = import_file(user=admin, text=text.replace('station = "bench-1"', 'station = "far"'))
     assert other[1].endswith("2 left out, because there is no station far")
     assert Reference.objects.count() == 0
 
@@ -115,7 +115,7 @@ def test_without_the_archive_and_without_the_station_it_is_said(taken, admin, se
 def test_a_picture_that_the_disk_has_lost_is_left_out_of_the_archive(taken, settings):
     lost = hashlib.sha256(jpeg(2)).hexdigest()
     (settings.DATA_DIR / "pictures" / f"{lost}.jpg").unlink()
-    with zipfile.ZipFile(io.BytesIO(exported_with_pictures(scenes=[taken.scene]))) as made:
+    with zipfile.ZipFile(io.BytesIO(export_archive(scenes=[taken.scene]))) as made:
         assert f"pictures/{lost}.jpg" not in made.namelist()
         assert len(made.namelist()) == 2
 
@@ -139,10 +139,10 @@ def test_what_is_no_such_archive_is_refused_and_named(taken, monkeypatch):
         unpacked(b"\xff\xfe")
     monkeypatch.setattr(references, "LARGEST_PICTURE", 100)
     with pytest.raises(EvaError, match="more than 100 bytes"):
-        unpacked(exported_with_pictures(scenes=[taken.scene]))
+        unpacked(export_archive(scenes=[taken.scene]))
     monkeypatch.setattr(references, "LARGEST", 1000)
     with pytest.raises(EvaError, match="1000 bytes in all"):
-        unpacked(exported_with_pictures(scenes=[taken.scene]))
+        unpacked(export_archive(scenes=[taken.scene]))
 
 
 @pytest.mark.parametrize("packed", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -191,7 +191,7 @@ def test_regions_go_with_their_picture(taken, admin, settings, tmp_path):
         regions=[BLOCK],
         by=admin,
     )
-    content = exported_with_pictures(scenes=[taken.scene])
+    content = export_archive(scenes=[taken.scene])
     lose()
     elsewhere(settings, tmp_path)
     assert take(content, admin)[1].endswith(": 2 new")
@@ -205,12 +205,12 @@ def test_regions_go_with_their_picture(taken, admin, settings, tmp_path):
 
 
 def test_regions_of_a_file_that_cannot_be_are_refused(taken, admin):
-    text = exported(scenes=[taken.scene])
+    text = export_toml(scenes=[taken.scene])
     lose()
     for given, said in (
         ("{name = 'block', x = 0.9, y = 0.1, width = 0.2, height = 0.2}", "beyond the picture"),
         ("{name = 'block', x = 0.9, y = 0.1, width = 0.01, height = 0.2}", "8 x 8 or more"),
     ):
         with pytest.raises(EvaError, match=said):
-            imported(user=admin, text=text + f"regions = [{given}]\n")
+            import_file(user=admin, text=text + f"regions = [{given}]\n")
     assert Reference.objects.count() == 0

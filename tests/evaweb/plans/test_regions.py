@@ -10,7 +10,7 @@ import simplejpeg
 
 from evaweb.errors import EvaError
 from evaweb.plans import pictures
-from evaweb.plans.regions import Region, _words, check_sizes, matched, regions_of
+from evaweb.plans.regions import Region, _words, check_sizes, match_regions, regions_of
 
 HEIGHT, WIDTH = 480, 640
 LEAST = 0.75  # what the administrator's page proposes
@@ -41,7 +41,9 @@ BLOCK = region(288, 188, 64, 60)
 
 
 def look(now, reference=None, quality=85, drawn=BLOCK):
-    return matched([drawn], encoded(bench() if reference is None else reference), encoded(now, quality))[0]
+    return match_regions(
+        [drawn], encoded(bench() if reference is None else reference), encoded(now, quality)
+    )[0]
 
 
 def noisy(picture, sigma):
@@ -69,7 +71,7 @@ def test_a_block_in_its_place_matches_whatever_the_light_and_the_sensor(kind):
 
 def test_a_block_that_is_not_there_does_not_match_although_the_whole_picture_does():
     row = look(bench(x=None))
-    assert pictures.match(encoded(bench()), encoded(bench(x=None))) > 0.94
+    assert pictures.image_match(encoded(bench()), encoded(bench(x=None))) > 0.94
     assert row["match"] < 0.5
     assert (row["dx"], row["dy"], row["words"]) == (None, None, "not recognised here or nearby")
 
@@ -146,13 +148,13 @@ def test_a_small_file_that_is_a_very_large_picture_is_refused_before_it_is_decod
     large = simplejpeg.encode_jpeg(np.zeros((4100, 4100, 1), "u1"), colorspace="GRAY")
     monkeypatch.setattr(simplejpeg, "decode_jpeg", lambda *given, **named: pytest.fail("decoded"))
     with pytest.raises(EvaError, match="a picture of 4100 x 4100 pixels; allowed: 16777216 pixels in all"):
-        pictures.match(large, large)
+        pictures.image_match(large, large)
     with pytest.raises(EvaError, match="4100 x 4100 pixels"):
         check_sizes([], large)
     small = simplejpeg.encode_jpeg(np.zeros((8, 8, 1), "u1"), colorspace="GRAY")
     monkeypatch.undo()
     with pytest.raises(EvaError, match="this is no JPEG: its JPEG has 101 scans; allowed: 64"):
-        pictures.match(small + 100 * b"\xff\xda", small)
+        pictures.image_match(small + 100 * b"\xff\xda", small)
 
 
 # --- the real episode ----------------------------------------------------------------------------------------
@@ -208,7 +210,7 @@ def margin(name, frames):
             changed.append(moved)
     present = [look(one, first, quality, drawn)["match"] for one in shown for quality in (85, 60)]
     wrong = [look(one, first, 85, drawn)["match"] for one in changed]
-    whole = [pictures.match(encoded(first), encoded(one)) for one in changed]
+    whole = [pictures.image_match(encoded(first), encoded(one)) for one in changed]
     return min(present), max(wrong), max(whole)
 
 

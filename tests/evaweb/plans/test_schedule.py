@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from evaweb.canonical import canonical, difference, digest
 from evaweb.errors import EvaError
-from evaweb.plans.commitment import codes, commitment, verified
+from evaweb.plans.commitment import draw_codes, make_commitment, verify_commitment
 from evaweb.plans.schedule import IMBALANCE, RANDOM, Condition, counts_of, schedule
-from evaweb.plans.seeded_draws import Chance, new_key
+from evaweb.plans.seeded_draws import SeededDraws, new_key
 
 KEY = bytes(range(32))
 JSON = st.recursive(
@@ -68,15 +68,15 @@ def test_what_has_no_canonical_form_is_named(document, said):
 
 def test_draws_stay_what_they_are_for_ever():
     """A change of these numbers would change every schedule that was committed to."""
-    chance = Chance(KEY, "example")
+    chance = SeededDraws(KEY, "example")
     assert [chance.below(10) for _ in range(8)] == [1, 7, 9, 1, 8, 2, 7, 4]
-    assert Chance(KEY, "example").shuffled("abcdef") == list("baefcd")
+    assert SeededDraws(KEY, "example").shuffled("abcdef") == list("baefcd")
 
 
 def test_draws_are_uniform_and_independent_of_each_other():
-    counts = Counter(Chance(KEY, f"trial {i}").below(3) for i in range(3000))
+    counts = Counter(SeededDraws(KEY, f"trial {i}").below(3) for i in range(3000))
     assert all(900 < counts[i] < 1100 for i in range(3))
-    orders = Counter(tuple(Chance(KEY, f"order {i}").shuffled("abc")) for i in range(1200))
+    orders = Counter(tuple(SeededDraws(KEY, f"order {i}").shuffled("abc")) for i in range(1200))
     assert len(orders) == 6
     assert min(orders.values()) > 140
 
@@ -142,24 +142,24 @@ def test_plans_that_cannot_be_carried_out_are_refused(given_, said):
 
 
 def test_each_trial_has_a_code_of_its_own():
-    found = codes(KEY, 3000)
+    found = draw_codes(KEY, 3000)
     assert len(set(found)) == 3000
     assert all(len(code) == 5 and not set(code) & set("0O1I") for code in found)
-    assert codes(KEY, 10) == found[:10]
-    assert codes(new_key(), 10) != found[:10]
+    assert draw_codes(KEY, 10) == found[:10]
+    assert draw_codes(new_key(), 10) != found[:10]
 
 
 def test_a_commitment_holds_plan_schedule_and_key():
     units = schedule(checkpoints=["a", "b"], conditions=conditions(3), repetitions=1, key=KEY)
     other = schedule(checkpoints=["a", "b"], conditions=conditions(3), repetitions=1, key=new_key())
     plan = digest({"name": "cups"})
-    committed = commitment(plan, units, KEY)
-    assert verified(plan, units, KEY, committed)
-    assert not verified(digest({"name": "cup"}), units, KEY, committed)
-    assert not verified(plan, units, bytes(32), committed)
-    assert other == units or not verified(plan, other, KEY, committed)
+    committed = make_commitment(plan, units, KEY)
+    assert verify_commitment(plan, units, KEY, committed)
+    assert not verify_commitment(digest({"name": "cup"}), units, KEY, committed)
+    assert not verify_commitment(plan, units, bytes(32), committed)
+    assert other == units or not verify_commitment(plan, other, KEY, committed)
     with pytest.raises(EvaError, match="a key of 3 bytes; allowed: 32"):
-        commitment(plan, units, b"abc")
+        make_commitment(plan, units, b"abc")
 
 
 # --- random order ---------------------------------------------------------------------------------------------

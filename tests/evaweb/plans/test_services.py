@@ -3,34 +3,34 @@ from collections import Counter
 import pytest
 from django.db import IntegrityError, transaction
 
-from evaweb.blinding import HIDDEN, sight_of
+from evaweb.blinding import HIDDEN, visibility_for_user
 from evaweb.canonical import digest
 from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.plans.allocation import give_back, hand_out, progress
-from evaweb.plans.blinding_rules import look, sealed_for
-from evaweb.plans.commitment import commitment, schedule_digest
+from evaweb.plans.allocation import allocate_trial, plan_progress, release_slots
+from evaweb.plans.blinding_rules import is_sealed_for, record_unblinding
+from evaweb.plans.commitment import make_commitment, schedule_digest
 from evaweb.plans.documents import conditions_of, scene_of
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import schedule
-from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.stations.models import Station
 from evaweb.trials import services as trials
 from evaweb.trials.models import Checkpoint, Milestone, Scene, Trial
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 
 def done(bench, trial, success=True):
     """As if it had been run and scored."""
-    builders.over(trial, 10.0)
-    trials.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, success, success))
+    builders.finished_trial(trial, 10.0)
+    trials.score_trial(user=bench.operator, trial=trial, milestones=bench.ticks(True, success, success))
 
 
 @pytest.fixture
 def plan(draft, owner):
-    return plan_freeze(user=owner, plan=draft)
+    return freeze_plan(user=owner, plan=draft)
 
 
 def test_frozen_it_is_a_document_with_a_schedule(plan):
@@ -51,26 +51,26 @@ def test_frozen_it_is_a_document_with_a_schedule(plan):
 def test_what_is_missing_is_said_before_it_is_frozen(draft, owner, bench):
     draft.positions.clear()
     with pytest.raises(EvaError, match="has no position"):
-        plan_freeze(user=owner, plan=draft)
+        freeze_plan(user=owner, plan=draft)
     draft.positions.set(bench.scene.positions.all())
     Plan.objects.filter(pk=draft.pk).update(second=None)
     with pytest.raises(EvaError, match="needs two checkpoints, or none"):
-        plan_freeze(user=owner, plan=draft)
+        freeze_plan(user=owner, plan=draft)
     Plan.objects.filter(pk=draft.pk).update(first=None, stopping="evidence")
     with pytest.raises(EvaError, match="needs the comparison"):
-        plan_freeze(user=owner, plan=draft)
+        freeze_plan(user=owner, plan=draft)
     draft.checkpoints.clear()
     with pytest.raises(EvaError, match="has no checkpoint"):
-        plan_freeze(user=owner, plan=draft)
+        freeze_plan(user=owner, plan=draft)
     assert Plan.objects.get(pk=draft.pk).state == PlanState.DRAFT
 
 
 def test_only_its_owner_or_an_administrator_freezes_it(draft):
     with pytest.raises(NotAllowed, match="is olga's"):
-        plan_freeze(user=builders.user("eve"), plan=draft)
+        freeze_plan(user=builders.user("eve"), plan=draft)
     with pytest.raises(NotAllowed, match="needs an operator"):
-        plan_freeze(user=builders.user("vera", "viewer"), plan=draft)
-    assert plan_freeze(user=builders.user("adam", "admin"), plan=draft).state == PlanState.FROZEN
+        freeze_plan(user=builders.user("vera", "viewer"), plan=draft)
+    assert freeze_plan(user=builders.user("adam", "admin"), plan=draft).state == PlanState.FROZEN
 
 
 def test_a_plan_that_was_lost_is_frozen_again_by_an_administrator_and_revealed(bench, plan, draft):
@@ -79,30 +79,30 @@ def test_a_plan_that_was_lost_is_frozen_again_by_an_administrator_and_revealed(b
         builders.user("adam", "admin"),
         {"name": plan.name, "title": plan.title, "owner": draft.owner},
     )
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
     done(bench, trial)
     chosen = {name: list(getattr(plan, name).all()) for name in ("checkpoints", "positions")}
-    with unguarded("plans"):
+    with without_triggers("plans"):
         for model in (PlanEvent, Handout, Slot):
             model.objects.all().delete()
         plan.delete()
     (told,) = (each for each in reconcile().problems if " of plan " in each)
     assert told.startswith("1 trials are of plan blocks v1, which is not in the database: ")
-    assert all(sight_of(user).hides(trial) for user in (bench.operator, draft.owner, adam))
-    assert sight_of(bench.operator).label(trial) == HIDDEN
+    assert all(visibility_for_user(user).hides(trial) for user in (bench.operator, draft.owner, adam))
+    assert visibility_for_user(bench.operator).checkpoint_label(trial) == HIDDEN
     made = Plan.objects.create(**again)
     for name, rows in chosen.items():
         getattr(made, name).set(rows)
     with pytest.raises(NotAllowed):
-        plan_freeze(user=draft.owner, plan=made)
-    plan_freeze(user=adam, plan=made)
+        freeze_plan(user=draft.owner, plan=made)
+    freeze_plan(user=adam, plan=made)
     assert (made.state, made.evaluation_id) == (PlanState.CLOSED, trial.evaluation_id)
-    assert sight_of(draft.owner).hides(trial)
+    assert visibility_for_user(draft.owner).hides(trial)
     Plan.objects.update(owner=bench.operator)
     with pytest.raises(NotAllowed, match="you have run trials"):
-        look(made, bench.operator)
-    plan_reveal(user=adam, plan=made)
-    assert not sight_of(bench.operator).hides(trial)
+        record_unblinding(made, bench.operator)
+    reveal_plan(user=adam, plan=made)
+    assert not visibility_for_user(bench.operator).hides(trial)
     assert not any(" of plan " in each for each in reconcile().problems)
 
 
@@ -113,8 +113,8 @@ def test_what_a_frozen_plan_foresees_and_where_it_stands_is_never_changed_back(p
     for state in ("draft", "revealed"):
         with pytest.raises(IntegrityError, match="never"), transaction.atomic():
             Plan.objects.filter(pk=plan.pk).update(state=state)
-    plan_close(user=owner, plan=plan, reason="enough")
-    plan_reveal(user=owner, plan=plan)
+    close_plan(user=owner, plan=plan, reason="enough")
+    reveal_plan(user=owner, plan=plan)
     with pytest.raises(IntegrityError, match="never"), transaction.atomic():
         Plan.objects.filter(pk=plan.pk).update(state="frozen")
 
@@ -122,7 +122,7 @@ def test_what_a_frozen_plan_foresees_and_where_it_stands_is_never_changed_back(p
 def test_trials_come_in_the_order_of_the_plan_each_under_a_code_of_its_own(bench, plan):
     handed = []
     for _ in range(12):
-        handout = hand_out(user=bench.operator, station=bench.station, plan=plan)
+        handout = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
         handed.append(handout)
         done(bench, handout.trial)
     assert [h.slot.index for h in handed] == list(range(12))
@@ -134,23 +134,23 @@ def test_trials_come_in_the_order_of_the_plan_each_under_a_code_of_its_own(bench
     with pytest.raises(
         Conflict, match="Blocks v1 has ended: all pairs of its comparison are made, after 6 pairs"
     ):
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
-    assert (progress(plan).counted, progress(plan).attempts) == (12, 12)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
+    assert (plan_progress(plan).counted, plan_progress(plan).attempts) == (12, 12)
 
 
 def test_one_block_meets_the_same_conditions(bench, plan):
-    first = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    first = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     done(bench, first.trial)
-    second = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    second = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     assert first.trial.checkpoint_id != second.trial.checkpoint_id
     for name in ("position_id", "number", "seed", "instruction"):
         assert getattr(first.trial, name) == getattr(second.trial, name)
 
 
 def test_what_does_not_count_is_repeated_under_another_code(bench, plan):
-    first = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    first = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     Trial.objects.filter(pk=first.trial_id).update(status="interrupted", reason="the e-stop was pressed")
-    again = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    again = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     assert again.slot == first.slot
     assert again.trial.attempt == 2
     assert again.code != first.code
@@ -158,9 +158,9 @@ def test_what_does_not_count_is_repeated_under_another_code(bench, plan):
 
 
 def test_a_station_with_an_unfinished_trial_gets_no_other(bench, plan):
-    hand_out(user=bench.operator, station=bench.station, plan=plan)
+    allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     with pytest.raises(Conflict, match="is prepared: run it, or abandon it"):
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     assert plan.handouts.count() == 1
 
 
@@ -169,7 +169,7 @@ def test_several_stations_share_a_plan_block_by_block(bench, plan):
     blocks = {bench.station.pk: set(), other.pk: set()}
     for _ in range(6):
         for station in (bench.station, other):
-            handout = hand_out(user=bench.operator, station=station, plan=plan)
+            handout = allocate_trial(user=bench.operator, station=station, plan=plan)
             blocks[station.pk].add(handout.slot.block)
             done(bench, handout.trial)
     assert not blocks[bench.station.pk] & blocks[other.pk]
@@ -178,9 +178,9 @@ def test_several_stations_share_a_plan_block_by_block(bench, plan):
 
 def test_what_a_broken_station_has_not_begun_is_given_to_others(bench, plan, owner):
     other = Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
-    done(bench, hand_out(user=bench.operator, station=bench.station, plan=plan).trial)
-    assert give_back(user=owner, plan=plan, station=bench.station, reason="its gripper broke") == 1
-    handout = hand_out(user=bench.operator, station=other, plan=plan)
+    done(bench, allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial)
+    assert release_slots(user=owner, plan=plan, station=bench.station, reason="its gripper broke") == 1
+    handout = allocate_trial(user=bench.operator, station=other, plan=plan)
     assert (handout.slot.index, handout.trial.station) == (1, other)
 
 
@@ -189,19 +189,19 @@ def test_who_has_looked_at_another_plan_of_the_same_checkpoints_runs_none_of_thi
         made = Plan.objects.create(name=name, title=name, question="And?", owner=owner, repetitions=3)
         made.checkpoints.set(checkpoints)
         made.positions.set(bench.scene.positions.all())
-        return plan_freeze(user=owner, plan=made)
+        return freeze_plan(user=owner, plan=made)
 
     both = list(draft.checkpoints.all())
     others = [
         Checkpoint.objects.create(name=f"other-{n}", policy={"url": f"ws://127.0.0.1:{n}"}) for n in (1, 2)
     ]
-    plan = plan_freeze(user=owner, plan=draft)
-    look(twin("elsewhere", [both[0], *others]), owner)
-    trial = hand_out(user=owner, station=bench.station, plan=plan).trial
+    plan = freeze_plan(user=owner, plan=draft)
+    record_unblinding(twin("elsewhere", [both[0], *others]), owner)
+    trial = allocate_trial(user=owner, station=bench.station, plan=plan).trial
     done(bench, trial)
-    look(twin("again", both), alma := builders.user("alma", "admin"))
+    record_unblinding(twin("again", both), alma := builders.user("alma", "admin"))
     with pytest.raises(NotAllowed, match="you have seen results"):
-        hand_out(user=alma, station=bench.station, plan=plan)
+        allocate_trial(user=alma, station=bench.station, plan=plan)
     record = integrity_document(plan)
     assert [(row["plan"], row["version"], row["trials"]) for row in record["beside"]] == [("again", 1, 0)]
     assert any("again v1 (0 trials)" in said for said in record["remarks"])
@@ -210,9 +210,9 @@ def test_who_has_looked_at_another_plan_of_the_same_checkpoints_runs_none_of_thi
 def test_a_plan_for_some_stations_is_not_carried_out_on_others(bench, draft, owner):
     other = Station.objects.create(name="bench-2", robot="agilex_piper", simulated=True, boot="b")
     draft.stations.set([other])
-    plan = plan_freeze(user=owner, plan=draft)
+    plan = freeze_plan(user=owner, plan=draft)
     with pytest.raises(Conflict, match="is for bench-2, not for bench-1"):
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
 
 
 def test_a_scene_or_a_checkpoint_that_was_changed_stops_the_plan(bench, plan):
@@ -220,18 +220,18 @@ def test_a_scene_or_a_checkpoint_that_was_changed_stops_the_plan(bench, plan):
     milestone.points = 5
     milestone.save()
     with pytest.raises(Conflict, match="scene block-on-plate was changed since"):
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     milestone.points = 1
     milestone.save()
     for checkpoint in plan.checkpoints.all():
         checkpoint.policy = {"url": "ws://127.0.0.1:9"}
         checkpoint.save()
     with pytest.raises(Conflict, match="a checkpoint was changed since") as said:
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     assert not any(row.name in str(said.value) for row in plan.checkpoints.all())
     plan.checkpoints.update(active=False)
     with pytest.raises(Conflict, match="is switched off") as said:
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     assert not any(row.name in str(said.value) for row in plan.checkpoints.all())
 
 
@@ -258,15 +258,15 @@ CHANGES = {  # of a scene, each with what is said of it
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_trial_is_scored_and_corrected_by_the_scene_that_was_frozen_and_by_no_other(bench, plan, change):
-    trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+    trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
     before = scene_of(bench.scene, list(bench.scene.positions.all()))
-    builders.over(trial, 10.0)
+    builders.finished_trial(trial, 10.0)
     changed, said = CHANGES[change]
 
     ticks = bench.ticks(True, True, True)
 
     def score(**words):
-        return trials.trial_score(user=bench.operator, trial=trial, milestones=ticks, **words)
+        return trials.score_trial(user=bench.operator, trial=trial, milestones=ticks, **words)
 
     with transaction.atomic():
         changed(bench.scene)
@@ -284,38 +284,40 @@ def test_a_trial_is_scored_and_corrected_by_the_scene_that_was_frozen_and_by_no_
 
 def test_an_amendment_is_the_next_version_and_ends_the_one_before(bench, plan, owner):
     with pytest.raises(EvaError, match="reason is empty"):
-        plan_amend(user=owner, plan=plan, reason=" ")
-    draft = plan_amend(user=owner, plan=plan, reason="the plate was replaced")
+        amend_plan(user=owner, plan=plan, reason=" ")
+    draft = amend_plan(user=owner, plan=plan, reason="the plate was replaced")
     assert (draft.version, draft.state) == (2, PlanState.DRAFT)
-    done(bench, hand_out(user=bench.operator, station=bench.station, plan=plan).trial)  # it goes on meanwhile
+    done(
+        bench, allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    )  # it goes on meanwhile
     draft.repetitions = 5
     draft.save()
-    frozen = plan_freeze(user=owner, plan=draft)
+    frozen = freeze_plan(user=owner, plan=draft)
     plan.refresh_from_db()
     assert plan.state == PlanState.CLOSED
     assert "the plate was replaced" in plan.closed_because
     assert "repetitions: 3 -> 5" in frozen.events.get(what="frozen").text
     assert frozen.key != plan.key
-    handout = hand_out(user=bench.operator, station=bench.station, plan=frozen)
+    handout = allocate_trial(user=bench.operator, station=bench.station, plan=frozen)
     assert (handout.trial.evaluation.version, handout.trial.number, handout.trial.attempt) == (2, 1, 1)
     with pytest.raises(Conflict, match="no trial of it is handed out"):
-        hand_out(user=bench.operator, station=bench.station, plan=plan)
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     with pytest.raises(Conflict, match="is amended by version 2 already"):
-        plan_amend(user=owner, plan=plan, reason="again")
+        amend_plan(user=owner, plan=plan, reason="again")
 
 
 def test_it_is_revealed_once_closed_by_its_owner_and_anybody_can_check(bench, plan, owner):
-    handout = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    handout = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     with pytest.raises(Conflict, match="it is closed first"):
-        plan_reveal(user=owner, plan=plan)
+        reveal_plan(user=owner, plan=plan)
     with pytest.raises(Conflict, match=f"{handout.code} on bench-1 is prepared"):
-        plan_close(user=owner, plan=plan, reason="enough")
+        close_plan(user=owner, plan=plan, reason="enough")
     done(bench, handout.trial)
-    plan_close(user=owner, plan=plan, reason="enough")
+    close_plan(user=owner, plan=plan, reason="enough")
     with pytest.raises(NotAllowed):
-        plan_reveal(user=bench.operator, plan=plan)
+        reveal_plan(user=bench.operator, plan=plan)
     assert plan.sealed
-    plan = plan_reveal(user=owner, plan=plan)
+    plan = reveal_plan(user=owner, plan=plan)
     assert not plan.sealed
     key = bytes.fromhex(plan.events.get(what="revealed").text[4:68])
     units = schedule(
@@ -324,14 +326,14 @@ def test_it_is_revealed_once_closed_by_its_owner_and_anybody_can_check(bench, pl
         repetitions=plan.document["repetitions"],
         key=key,
     )
-    assert commitment(digest(plan.document), units, key) == plan.commitment
+    assert make_commitment(digest(plan.document), units, key) == plan.commitment
     assert len(schedule_digest(units)) == 64
     with pytest.raises(Conflict, match="make another plan"):
-        plan_amend(user=owner, plan=plan, reason="more")
+        amend_plan(user=owner, plan=plan, reason="more")
 
 
 def test_the_database_itself_keeps_what_was_frozen_and_done(bench, plan):
-    handout = hand_out(user=bench.operator, station=bench.station, plan=plan)
+    handout = allocate_trial(user=bench.operator, station=bench.station, plan=plan)
     for change in (
         lambda: Plan.objects.filter(pk=plan.pk).update(document={**plan.document, "question": "?"}),
         lambda: Plan.objects.filter(pk=plan.pk).update(blind=False),
@@ -344,43 +346,43 @@ def test_the_database_itself_keeps_what_was_frozen_and_done(bench, plan):
 
 
 def test_a_changed_document_is_not_revealed(plan, owner):
-    plan_close(user=owner, plan=plan, reason="enough")
+    close_plan(user=owner, plan=plan, reason="enough")
     document = {**plan.document, "question": "Is old better?"}
-    with unguarded("plans"):
+    with without_triggers("plans"):
         Plan.objects.filter(pk=plan.pk).update(document=document)
     with pytest.raises(EvaError, match="someone has changed the database"):
-        plan_reveal(user=owner, plan=plan)
+        reveal_plan(user=owner, plan=plan)
     assert Plan.objects.get(pk=plan.pk).state == PlanState.CLOSED
 
 
 def test_who_runs_trials_does_not_look_and_who_looked_runs_none(bench, plan, owner):
     admin = builders.user("adam", "admin")
-    assert sealed_for(plan, bench.operator)
+    assert is_sealed_for(plan, bench.operator)
     with pytest.raises(NotAllowed, match="blind until its owner, olga, reveals it"):
-        look(plan, bench.operator)
-    assert sealed_for(plan, owner)
-    assert sight_of(owner).names == {"pi0-block", "pi0-new"}
-    look(plan, owner)
-    look(plan, owner)
-    assert not sealed_for(plan, owner)
-    assert sight_of(owner).clear
+        record_unblinding(plan, bench.operator)
+    assert is_sealed_for(plan, owner)
+    assert visibility_for_user(owner).names == {"pi0-block", "pi0-new"}
+    record_unblinding(plan, owner)
+    record_unblinding(plan, owner)
+    assert not is_sealed_for(plan, owner)
+    assert visibility_for_user(owner).sees_everything
     assert plan.events.filter(what="looked", by=owner).count() == 1
     assert Look.objects.filter(plan=plan, user=owner).count() == 1
     with pytest.raises(NotAllowed, match="you have seen results"):
-        hand_out(user=owner, station=bench.station, plan=plan)
-    hand_out(user=admin, station=bench.station, plan=plan)
+        allocate_trial(user=owner, station=bench.station, plan=plan)
+    allocate_trial(user=admin, station=bench.station, plan=plan)
     with pytest.raises(NotAllowed, match="you have run trials of Blocks v1"):
-        look(plan, admin)
+        record_unblinding(plan, admin)
 
 
 def test_an_open_plan_hides_nothing(bench, draft, owner):
     draft.blind = False
     draft.save()
-    plan = plan_freeze(user=owner, plan=draft)
-    assert not sealed_for(plan, bench.operator)
-    look(plan, bench.operator)
+    plan = freeze_plan(user=owner, plan=draft)
+    assert not is_sealed_for(plan, bench.operator)
+    record_unblinding(plan, bench.operator)
     assert not plan.looks.exists()
-    assert hand_out(user=bench.operator, station=bench.station, plan=plan).number == 1
+    assert allocate_trial(user=bench.operator, station=bench.station, plan=plan).number == 1
 
 
 def test_the_database_keeps_a_frozen_plan_with_its_document(plan):

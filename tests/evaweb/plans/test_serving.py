@@ -3,13 +3,13 @@
 import pytest
 
 from evaweb.errors import Conflict
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.design import planned
 from evaweb.plans.documents import document_of
 from evaweb.plans.draft_checks import problems
-from evaweb.plans.exchange import exported, imported
+from evaweb.plans.exchange import export_toml, import_file
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.trials import services
@@ -35,16 +35,16 @@ def strategies(bench, plan, count):
     """Strategy of each of the next trials, by checkpoint, as the station gets it."""
     found = {}
     for _ in range(count):
-        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
         found[trial.checkpoint.name] = setup_args(trial, trial.pk).get("strategy")
-        builders.over(trial)
-        services.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, True, True))
+        builders.finished_trial(trial)
+        services.score_trial(user=bench.operator, trial=trial, milestones=bench.ticks(True, True, True))
     return found
 
 
 def test_each_trial_runs_with_the_strategy_of_its_checkpoint_else_of_its_plan(bench, draft, served, owner):
     draft.checkpoints.add(served)
-    assert strategies(bench, plan_freeze(user=owner, plan=draft), 3) == {
+    assert strategies(bench, freeze_plan(user=owner, plan=draft), 3) == {
         "pi0-block": None,
         "pi0-new": None,
         "pi0-rtc": RTC,
@@ -74,18 +74,18 @@ def test_a_strategy_is_frozen_and_exported_and_an_edit_needs_another_plan(
     bench, draft, served, anchor, owner
 ):
     draft.checkpoints.add(served, anchor)
-    plan = plan_freeze(user=owner, plan=draft)
+    plan = freeze_plan(user=owner, plan=draft)
     told = {row["name"]: row for row in plan.document["checkpoints"]}
     assert (told["pi0-rtc"]["strategy"], told["act-anchor"]["anchor"]) == (RTC, True)
     assert {"strategy", "anchor"} & {*told["pi0-block"]} == set()
-    text = exported(checkpoints=[served, anchor])
+    text = export_toml(checkpoints=[served, anchor])
     admin = builders.user("adam", "admin")
-    assert imported(user=admin, text=text) == [
+    assert import_file(user=admin, text=text) == [
         "checkpoint act-anchor: the same",
         "checkpoint pi0-rtc: the same",
     ]
     with pytest.raises(Conflict, match="checkpoint pi0-rtc is in use"):
-        imported(user=admin, text=text.replace("5.0", "6.0"))
+        import_file(user=admin, text=text.replace("5.0", "6.0"))
     Checkpoint.objects.filter(pk=served.pk).update(strategy=RTC | {"inference_rate": 6.0})
     with pytest.raises(Conflict, match="a checkpoint was changed since"):
         strategies(bench, plan, 12)
@@ -122,16 +122,16 @@ def carried_out(bench, owner, anchor):
         )
         plan.checkpoints.set([bench.checkpoint, anchor])
         plan.positions.set(bench.scene.positions.all())
-        plan = plan_freeze(user=owner, plan=plan)
+        plan = freeze_plan(user=owner, plan=plan)
         tried = 0
         for _ in range(4 * repetitions):
-            trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+            trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
             won = trial.checkpoint != anchor or succeeds(tried)
             tried += trial.checkpoint == anchor
-            builders.over(trial)
-            services.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, won, won))
-        plan = plan_close(user=owner, plan=plan, reason="all are made")
-        return plan_reveal(user=owner, plan=plan) if reveal else plan
+            builders.finished_trial(trial)
+            services.score_trial(user=bench.operator, trial=trial, milestones=bench.ticks(True, won, won))
+        plan = close_plan(user=owner, plan=plan, reason="all are made")
+        return reveal_plan(user=owner, plan=plan) if reveal else plan
 
     return carry
 

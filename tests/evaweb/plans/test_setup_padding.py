@@ -3,18 +3,18 @@
 import pytest
 
 from evaweb.plans import setup_padding as pacing
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.trials.models import Trial
 from evaweb.trials.station_commands import setup_args, trial_command
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 
 @pytest.fixture
 def plan(draft, owner):
-    return plan_freeze(user=owner, plan=draft)
+    return freeze_plan(user=owner, plan=draft)
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def handed(bench, plan):
 
     def hand():
         Trial.objects.filter(station=bench.station).update(status="voided")
-        return hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        return allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
 
     return hand
 
@@ -45,28 +45,28 @@ def test_every_set_up_lasts_as_long_as_with_the_slowest(bench, plan, handed):
     assert all(8.0 <= row["warm_up_s"] <= 10.0 and 0.2 <= row["connect_s"] <= 0.25 for row in found)
     assert len({row["warm_up_s"] for row in found}) == 6, "by chance"
     trial = handed()
-    assert pacing.least_times(trial) == pacing.least_times(trial), "but the same for the same trial"
+    assert pacing.min_stage_times(trial) == pacing.min_stage_times(trial), "but the same for the same trial"
 
 
 def test_what_took_long_once_is_forgotten_after_five_trials(bench, plan, handed):
     quick = plan.checkpoints.order_by("name")[0]
     took(quick, bench, 60.0, *[2.0] * pacing.NEWEST)
-    assert pacing.least_times(handed())["warm_up_s"] <= 2.5
+    assert pacing.min_stage_times(handed())["warm_up_s"] <= 2.5
     took(quick, bench, 10_000.0)
-    assert pacing.least_times(handed())["warm_up_s"] == pacing.MOST_S
+    assert pacing.min_stage_times(handed())["warm_up_s"] == pacing.MOST_S
 
 
 def test_where_nothing_is_blind_or_nothing_known_nobody_waits(bench, plan, handed):
     trial = handed()
-    assert pacing.least_times(trial) is None
+    assert pacing.min_stage_times(trial) is None
     assert "least" not in setup_args(trial, "00000000-0000-0000-0000-000000000000")
     Trial.objects.filter(pk=trial.pk).update(setup_took={"connect_s": 1.0, "warm_up_s": 1.0})
-    assert pacing.least_times(trial) is not None
-    with unguarded("plans"):
+    assert pacing.min_stage_times(trial) is not None
+    with without_triggers("plans"):
         Plan.objects.filter(pk=plan.pk).update(state="revealed")
-    assert pacing.least_times(trial) is None
+    assert pacing.min_stage_times(trial) is None
     Trial.objects.filter(station=bench.station).update(status="voided")
-    assert pacing.least_times(bench.prepare()) is None
+    assert pacing.min_stage_times(bench.prepare()) is None
 
 
 def test_how_long_it_took_is_kept_when_the_run_is_asked_for_and_a_repeated_set_up_is_the_same(

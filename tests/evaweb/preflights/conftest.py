@@ -11,7 +11,7 @@ from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint
 from runtime.ipc.messages import Ack, Command
 from tests.evaweb.trials import builders
-from tests.standing import standing
+from tests.standing import state_flags
 
 OK = {
     "verdict": "ok",
@@ -76,7 +76,7 @@ class Runtime:
     def status(self, timeout: float | None = None) -> Mapping[str, Any]:
         if self.gone is not None:
             raise self.gone
-        return standing(self.state)
+        return state_flags(self.state)
 
     def request(self, command: Command, timeout: float | None = None, **how: Any) -> Ack:
         self.heard.append(command)
@@ -87,7 +87,7 @@ class Runtime:
 
             raise NoAnswer(f"no answer to {command.kind}")
         if command.kind == "policy_server":
-            said = {"state": self.state} if self.old else standing(self.state)
+            said = {"state": self.state} if self.old else state_flags(self.state)
             return Ack(command.uuid, "done", data={"server": self.server, **said})
         if command.kind == "preflight":
             if self.refuses:
@@ -119,7 +119,7 @@ def runtimes(bench, monkeypatch):
     """By station; one that is not in it does not run."""
     made = {bench.station.name: Runtime()}
     monkeypatch.setattr(
-        "evaweb.preflights.services.wire_to",
+        "evaweb.preflights.services.connection_to",
         lambda name: made.get(name, Runtime(gone=StationGone(f"{name} is not running"))),
     )
     return made

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.evaweb.console.test_modules import NODE, run
-from tests.standing import standing
+from tests.standing import state_flags
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's modules are not run")
 
@@ -11,19 +11,27 @@ pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the
 @pytest.mark.parametrize(
     ("store", "checkpoint", "says"),
     [
-        ({"role": "operator", "fresh": True, "snapshot": {**standing("idle")}}, "pi0", ""),
-        ({"role": "operator", "fresh": True, "snapshot": {**standing("ready")}}, "pi0", ""),
-        ({"role": "operator", "fresh": False, "snapshot": {**standing("running")}}, "pi0", ""),
+        ({"role": "operator", "fresh": True, "snapshot": {**state_flags("idle")}}, "pi0", ""),
+        ({"role": "operator", "fresh": True, "snapshot": {**state_flags("ready")}}, "pi0", ""),
+        ({"role": "operator", "fresh": False, "snapshot": {**state_flags("running")}}, "pi0", ""),
         ({"role": "operator", "fresh": False}, "pi0", ""),
-        ({"role": "operator", "fresh": True, "snapshot": {**standing("idle")}}, "", "choose a checkpoint"),
-        ({"role": "viewer", "fresh": True, "snapshot": {**standing("idle")}}, "pi0", "a viewer watches"),
+        ({"role": "operator", "fresh": True, "snapshot": {**state_flags("idle")}}, "", "choose a checkpoint"),
+        ({"role": "viewer", "fresh": True, "snapshot": {**state_flags("idle")}}, "pi0", "a viewer watches"),
         (
-            {"role": "operator", "fresh": True, "snapshot": {**standing("setting_up")}},
+            {"role": "operator", "fresh": True, "snapshot": {**state_flags("setting_up")}},
             "pi0",
             "not while setting up",
         ),
-        ({"role": "admin", "fresh": True, "snapshot": {**standing("running")}}, "pi0", "not while running"),
-        ({"role": "admin", "fresh": True, "snapshot": {**standing("holding")}}, "pi0", "not while holding"),
+        (
+            {"role": "admin", "fresh": True, "snapshot": {**state_flags("running")}},
+            "pi0",
+            "not while running",
+        ),
+        (
+            {"role": "admin", "fresh": True, "snapshot": {**state_flags("holding")}},
+            "pi0",
+            "not while holding",
+        ),
     ],
 )
 def test_it_says_why_it_cannot_be_pressed(store, checkpoint, says):

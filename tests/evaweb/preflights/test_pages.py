@@ -7,13 +7,13 @@ from django.test import Client
 from django.urls import reverse
 from django.utils import timezone
 
-from evaweb.plans.blinding_rules import look
+from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze, plan_reveal
-from evaweb.preflights.blinding_rules import shown
+from evaweb.plans.services import freeze_plan, reveal_plan
+from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight
-from evaweb.preflights.reading import STAGES, ago, read
-from evaweb.preflights.services import preflight_ask
+from evaweb.preflights.reading import STAGES, time_since, view_report
+from evaweb.preflights.services import start_preflight
 from evaweb.trials.models import Checkpoint
 from runtime.preflight.verdict import PreflightStage
 from tests.evaweb.preflights.conftest import CLOSED, OK
@@ -116,9 +116,13 @@ def test_nobody_sees_one_without_logging_in(row):
 
 def test_stages_and_verdicts_are_those_of_the_runtime():
     assert tuple(PreflightStage) == STAGES
-    assert read(None) is None
-    assert [stage.state for stage in read({"stage": "infer"}).stages][3:6] == ["done", "failed", "waiting"]
-    assert {stage.state for stage in read({"stage": "nowhere"}).stages} == {"waiting"}
+    assert view_report(None) is None
+    assert [stage.state for stage in view_report({"stage": "infer"}).stages][3:6] == [
+        "done",
+        "failed",
+        "waiting",
+    ]
+    assert {stage.state for stage in view_report({"stage": "nowhere"}).stages} == {"waiting"}
 
 
 @pytest.mark.parametrize(
@@ -127,7 +131,7 @@ def test_stages_and_verdicts_are_those_of_the_runtime():
 )
 def test_how_long_ago_is_said_in_its_largest_unit(seconds, said):
     now = timezone.now()
-    assert ago(now - timedelta(seconds=seconds), now) == said
+    assert time_since(now - timedelta(seconds=seconds), now) == said
 
 
 # --- who is shown what
@@ -154,7 +158,7 @@ def test_a_blind_plan_hides_what_tells_checkpoints_apart_until_its_reveal(row, b
     plan.save()
     row.ended(OK)
     assert "24 ms" in fragment(operator, row)
-    plan = plan_freeze(user=olga, plan=plan)
+    plan = freeze_plan(user=olga, plan=plan)
     for address in (
         reverse("preflight", args=[row.pk]),
         reverse("preflight-newest") + "?checkpoint=pi0-block",
@@ -162,13 +166,13 @@ def test_a_blind_plan_hides_what_tells_checkpoints_apart_until_its_reveal(row, b
         answer = operator.get(address)
         assert answer.status_code == 404
         assert not any(secret in answer.content.decode().partition("does not exist")[2] for secret in SECRETS)
-    assert "is blind" in shown(row, olga).hidden
-    look(plan, olga)
-    assert shown(row, olga).report == OK
+    assert "is blind" in visible_preflight(row, olga).hidden
+    record_unblinding(plan, olga)
+    assert visible_preflight(row, olga).report == OK
     Plan.objects.filter(pk=plan.pk).update(state="closed")
     assert operator.get(reverse("preflight", args=[row.pk])).status_code == 404
     plan.refresh_from_db()
-    plan_reveal(user=olga, plan=plan)
+    reveal_plan(user=olga, plan=plan)
     assert "24 ms" in fragment(operator, row)
 
 
@@ -238,13 +242,13 @@ def test_the_console_has_its_button_where_a_checkpoint_is_chosen(operator, bench
 
 
 def test_the_chronicle_fetches_what_nobody_looks_at(bench, checkpoint, runtime):
-    from evaweb.console.event_ingest import Scribe
-    from evaweb.console.feed import Feeds, Link
+    from evaweb.console.event_ingest import StationEventIngester
+    from evaweb.console.feed import Feeds, LinkState
 
-    row = preflight_ask(user=bench.operator, checkpoint=checkpoint, station=bench.station)
+    row = start_preflight(user=bench.operator, checkpoint=checkpoint, station=bench.station)
     runtime.told[str(row.pk)] = {"running": False, "report": OK, "failure": ""}
-    scribe = Scribe(bench.station.name, Feeds())
-    scribe._feed.link = Link(True)
+    scribe = StationEventIngester(bench.station.name, Feeds())
+    scribe._feed.link = LinkState(True)
     scribe._write()
     row.refresh_from_db()
     assert row.verdict == "ok"

@@ -8,10 +8,10 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, NotAllowed, StationGone
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.preflights import job_kinds
 from evaweb.preflights.models import Preflight, PreflightStatus, Verdict
-from evaweb.preflights.services import preflight_ask, preflight_settled, preflights_settled
+from evaweb.preflights.services import refresh_preflight, refresh_preflights, start_preflight
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import NoAnswer
 from runtime.preflight import verdict as runtimes_own
@@ -27,7 +27,7 @@ def told(runtime, row, report=None, failure=""):
 
 @pytest.fixture
 def ask(bench, checkpoint, runtime):
-    return lambda **given: preflight_ask(
+    return lambda **given: start_preflight(
         **{"user": bench.operator, "checkpoint": checkpoint, "station": bench.station, **given}
     )
 
@@ -52,20 +52,20 @@ def test_it_is_asked_as_the_checkpoint_is_served(ask, checkpoint, runtime):
 
 def test_its_report_is_kept_when_somebody_looks(ask, runtime):
     row = ask()
-    assert preflight_settled(row=row).status == "running"
+    assert refresh_preflight(row=row).status == "running"
     told(runtime, row, OK)
-    settled = preflight_settled(row=row)
+    settled = refresh_preflight(row=row)
     assert (settled.status, settled.verdict, settled.report) == ("done", "ok", OK)
     assert settled.ended_at
     runtime.told.clear()
-    assert preflight_settled(row=settled).report == OK
+    assert refresh_preflight(row=settled).report == OK
 
 
 def test_it_is_kept_too_where_nobody_looks(ask, bench, runtime):
     row = ask()
-    assert preflights_settled(station=bench.station) == 0
+    assert refresh_preflights(station=bench.station) == 0
     told(runtime, row, CLOSED)
-    assert preflights_settled(station=bench.station) == 1
+    assert refresh_preflights(station=bench.station) == 1
     row.refresh_from_db()
     assert row.verdict == "port_closed"
 
@@ -73,26 +73,26 @@ def test_it_is_kept_too_where_nobody_looks(ask, bench, runtime):
 def test_one_without_a_report_says_why(ask, runtime):
     row = ask()
     told(runtime, row, failure="cancelled: setup by ann")
-    assert (preflight_settled(row=row).status, row.reason) == ("lost", "cancelled: setup by ann")
+    assert (refresh_preflight(row=row).status, row.reason) == ("lost", "cancelled: setup by ann")
 
 
 def test_a_station_that_was_restarted_knows_nothing_of_it(ask, runtime):
     row = ask()
     runtime.told.clear()
-    assert preflight_settled(row=row).status == "lost"
+    assert refresh_preflight(row=row).status == "lost"
     assert "restarted meanwhile" in row.reason
 
 
 def test_a_station_that_has_gone_loses_it_and_one_that_is_slow_does_not(ask, runtime):
     row = ask()
     runtime.lost = {"preflight_report"}
-    assert preflight_settled(row=row).status == "running"
+    assert refresh_preflight(row=row).status == "running"
     Preflight.objects.filter(pk=row.pk).update(over_by=timezone.now() - timedelta(seconds=1))
     row.refresh_from_db()
-    assert preflight_settled(row=row).reason.endswith("has not answered since")
+    assert refresh_preflight(row=row).reason.endswith("has not answered since")
     row = ask(station=row.station)
     runtime.lost, runtime.gone = set(), StationGone("bench-1 is not running")
-    assert preflight_settled(row=row).reason == "bench-1 is not running"
+    assert refresh_preflight(row=row).reason == "bench-1 is not running"
 
 
 def test_what_the_station_refuses_leaves_nothing(ask, runtime):
@@ -107,7 +107,7 @@ def test_an_answer_that_was_lost_is_found_out_later(ask, runtime):
     row = ask()
     assert row.status == "running"
     told(runtime, row, OK)
-    assert preflight_settled(row=row).verdict == "ok"
+    assert refresh_preflight(row=row).verdict == "ok"
 
 
 def test_a_station_that_hangs_is_no_reason_for_another_way(ask, runtime):
@@ -175,9 +175,9 @@ def test_where_the_station_does_not_run_the_worker_asks(ask, resting, checkpoint
     )
     row = ask(station=resting)
     assert (row.by, row.status) == ("worker", "running")
-    assert preflight_settled(row=row).status == "running"
-    assert work("station") == 1
-    assert preflight_settled(row=row).status == "running" or row.verdict == "port_closed"
+    assert refresh_preflight(row=row).status == "running"
+    assert run_queue("station") == 1
+    assert refresh_preflight(row=row).status == "running" or row.verdict == "port_closed"
     row.refresh_from_db()
     assert (row.status, row.verdict) == ("done", "port_closed")
     assert asked == [{"deployment": resting.deployment, "changes": {"policy": checkpoint.policy}}]
@@ -190,7 +190,7 @@ def test_a_job_that_is_done_twice_asks_once(ask, resting, monkeypatch):
         "runtime.station.preflight_child.run_preflight", lambda line, longest: asked.append(line) or dict(OK)
     )
     row = ask(station=resting)
-    done = job_kinds.Work({"preflight": str(row.pk)}, lambda text: None)
+    done = job_kinds.JobContext({"preflight": str(row.pk)}, lambda text: None)
     assert job_kinds.preflight(done) == job_kinds.preflight(done) == {"verdict": "ok"}
     assert len(asked) == 1
 
@@ -198,14 +198,14 @@ def test_a_job_that_is_done_twice_asks_once(ask, resting, monkeypatch):
 def test_the_workers_errors_are_the_reason(ask, resting):
     row = ask(station=resting)
     Job.objects.update(status=JobStatus.FAILED, error="preflight: its process ended with -9")
-    assert preflight_settled(row=row).reason == "preflight: its process ended with -9"
+    assert refresh_preflight(row=row).reason == "preflight: its process ended with -9"
     row = ask(station=resting)
     Job.objects.all().delete()
-    assert "its job is gone" in preflight_settled(row=row).reason
+    assert "its job is gone" in refresh_preflight(row=row).reason
     row = ask(station=resting)
     Preflight.objects.filter(pk=row.pk).update(asked_at=timezone.now() - timedelta(hours=2))
     row.refresh_from_db()
-    assert "No worker is running" in preflight_settled(row=row).reason
+    assert "No worker is running" in refresh_preflight(row=row).reason
 
 
 def test_the_worker_too_leaves_a_server_alone_that_is_at_work(ask, resting, runtime):

@@ -2,9 +2,9 @@ import pytest
 from django.contrib.auth.models import User
 
 from evaweb.episodes.folders import preview_folder
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze, plan_reveal
+from evaweb.plans.services import freeze_plan, reveal_plan
 from evaweb.results.analysis import caching
 from evaweb.stations.models import Station
 from evaweb.trials import services
@@ -16,13 +16,13 @@ from tests.evaweb.trials import builders
 @pytest.fixture(autouse=True)
 def _alone(settings, tmp_path):
     settings.DATA_DIR = tmp_path
-    caching.forget()
+    caching.clear_caches()
 
 
 @pytest.fixture
 def bench(db):
     played("bench", builders.bench)
-    return builders.Bench(
+    return builders.TrialBench(
         Station.objects.get(), Scene.objects.get(), Checkpoint.objects.get(), User.objects.get(username="ann")
     )
 
@@ -54,7 +54,7 @@ def _frozen(bench, owner):
     )
     made.checkpoints.set([bench.checkpoint, other])
     made.positions.set(bench.scene.positions.all())
-    plan_freeze(user=owner, plan=made)
+    freeze_plan(user=owner, plan=made)
 
 
 @pytest.fixture
@@ -69,16 +69,16 @@ def carry_out(bench):
 
 def _carried_out(bench, plan, n, pictures):
     for _ in range(n):
-        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
         new = trial.checkpoint.name == "pi0-new"
         ok = (trial.number + trial.position.number) % 4 != 0 if new else trial.number == 1
         smooth = -5.0 - 0.1 * trial.number if trial.number > 1 else None  # the first of each was not measured
         facts = {"smoothness": smooth, "smoothness_commanded": smooth and smooth + 0.5 * new}
         facts |= {"cameras": ["top"] if pictures else []}
-        builders.over(trial, 8.0 + trial.number + 0.25 * new, **facts)
+        builders.finished_trial(trial, 8.0 + trial.number + 0.25 * new, **facts)
         if pictures:
             preview_folder(trial.episode_id).mkdir(parents=True)  # it can be watched
-        services.trial_score(
+        services.score_trial(
             user=bench.operator,
             trial=trial,
             milestones=bench.ticks(True, ok or new, ok),
@@ -90,5 +90,5 @@ def _carried_out(bench, plan, n, pictures):
 def revealed(plan, owner, carry_out):
     """All of it carried out, which closes it, and revealed."""
     carry_out(plan, 16)
-    played("revealed", lambda: plan_reveal(user=owner, plan=plan))
+    played("revealed", lambda: reveal_plan(user=owner, plan=plan))
     return Plan.objects.get()

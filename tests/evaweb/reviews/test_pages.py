@@ -10,7 +10,7 @@ from django.urls import reverse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.reviews import services
 from evaweb.reviews.models import Standing
 from tests.examples import some
@@ -49,7 +49,7 @@ def listed(browser, **query):
 @pytest.mark.django_db
 def test_the_list_says_what_was_found_and_said(browser, two, ann):
     _, waiting = two
-    services.review_add(user=ann, episode=waiting, verdict="pass")
+    services.add_review(user=ann, episode=waiting, verdict="pass")
     _, page = listed(browser)
     assert 'data-quality="error">3 flags<' in page
     assert "not checked" in page
@@ -64,7 +64,7 @@ def test_the_list_is_narrowed_to_what_is_flagged_or_waits(browser, two, ann):
     assert listed(browser, quality="clean")[0] == set()
     assert listed(browser, quality="unchecked")[0] == {waiting}
     assert listed(browser, review="unreviewed")[0] == {flagged, waiting}
-    services.review_add(user=ann, episode=two[0], verdict="fail")
+    services.add_review(user=ann, episode=two[0], verdict="fail")
     assert listed(browser, review="unreviewed")[0] == {waiting}
     assert listed(browser, review="fail")[0] == {flagged}
     assert listed(browser, review="pass")[0] == set()
@@ -80,7 +80,7 @@ def test_the_page_of_an_episode_has_its_review_where_it_can_be_played(browser, c
     episode = closed()
     address = reverse("replay", args=[episode.uuid])
     assert 'id="review"' not in browser.get(address).content.decode()
-    work("cpu")
+    run_queue("cpu")
     page = browser.get(address).content.decode()
     assert f'data-address="/api/v1/episodes/{episode.uuid}/reviews"' in page
     assert f'data-next="/api/v1/reviews/next?after={episode.uuid}"' in page

@@ -8,10 +8,10 @@ from django.contrib.auth.models import User
 from evaweb.episodes.models import Episode, Tag
 from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs.models import Job
-from evaweb.jobs.services import work
+from evaweb.jobs.services import run_queue
 from evaweb.reviews import services
 from evaweb.reviews.models import Review, Segment, Standing
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 pytestmark = pytest.mark.django_db
 
@@ -35,24 +35,24 @@ def everything():
 def spoken(closed, ann, bob):
     """An episode that was checked, reviewed twice and annotated."""
     episode = closed()
-    services.quality_asked(episode=episode)
-    services.review_add(user=ann, episode=episode, verdict="pass")
-    services.review_add(user=bob, episode=episode, verdict="fail", note="it slips")
-    kept = services.segment_put(
+    services.request_quality_check(episode=episode)
+    services.add_review(user=ann, episode=episode, verdict="pass")
+    services.add_review(user=bob, episode=episode, verdict="fail", note="it slips")
+    kept = services.save_segment(
         user=ann, episode=episode, first=0, last=9, label="reach", milestone="touched"
     )
-    gone = services.segment_put(user=ann, episode=episode, first=10, last=12, label="wrong")
-    services.segment_put(user=ann, episode=episode, first=1, last=9, label="reach", segment=kept.uuid)
-    services.segment_remove(user=ann, episode=episode, segment=gone.uuid)
+    gone = services.save_segment(user=ann, episode=episode, first=10, last=12, label="wrong")
+    services.save_segment(user=ann, episode=episode, first=1, last=9, label="reach", segment=kept.uuid)
+    services.remove_segment(user=ann, episode=episode, segment=gone.uuid)
     services.tags_change(user=ann, episode=episode, add=["slips", "wrong"])
     services.tags_change(user=bob, episode=episode, remove=["wrong"])
-    work("cpu")
+    run_queue("cpu")
     return episode
 
 
 def lose():
     """All rows, as a database that was lost has none; no trigger stands in the way."""
-    with unguarded("reviews"):
+    with without_triggers("reviews"):
         for model in (Standing, Tag, Segment, Review, Episode, Job, User):
             model.objects.all().delete()
 

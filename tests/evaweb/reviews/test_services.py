@@ -23,10 +23,10 @@ def said(data, episode):
 
 def test_the_newest_pass_or_fail_counts_and_all_are_kept(closed, data, ann, bob):
     episode = closed()
-    services.review_add(user=ann, episode=episode, verdict="pass")
-    services.review_add(user=bob, episode=episode, verdict="fail", note="  it slips  ")
-    services.review_add(user=ann, episode=episode, verdict="note", note="look at row 12")
-    standing = selectors.standing_of(episode=episode)
+    services.add_review(user=ann, episode=episode, verdict="pass")
+    services.add_review(user=bob, episode=episode, verdict="fail", note="  it slips  ")
+    services.add_review(user=ann, episode=episode, verdict="note", note="look at row 12")
+    standing = selectors.get_standing(episode=episode)
     assert (standing.review.verdict, standing.review.note, standing.review.reviewer) == (
         "fail",
         "it slips",
@@ -43,16 +43,16 @@ def test_the_newest_pass_or_fail_counts_and_all_are_kept(closed, data, ann, bob)
 
 def test_a_note_on_a_moment_keeps_its_frame(closed, data, ann):
     episode = closed()
-    services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=FRAMES - 1)
-    services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=3)
-    services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=3)  # asked again
+    services.add_review(user=ann, episode=episode, verdict="note", note="it slips", frame=FRAMES - 1)
+    services.add_review(user=ann, episode=episode, verdict="note", note="it slips", frame=3)
+    services.add_review(user=ann, episode=episode, verdict="note", note="it slips", frame=3)  # asked again
     assert [line["frame"] for line in said(data, episode)] == [FRAMES - 1, 3]
     with pytest.raises(EvaError, match=f"frame = {FRAMES}; allowed: 0 to {FRAMES - 1}"):
-        services.review_add(user=ann, episode=episode, verdict="note", note="it slips", frame=FRAMES)
+        services.add_review(user=ann, episode=episode, verdict="note", note="it slips", frame=FRAMES)
 
 
 def test_the_database_itself_keeps_what_was_said(closed, ann):
-    review = services.review_add(user=ann, episode=closed(), verdict="pass")
+    review = services.add_review(user=ann, episode=closed(), verdict="pass")
     with pytest.raises(DatabaseError, match="never changed"), transaction.atomic():
         Review.objects.filter(pk=review.pk).update(verdict="fail")
     with pytest.raises(DatabaseError, match="never changed"), transaction.atomic():
@@ -66,10 +66,10 @@ def test_where_the_disk_does_not_take_it_nothing_is_changed(closed, ann, monkeyp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(disk.os, "fsync", full)
-    with pytest.raises(disk.NotKept, match="No space left"):
-        services.review_add(user=ann, episode=episode, verdict="pass")
-    with pytest.raises(disk.NotKept, match="No space left"):
-        services.segment_put(user=ann, episode=episode, first=0, last=1, label="reach")
+    with pytest.raises(disk.NotWritten, match="No space left"):
+        services.add_review(user=ann, episode=episode, verdict="pass")
+    with pytest.raises(disk.NotWritten, match="No space left"):
+        services.save_segment(user=ann, episode=episode, first=0, last=1, label="reach")
     assert not Review.objects.exists()
     assert not Segment.objects.exists()
     assert not Standing.objects.exclude(review=None).exists()
@@ -86,15 +86,15 @@ def test_where_the_disk_does_not_take_it_nothing_is_changed(closed, ann, monkeyp
 )
 def test_what_cannot_be_said_is_refused(closed, ann, verdict, note, sentence):
     with pytest.raises(EvaError, match=sentence):
-        services.review_add(user=ann, episode=closed(), verdict=verdict, note=note)
+        services.add_review(user=ann, episode=closed(), verdict=verdict, note=note)
 
 
 def test_viewers_say_nothing(closed, vera):
     episode = closed()
     with pytest.raises(NotAllowed):
-        services.review_add(user=vera, episode=episode, verdict="pass")
+        services.add_review(user=vera, episode=episode, verdict="pass")
     with pytest.raises(NotAllowed):
-        services.segment_put(user=vera, episode=episode, first=0, last=1, label="reach")
+        services.save_segment(user=vera, episode=episode, first=0, last=1, label="reach")
 
 
 def test_what_is_being_recorded_is_not_reviewed(closed, ann):
@@ -102,18 +102,18 @@ def test_what_is_being_recorded_is_not_reviewed(closed, ann):
     type(episode).objects.update(status=EpisodeStatus.RECORDING)
     episode.refresh_from_db()
     with pytest.raises(Conflict, match="still being recorded"):
-        services.review_add(user=ann, episode=episode, verdict="pass")
+        services.add_review(user=ann, episode=episode, verdict="pass")
     with pytest.raises(Conflict, match="still being recorded"):
-        services.quality_asked(episode=episode)
+        services.request_quality_check(episode=episode)
 
 
 def test_several_annotators_mark_the_same_frames_each_their_own(closed, data, ann, bob, alma):
     episode = closed()
-    reach = services.segment_put(
+    reach = services.save_segment(
         user=ann, episode=episode, first=0, last=9, label="reach", milestone="cup touched"
     )
-    services.segment_put(user=bob, episode=episode, first=2, last=11, label="approach")
-    changed = services.segment_put(
+    services.save_segment(user=bob, episode=episode, first=2, last=11, label="approach")
+    changed = services.save_segment(
         user=ann, episode=episode, first=0, last=8, label="reach", segment=reach.uuid
     )
     assert changed.uuid == reach.uuid
@@ -122,22 +122,22 @@ def test_several_annotators_mark_the_same_frames_each_their_own(closed, data, an
     ]
     assert told == [(0, 8, "reach", "ann"), (2, 11, "approach", "bob")]
     with pytest.raises(NotAllowed, match="ann's"):
-        services.segment_remove(user=bob, episode=episode, segment=reach.uuid)
-    services.segment_remove(user=alma, episode=episode, segment=reach.uuid)
+        services.remove_segment(user=bob, episode=episode, segment=reach.uuid)
+    services.remove_segment(user=alma, episode=episode, segment=reach.uuid)
     assert [line["kind"] for line in said(data, episode)] == ["segment"] * 3 + ["segment_removed"]
     with pytest.raises(NotFound):
-        services.segment_remove(user=ann, episode=episode, segment=reach.uuid)
+        services.remove_segment(user=ann, episode=episode, segment=reach.uuid)
 
 
 @pytest.mark.parametrize(("first", "last"), [(-1, 3), (5, 4), (0, FRAMES)])
 def test_segments_lie_within_the_episode(closed, ann, first, last):
     with pytest.raises(EvaError, match=f"allowed: frames 0 to {FRAMES - 1}"):
-        services.segment_put(user=ann, episode=closed(), first=first, last=last, label="reach")
+        services.save_segment(user=ann, episode=closed(), first=first, last=last, label="reach")
 
 
 def test_a_segment_has_a_label(closed, ann):
     with pytest.raises(EvaError, match="label is empty"):
-        services.segment_put(user=ann, episode=closed(), first=0, last=1, label=" ")
+        services.save_segment(user=ann, episode=closed(), first=0, last=1, label=" ")
 
 
 def test_the_next_unreviewed_goes_down_the_list_and_begins_again_at_its_top(closed, ann):
@@ -147,23 +147,23 @@ def test_the_next_unreviewed_goes_down_the_list_and_begins_again_at_its_top(clos
     assert selectors.unreviewed_next(after=None) == (newer, 2)
     assert selectors.unreviewed_next(after=newer.uuid) == (older, 2)
     assert selectors.unreviewed_next(after=older.uuid) == (newer, 2)
-    services.review_add(user=ann, episode=older, verdict="note", note="odd")
+    services.add_review(user=ann, episode=older, verdict="note", note="odd")
     assert selectors.unreviewed_next(after=newer.uuid) == (older, 2), "a note decides nothing"
-    services.review_add(user=ann, episode=older, verdict="pass")
+    services.add_review(user=ann, episode=older, verdict="pass")
     assert selectors.unreviewed_next(after=newer.uuid) == (None, 1)
-    services.review_add(user=ann, episode=newer, verdict="fail")
+    services.add_review(user=ann, episode=newer, verdict="fail")
     assert selectors.unreviewed_next(after=None) == (None, 0)
 
 
 def test_who_says_the_same_once_more_because_the_answer_was_lost_has_said_it_once(closed, data, ann, bob):
     episode = closed()
-    first = services.review_add(user=ann, episode=episode, verdict="pass", note="clean")
-    assert services.review_add(user=ann, episode=episode, verdict="pass", note="clean ") == first
+    first = services.add_review(user=ann, episode=episode, verdict="pass", note="clean")
+    assert services.add_review(user=ann, episode=episode, verdict="pass", note="clean ") == first
     part = {"episode": episode, "first": 0, "last": 5, "label": "reach"}
-    marked = services.segment_put(user=ann, **part)
-    assert services.segment_put(user=ann, **part) == marked
-    assert services.segment_put(user=ann, segment=marked.pk, **part) == marked
-    assert services.segment_put(user=bob, **part) != marked, "another annotator sees the same"
+    marked = services.save_segment(user=ann, **part)
+    assert services.save_segment(user=ann, **part) == marked
+    assert services.save_segment(user=ann, segment=marked.pk, **part) == marked
+    assert services.save_segment(user=bob, **part) != marked, "another annotator sees the same"
     assert len(said(data, episode)) == 3
-    services.review_add(user=bob, episode=episode, verdict="fail")
-    assert services.review_add(user=ann, episode=episode, verdict="pass", note="clean") != first
+    services.add_review(user=bob, episode=episode, verdict="fail")
+    assert services.add_review(user=ann, episode=episode, verdict="pass", note="clean") != first

@@ -5,7 +5,7 @@ import json
 import pytest
 from django.test import Client
 
-from evaweb.blinding import Sight, sight_of
+from evaweb.blinding import Visibility, visibility_for_user
 from evaweb.episodes.models import EpisodeStatus, Tag
 from evaweb.episodes.selectors import episode_get, episode_list, tag_counts
 from evaweb.errors import Conflict, EvaError, NotAllowed
@@ -13,7 +13,7 @@ from evaweb.find.selectors import find
 from evaweb.reviews.services import MOST_TAGS, Tagged, tags_change
 
 pytestmark = pytest.mark.django_db
-BLIND = Sight(checkpoints=frozenset({1}), names=frozenset({"Secret-birch"}))
+BLIND = Visibility(checkpoints=frozenset({1}), names=frozenset({"Secret-birch"}))
 
 
 def tags(episode):
@@ -78,7 +78,9 @@ def test_the_list_is_narrowed_to_a_tag_and_shows_and_exports_them(closed, ann):
     assert "allowed: cup &amp; saucer, slips" in browser.get("/replay/", {"tag": "nope"}).content.decode()
     answer = browser.get("/replay/", {"format": "csv", "tag": "cup & saucer"})
     assert "cup & saucer, slips" in b"".join(answer.streaming_content).decode()
-    found = {group.name: group.items for group in find(query="slip", user=ann, sight=sight_of(ann))}
+    found = {
+        group.name: group.items for group in find(query="slip", user=ann, sight=visibility_for_user(ann))
+    }
     assert [(one.title, one.detail, one.address) for one in found["Tags"]] == [
         ("slips", "2 episodes", "/replay/?tag=slips")
     ]

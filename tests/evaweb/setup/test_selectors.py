@@ -6,7 +6,7 @@ import pytest
 from django.test import Client
 from django.urls import resolve, reverse
 
-from evaweb.blinding import EVERYTHING, Sight
+from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.plans.models import Plan
 from evaweb.preflights.models import Preflight
 from evaweb.setup.selectors import cards
@@ -17,7 +17,7 @@ from tests.evaweb.trials import builders
 pytestmark = pytest.mark.django_db
 
 
-def missing(user, sight=EVERYTHING):
+def missing(user, sight=FULL_VISIBILITY):
     return {card.title: [one.text for one in card.missing] for card in cards(user=user, sight=sight)}
 
 
@@ -30,7 +30,7 @@ def test_an_empty_lab_misses_everything_and_each_has_a_form(alma, client):
         "Stations": ["No station yet."],
     }
     client.force_login(alma)
-    for card in cards(user=alma, sight=EVERYTHING):
+    for card in cards(user=alma, sight=FULL_VISIBILITY):
         for address in (card.address, card.add, *(one.address for one in card.missing)):
             assert client.get(address).status_code == 200, address
 
@@ -56,7 +56,7 @@ def test_each_thing_that_is_not_whole_is_named_with_the_form_that_mends_it(alma,
     assert told["Stations"] == [f"{bench.station} was never seen: start its runtime, or correct its name."]
     draft.positions.set(bench.scene.positions.all())
     draft.checkpoints.set([bench.checkpoint])
-    [plans] = [card for card in cards(user=alma, sight=EVERYTHING) if card.title == "Plans"]
+    [plans] = [card for card in cards(user=alma, sight=FULL_VISIBILITY) if card.title == "Plans"]
     assert [one.text for one in plans.missing] == ["Cups v1 is a draft: its trials begin once it is frozen."]
     assert resolve(plans.missing[0].address).view_name == "result-plan"
     Station.objects.update(boot="b1")
@@ -76,7 +76,7 @@ def test_a_checkpoint_wants_a_preflight_that_succeeded(alma, bench, verdict, usa
 
 def test_a_hidden_checkpoint_is_neither_counted_nor_named(bob, bench):
     hidden = Checkpoint.objects.create(name="secret")
-    sight = Sight(checkpoints=frozenset({hidden.pk}), names=frozenset({"secret"}))
+    sight = Visibility(checkpoints=frozenset({hidden.pk}), names=frozenset({"secret"}))
     [card] = [card for card in cards(user=bob, sight=sight) if card.title == "Checkpoints"]
     assert (card.count, card.newest) == (1, bench.checkpoint.name)
     assert not any("secret" in one.text for one in card.missing)

@@ -11,7 +11,7 @@ from pathlib import Path
 from django.conf import settings
 from django.db import connection
 
-from tests.evaweb.stand_in import StandIn
+from tests.evaweb.stand_in import FakeStation
 from tests.namespaces import Network
 from tests.processes import PATIENCE_S
 from tests.sources import ROOT
@@ -54,7 +54,7 @@ class Elsewhere:
 
     def __init__(self, folder: Path, net: Loopback | Namespaces, name: str) -> None:
         self.net, self.name, self.data = net, name, folder / "robot"
-        self.station = StandIn(self.data, name)
+        self.station = FakeStation(self.data, name)
         self.port = self.second_port = 0
         self._logs = folder
         self._children: dict[str, subprocess.Popen[str]] = {}

@@ -8,12 +8,12 @@ from uuid import uuid4
 
 import pytest
 
-from evaweb.console.feed import Feed
+from evaweb.console.feed import StationFeed
 from evaweb.episodes.job_kinds import look_for_arrived
 from evaweb.errors import StationGone
 from evaweb.stations import commands, enrolment, leases, stops
 from evaweb.stations.models import CommandStatus, Station
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from runtime.ipc.bus import Endpoints
 from runtime.link.uplink import read_uplink
 from tests.evaweb.stations.elsewhere import Elsewhere, Loopback, Namespaces
@@ -57,7 +57,7 @@ def enrolled(elsewhere, alma):
 
 def is_linked(name):
     try:
-        return wire_to(name).status()
+        return connection_to(name).status()
     except StationGone:
         return None
 
@@ -66,7 +66,7 @@ def pressed(name, user):
     """The answer to a press, once it is one: a machine that is busy may lose a link for a moment."""
 
     def press():
-        answer = stops.press(station=name, username=user.username, why="a test", uuid=uuid4()).result()
+        answer = stops.press_estop(station=name, username=user.username, why="a test", uuid=uuid4()).result()
         return answer if answer.status is CommandStatus.DONE else None
 
     return eventually(press, "the answer to a press")
@@ -96,18 +96,20 @@ def claimed(user, station):
 
 def run(user, station, lease):
     try:
-        snapshot = wire_to(station.name).status()
+        snapshot = connection_to(station.name).status()
     except StationGone:
         return None
     where = {"boot": snapshot["boot"], "sequence": snapshot["sequence"]}
-    row = commands.issue(user=user, station=station, kind="run", page="p1", epoch=lease.epoch, **where)
+    row = commands.issue_command(
+        user=user, station=station, kind="run", page="p1", epoch=lease.epoch, **where
+    )
     return row if row.status is CommandStatus.ACCEPTED else None
 
 
 @pytest.mark.parametrize("elsewhere", ["namespaces"], indirect=True)
 def test_a_cable_that_is_pulled_is_seen_and_one_that_is_plugged_in_again_found(elsewhere, alma, ann):
     station = enrolled(elsewhere, alma)
-    feed, links = Feed(station.name), []
+    feed, links = StationFeed(station.name), []
     at_the_robot = Endpoints(elsewhere.data / "stations" / station.name)
 
     def linked_there():
@@ -120,14 +122,14 @@ def test_a_cable_that_is_pulled_is_seen_and_one_that_is_plugged_in_again_found(e
         if stream == "link":
             links.append(content)
 
-    feed.join(heard, pictures=False)
+    feed.subscribe(heard, pictures=False)
     try:
         eventually(lambda: links[-1].ok, "the live page")
         elsewhere.net.pull()
         eventually(lambda: "link to its computer is lost" in links[-1].reason, "what the page says")
         eventually(lambda: read_uplink(at_the_robot)["why"], "what the robot's computer says")
         assert 0 <= time.time() - read_uplink(at_the_robot)["since"] < PATIENCE_S
-        answer = stops.press(station=station.name, username="ann", why="a test", uuid=uuid4()).result()
+        answer = stops.press_estop(station=station.name, username="ann", why="a test", uuid=uuid4()).result()
         assert answer.status is CommandStatus.FAILED
         assert answer.reason.startswith("USE THE HARDWARE STOP: not sent, the link to")
         elsewhere.net.plug()
@@ -135,7 +137,7 @@ def test_a_cable_that_is_pulled_is_seen_and_one_that_is_plugged_in_again_found(e
         eventually(lambda: read_uplink(at_the_robot)["why"] == "", "what the robot's computer says again")
         pressed(station.name, ann)
     finally:
-        feed.leave(heard)
+        feed.unsubscribe(heard)
 
 
 def test_a_key_that_is_withdrawn_is_no_station_any_more(elsewhere, alma):
@@ -168,7 +170,7 @@ def test_an_episode_arrives_whole_though_both_ends_are_killed_on_its_way(elsewhe
 
 def why_gone(name):
     try:
-        wire_to(name).status(timeout=1.0)  # what was asked as it was withdrawn is never answered
+        connection_to(name).status(timeout=1.0)  # what was asked as it was withdrawn is never answered
     except StationGone as gone:
         return str(gone)
     return ""

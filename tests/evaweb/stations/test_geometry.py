@@ -9,15 +9,15 @@ import pytest
 
 import robots
 from evaweb.errors import NotFound
-from evaweb.stations.geometry import geometry
+from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.models import Station
-from evaweb.stations.robot_geometry import looks_of
+from evaweb.stations.robot_geometry import drawn_robot
 from evaweb.stations.surroundings import BENCH
 
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
-    found = geometry(name, simulated=False)
+    found = scene_geometry(name, simulated=False)
     assert json.loads(json.dumps(found)) == found
     assert len(found["home"]) == len(found["parts"])
     parts = range(len(found["parts"]))
@@ -29,8 +29,8 @@ def test_a_robot_has_parts_shapes_and_a_pose_to_begin_with(name):
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
-    looks = looks_of(name)
-    frames = geometry(name, simulated=False)["frames"]
+    looks = drawn_robot(name)
+    frames = scene_geometry(name, simulated=False)["frames"]
     ends = [frame for frame in frames if frame["kind"] == "end"]
     for frame, arm in zip(ends, looks.robot.arms, strict=True):
         assert frame["name"].removeprefix(f"{arm.name}/") == arm.eef_link
@@ -42,8 +42,8 @@ def test_end_effectors_and_the_frames_of_their_poses_are_frames(name):
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_a_pose_of_an_arm_leads_from_its_frame_to_its_end_effector(name):
-    looks = looks_of(name)
-    frames = geometry(name, simulated=False)["frames"]
+    looks = drawn_robot(name)
+    frames = scene_geometry(name, simulated=False)["frames"]
     q = np.asarray(looks.robot.poses["home"])
     parts = looks.scene.poses(q)
     for frame, arm in zip(frames, looks.robot.arms, strict=False):
@@ -52,18 +52,20 @@ def test_a_pose_of_an_arm_leads_from_its_frame_to_its_end_effector(name):
 
 
 def test_the_frame_of_all_mounts_stands_still():
-    robot = looks_of("dual_franka").robot
-    (stand,) = [one for one in geometry("dual_franka", simulated=False)["frames"] if one["part"] is None]
+    robot = drawn_robot("dual_franka").robot
+    (stand,) = [
+        one for one in scene_geometry("dual_franka", simulated=False)["frames"] if one["part"] is None
+    ]
     assert stand["name"] == robot.mount_frame
     assert np.allclose(stand["pose"][12:15], robot.stand[:3])
 
 
 def test_fewer_groups_are_fewer_parts():
-    one = geometry("agilex_piper", ["left_arm"], simulated=False)
+    one = scene_geometry("agilex_piper", ["left_arm"], simulated=False)
     assert one["groups"] == ["left_arm"]
-    assert len(one["parts"]) == len(geometry("agilex_piper", simulated=False)["parts"]) / 2
+    assert len(one["parts"]) == len(scene_geometry("agilex_piper", simulated=False)["parts"]) / 2
     with pytest.raises(NotFound, match="tail"):
-        geometry("agilex_piper", ["tail"], simulated=False)
+        scene_geometry("agilex_piper", ["tail"], simulated=False)
 
 
 @pytest.mark.django_db

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from evaweb.stations.holders import holder_of, readable, who
+from evaweb.stations.holders import holder_display_name, holder_of, with_display_names
 
 
 def test_a_page_holds_under_its_user_and_its_own_name():
     assert holder_of("ann", "p1") == "web:ann:p1"
-    assert who("web:ann:p1") == "ann"
-    assert who("terminal:ann@bench") == "terminal:ann@bench"
+    assert holder_display_name("web:ann:p1") == "ann"
+    assert holder_display_name("terminal:ann@bench") == "terminal:ann@bench"
 
 
 @pytest.mark.parametrize(
@@ -29,4 +29,4 @@ def test_a_page_holds_under_its_user_and_its_own_name():
     ],
 )
 def test_a_sentence_of_the_runtime_names_people_not_pages(said, shown):
-    assert readable(said) == shown
+    assert with_display_names(said) == shown

@@ -11,16 +11,16 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.stations import leases
-from evaweb.stations.holders import who
+from evaweb.stations.holders import holder_display_name
 from evaweb.stations.models import Lease, LeaseRequest
-from evaweb.stations.runtime_client import wire_to
+from evaweb.stations.runtime_client import connection_to
 from evaweb.stations.selectors import lease_open, request_list
 
 pytestmark = pytest.mark.django_db
 
 
 def held(runtime):
-    return wire_to(runtime.name).status()["lease"]
+    return connection_to(runtime.name).status()["lease"]
 
 
 def claim(user, station, page="p1"):
@@ -48,7 +48,7 @@ def test_a_station_that_somebody_has_is_not_taken(live, ann, bob):
 
 
 def test_a_viewer_gets_no_lease(live, vera):
-    for act in (leases.claim, leases.request):
+    for act in (leases.claim, leases.request_handover):
         with pytest.raises(NotAllowed, match="needs an operator"):
             act(user=vera, station=live, page="p1")
 
@@ -78,7 +78,7 @@ def test_a_lease_is_renewed_by_name_and_epoch_alone(live, runtime, ann, django_a
 
 def test_giving_up_ends_row_and_lease(live, runtime, ann, bob):
     lease = claim(ann, live)
-    leases.give_up(user=ann, station=live, page="p1")
+    leases.release(user=ann, station=live, page="p1")
     lease.refresh_from_db()
     assert lease.end_reason == "given up"
     assert held(runtime)["holder"] == ""
@@ -89,13 +89,13 @@ def test_only_the_holding_page_gives_up(live, ann, bob):
     claim(ann, live)
     for user, page in ((bob, "p1"), (ann, "p9")):
         with pytest.raises(Conflict, match="this page does not have Bench 1"):
-            leases.give_up(user=user, station=live, page=page)
+            leases.release(user=user, station=live, page=page)
 
 
 def test_a_request_is_granted_with_the_next_epoch_and_no_gap(live, runtime, ann, bob):
     runtime.ready()
     mine = claim(ann, live)
-    asked = leases.request(user=bob, station=live, page="p2")
+    asked = leases.request_handover(user=bob, station=live, page="p2")
     assert list(request_list(station=live)) == [asked]
     theirs = leases.hand_over(user=ann, station=live, page="p1", request=asked.pk)
     mine.refresh_from_db()
@@ -144,16 +144,16 @@ def test_a_station_that_is_switched_off_is_not_moved(live, runtime, ann):
 
 def test_asking_again_is_the_same_request_for_the_newer_page(live, ann, bob):
     claim(ann, live)
-    first = leases.request(user=bob, station=live, page="p2")
-    again = leases.request(user=bob, station=live, page="p3")
+    first = leases.request_handover(user=bob, station=live, page="p2")
+    again = leases.request_handover(user=bob, station=live, page="p3")
     assert again.pk == first.pk
     assert again.holder == "web:bob:p3"
 
 
 def test_who_gets_a_station_has_got_what_they_asked_for(live, ann, bob):
     claim(ann, live)
-    asked = leases.request(user=bob, station=live, page="p2")
-    leases.give_up(user=ann, station=live, page="p1")
+    asked = leases.request_handover(user=bob, station=live, page="p2")
+    leases.release(user=ann, station=live, page="p1")
     claim(bob, live, "p2")
     asked.refresh_from_db()
     assert asked.answer == LeaseRequest.Answer.GRANTED
@@ -161,25 +161,25 @@ def test_who_gets_a_station_has_got_what_they_asked_for(live, ann, bob):
 
 def test_what_nobody_has_is_not_asked_for(live, bob):
     with pytest.raises(Conflict, match="nobody has Bench 1: take it"):
-        leases.request(user=bob, station=live, page="p2")
+        leases.request_handover(user=bob, station=live, page="p2")
 
 
 def test_one_does_not_ask_oneself(live, ann):
     claim(ann, live)
     with pytest.raises(Conflict, match="this page has Bench 1 already"):
-        leases.request(user=ann, station=live, page="p1")
+        leases.request_handover(user=ann, station=live, page="p1")
 
 
 def test_a_request_is_withdrawn_or_declined_once(live, ann, bob):
     claim(ann, live)
-    asked = leases.request(user=bob, station=live, page="p2")
-    assert leases.decline(user=ann, station=live, page="p1", request=asked.pk).answer == "declined"
+    asked = leases.request_handover(user=bob, station=live, page="p2")
+    assert leases.decline_request(user=ann, station=live, page="p1", request=asked.pk).answer == "declined"
     with pytest.raises(Conflict, match="the request of bob was declined already"):
         leases.hand_over(user=ann, station=live, page="p1", request=asked.pk)
     with pytest.raises(NotFound, match="bob has not asked"):
-        leases.withdraw(user=bob, station=live)
-    leases.request(user=bob, station=live, page="p2")
-    assert leases.withdraw(user=bob, station=live).answer == "withdrawn"
+        leases.withdraw_request(user=bob, station=live)
+    leases.request_handover(user=bob, station=live, page="p2")
+    assert leases.withdraw_request(user=bob, station=live).answer == "withdrawn"
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_a_request_is_withdrawn_or_declined_once(live, ann, bob):
 )
 def test_who_may_not_command_any_more_is_not_handed_the_station(live, runtime, ann, bob, change, sentence):
     claim(ann, live)
-    asked = leases.request(user=bob, station=live, page="p2")
+    asked = leases.request_handover(user=bob, station=live, page="p2")
     change(bob)
     with pytest.raises(NotAllowed, match=sentence):
         leases.hand_over(user=ann, station=live, page="p1", request=asked.pk)
@@ -201,15 +201,15 @@ def test_who_may_not_command_any_more_is_not_handed_the_station(live, runtime, a
 
 def test_only_the_holder_hands_over(live, ann, bob):
     claim(ann, live)
-    asked = leases.request(user=bob, station=live, page="p2")
+    asked = leases.request_handover(user=bob, station=live, page="p2")
     with pytest.raises(Conflict, match="this page does not have"):
         leases.hand_over(user=bob, station=live, page="p2", request=asked.pk)
 
 
 def test_a_lease_that_has_ended_is_not_handed_over(live, runtime, ann, bob):
     claim(ann, live)
-    asked = leases.request(user=bob, station=live, page="p2")
-    leases._tell(live.name, "lease_give_up", "web:ann:p1", held(runtime)["epoch"])
+    asked = leases.request_handover(user=bob, station=live, page="p2")
+    leases._send_lease_command(live.name, "lease_give_up", "web:ann:p1", held(runtime)["epoch"])
     with pytest.raises(Conflict, match="the lease has ended: nobody has Bench 1 now"):
         leases.hand_over(user=ann, station=live, page="p1", request=asked.pk)
 
@@ -217,17 +217,17 @@ def test_a_lease_that_has_ended_is_not_handed_over(live, runtime, ann, bob):
 def test_an_administrator_takes_with_a_reason(live, runtime, ann, bob, alma):
     mine = claim(ann, live)
     with pytest.raises(NotAllowed, match="needs an admin"):
-        leases.take(user=bob, station=live, page="p2", reason="mine")
+        leases.take_over(user=bob, station=live, page="p2", reason="mine")
     with pytest.raises(EvaError, match="needs a reason"):
-        leases.take(user=alma, station=live, page="p3", reason="  ")
-    taken = leases.take(user=alma, station=live, page="p3", reason="ann has gone home")
+        leases.take_over(user=alma, station=live, page="p3", reason="  ")
+    taken = leases.take_over(user=alma, station=live, page="p3", reason="ann has gone home")
     mine.refresh_from_db()
     assert mine.end_reason == "taken by alma: ann has gone home"
     assert held(runtime)["holder"] == taken.holder == "web:alma:p3"
 
 
 def notice(station, runtime, boot=None):
-    return leases.notice(station=station, boot=boot or runtime.boot, held=held(runtime))
+    return leases.record_snapshot_lease(station=station, boot=boot or runtime.boot, held=held(runtime))
 
 
 def test_a_lease_that_expired_ends_its_row(make_stand_in, ann):
@@ -254,17 +254,17 @@ def test_a_restart_ends_all_leases_before_it(live, runtime, ann):
 
 
 def test_the_lease_of_a_terminal_is_written_down(live, runtime):
-    leases._tell(live.name, "lease_claim", "terminal:eve@bench", 0, "operator")
+    leases._send_lease_command(live.name, "lease_claim", "terminal:eve@bench", 0, "operator")
     assert notice(live, runtime)
     lease = lease_open(station=live)
     assert (lease.holder, lease.user) == ("terminal:eve@bench", None)
-    assert who(lease.holder) == "terminal:eve@bench"
+    assert holder_display_name(lease.holder) == "terminal:eve@bench"
 
 
 def test_a_terminal_that_took_a_free_station_ends_the_row_of_the_one_before(live, runtime, ann):
     mine = claim(ann, live)
-    leases._tell(live.name, "lease_give_up", mine.holder, mine.epoch)
-    leases._tell(live.name, "lease_claim", "terminal:eve@bench", 0, "operator")
+    leases._send_lease_command(live.name, "lease_give_up", mine.holder, mine.epoch)
+    leases._send_lease_command(live.name, "lease_claim", "terminal:eve@bench", 0, "operator")
     assert notice(live, runtime)
     mine.refresh_from_db()
     assert mine.end_reason == "expired: it was not renewed"
@@ -274,15 +274,15 @@ def test_a_terminal_that_took_a_free_station_ends_the_row_of_the_one_before(live
 def test_an_old_snapshot_ends_no_newer_lease(live, runtime, ann):
     before = held(runtime)
     lease = claim(ann, live)
-    assert not leases.notice(station=live, boot=runtime.boot, held=before)
+    assert not leases.record_snapshot_lease(station=live, boot=runtime.boot, held=before)
     assert lease_open(station=live) == lease
 
 
 def test_an_old_snapshot_revives_no_lease_that_was_given_up(live, runtime, ann):
     claim(ann, live)
     before = held(runtime)
-    leases.give_up(user=ann, station=live, page="p1")
-    assert not leases.notice(station=live, boot=runtime.boot, held=before)
+    leases.release(user=ann, station=live, page="p1")
+    assert not leases.record_snapshot_lease(station=live, boot=runtime.boot, held=before)
     assert lease_open(station=live) is None
 
 

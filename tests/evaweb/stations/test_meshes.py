@@ -11,7 +11,7 @@ import pytest
 import robots
 from evaweb.errors import NotFound
 from evaweb.stations import robot_geometry as looks
-from evaweb.stations.geometry import geometry
+from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.meshes import mesh_content
 
 PIPER = robots.load_robot("agilex_piper").folder
@@ -41,7 +41,7 @@ def meshed(tmp_path, monkeypatch):
 
 
 def shown(name="meshed"):
-    return [visual for visual in geometry(name, simulated=False)["visuals"] if visual["kind"] == "mesh"]
+    return [visual for visual in scene_geometry(name, simulated=False)["visuals"] if visual["kind"] == "mesh"]
 
 
 def test_a_mesh_has_an_address_and_a_box_that_stands_for_it(meshed):

@@ -13,11 +13,11 @@ from django.db import OperationalError
 
 from evaweb.stations import notes as module
 from evaweb.stations.models import Command, CommandStatus, Station
-from evaweb.stations.notes import Notes
+from evaweb.stations.notes import StopRecorder
 from tests.processes import PATIENCE_S, eventually
 
 
-class Quiet(Notes):
+class Quiet(StopRecorder):
     """One whose thread is the test."""
 
     def __init__(self, keep, **more):
@@ -97,8 +97,8 @@ def test_one_that_cannot_be_kept_keeps_no_other_from_it(kept, caplog):
 
     quiet = Quiet(keep)
     for row in (halted(), halted(user="bob")):
-        quiet.note(row)
-    quiet.write()
+        quiet.record(row)
+    quiet.write_due()
     assert [row.user.username for row in kept] == ["bob"]
     assert "is not written down" in caplog.text
 
@@ -110,12 +110,12 @@ def test_one_that_cannot_be_kept_now_is_tried_again_with_those_that_came_since(k
         kept.append(row)
 
     quiet = Quiet(keep)
-    quiet.note(halted())
-    assert quiet.write() == 1.0
+    quiet.record(halted())
+    assert quiet.write_due() == 1.0
     last = halted()
-    quiet.note(last)
+    quiet.record(last)
     for quiet.now, wait in ((0.5, 0.5), (1.0, 1.0), (2.0, None)):
-        assert quiet.write() == wait
+        assert quiet.write_due() == wait
     assert (kept, last.data) == ([last], {"times": 2})
     assert caplog.text.count("is not written down yet") == 1, "one line for many"
 
@@ -152,9 +152,9 @@ def test_the_thread_survives_what_nobody_expects_and_keeps_the_note(kept, monkey
 
     monkeypatch.setattr(module, "_has_station", odd)
     monkeypatch.setattr(module, "_APART_S", 0.01)
-    notes, rows = Notes(kept.append), [halted(), halted(user="bob")]
+    notes, rows = StopRecorder(kept.append), [halted(), halted(user="bob")]
     for row in rows:
-        notes.note(row)
+        notes.record(row)
     eventually(
         lambda: sorted(map(id, kept)) == sorted(map(id, rows)), "both are written down", 3 * PATIENCE_S
     )
@@ -205,12 +205,12 @@ def test_what_waits_for_its_second_is_in_the_journal_until_it_is_handed_on(kept)
     quiet = Quiet(kept.append, journal=lambda rows: ahead.append(list(rows)))
     rows = [halted() for _ in range(4)]
     for row in rows[:3]:
-        quiet.note(row)
-        quiet.write()
+        quiet.record(row)
+        quiet.write_due()
     assert (kept, ahead[-2:]) == ([rows[0]], [[rows[1]], [rows[2]]])
     quiet.now = 1.0
-    quiet.note(rows[3])
-    quiet.write()
+    quiet.record(rows[3])
+    quiet.write_due()
     assert (kept, ahead[-2:]) == ([rows[0], rows[3]], [[], []])
 
 
@@ -220,8 +220,8 @@ def test_a_journal_that_the_disk_does_not_take_keeps_nothing_from_being_written(
 
     quiet = Quiet(kept.append, journal=full)
     for _ in range(2):
-        quiet.note(halted())
-        quiet.write()
-    quiet.write(all_of_them=True)
+        quiet.record(halted())
+        quiet.write_due()
+    quiet.write_due(all_of_them=True)
     assert len(kept) == 2
     assert "a kill would lose 1 stops" in caplog.text

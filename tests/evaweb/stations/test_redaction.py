@@ -7,7 +7,7 @@ import pytest
 
 import runtime
 from evaweb import blinding_reasons as reasons
-from evaweb.blinding import COVERED, COVERED_AT_REST, EVERYTHING
+from evaweb.blinding import COVERED, COVERED_AT_REST, FULL_VISIBILITY
 from evaweb.stations import redaction
 from runtime.core.sentences import Pattern, identity, known, plain, within
 from runtime.processes.coordinator import operations
@@ -37,7 +37,7 @@ TRUTH = {"reset": "a", "objects": {"block": [0.1, 0.2]}, "milestones": {"lifted"
 
 
 def test_of_the_benchs_truth_what_was_reached_is_left_out():
-    shown = redaction.state({"state": "ready", "truth": TRUTH}, EVERYTHING)
+    shown = redaction.redact_state({"state": "ready", "truth": TRUTH}, FULL_VISIBILITY)
     assert shown["truth"] == {"reset": "a", "objects": {"block": [0.1, 0.2]}}
 
 
@@ -54,24 +54,24 @@ def test_of_the_benchs_truth_what_was_reached_is_left_out():
 )
 def test_id_and_arguments_go_with_the_text_that_they_are_of(kind, text, kept):
     row = {"number": 1, "kind": kind, "text": plain(text), "data": {}, **identity(text)}
-    (shown,) = redaction.events([row], EVERYTHING)
+    (shown,) = redaction.redact_events([row], FULL_VISIBILITY)
     assert {key: shown[key] for key in ("id", "arguments") if key in shown} == (
         identity(text) if kept else {}
     )
     assert "alder" not in str(shown)
     # what says more than its text is no argument of that text
     more = {**row, "arguments": {**row["arguments"], "url": "ws://alder:8000"}}
-    assert "alder" not in str(redaction.events([more], EVERYTHING))
+    assert "alder" not in str(redaction.redact_events([more], FULL_VISIBILITY))
 
 
 def test_a_refusal_while_a_process_is_starting_keeps_the_id_by_which_pages_ask_again():
     starting = operations._FAMILY_STARTING(process="media")
-    assert identity(EVERYTHING.told(starting)) == identity(starting)
+    assert identity(FULL_VISIBILITY.redact_text(starting)) == identity(starting)
 
 
 def test_of_a_snapshot_those_sentences_are_left_that_are_shown_whole():
     said = {"state": "holding", "reason": LOST, "guarded": {"run": STOPPED}, "last_run": {"reason": LOST}}
-    shown = redaction.state({**said, "sentences": within(said)}, EVERYTHING)
+    shown = redaction.redact_state({**said, "sentences": within(said)}, FULL_VISIBILITY)
     assert shown["reason"] == COVERED
     assert shown["sentences"] == {"guarded.run": identity(STOPPED), "reason": identity(COVERED)}
     assert "alder" not in str(shown)
@@ -79,7 +79,7 @@ def test_of_a_snapshot_those_sentences_are_left_that_are_shown_whole():
 
 def test_what_is_covered_says_what_can_be_done_where_the_set_up_failed():
     said = {"state": "idle", "reason": LOST}
-    shown = redaction.state({**said, "sentences": within(said)}, EVERYTHING)
+    shown = redaction.redact_state({**said, "sentences": within(said)}, FULL_VISIBILITY)
     assert shown["reason"] == COVERED_AT_REST
     assert shown["sentences"]["reason"] == identity(COVERED_AT_REST)
 
@@ -87,16 +87,16 @@ def test_what_is_covered_says_what_can_be_done_where_the_set_up_failed():
 @pytest.mark.parametrize(("kind", "told"), [("truth", False), ("camera_back", True), ("estopped", True)])
 def test_an_event_that_says_how_it_went_is_none(kind, told):
     row = {"number": 1, "kind": kind, "text": "the simulated bench says: success", "data": {"success": True}}
-    assert bool(redaction.events([row], EVERYTHING)) is told
+    assert bool(redaction.redact_events([row], FULL_VISIBILITY)) is told
 
 
 def holding(reason):
     """The reason of a blind station, as somebody reads it from whom the checkpoint is hidden, and in its event."""
     said = {"state": "holding", "reason": reason}
-    shown = redaction.state({**said, "sentences": within(said)}, EVERYTHING)
+    shown = redaction.redact_state({**said, "sentences": within(said)}, FULL_VISIBILITY)
     text = STATE(reason=reason)
     row = {"number": 1, "kind": "state", "text": plain(text), "data": {}, **identity(text)}
-    (event,) = redaction.events([row], EVERYTHING)
+    (event,) = redaction.redact_events([row], FULL_VISIBILITY)
     assert event["text"] == f"running -> holding: {shown['reason']}"
     return shown
 
@@ -157,9 +157,14 @@ def test_neither_numbers_nor_gaps_in_them_count_the_events_that_are_left_out():
         rows = [{"kind": "state", "text": "idle -> ready", "time": 2.5, "data": {}}]
         rows += [{"kind": "limited", "text": "x", "time": 2.5 + 0.1 * at, "data": {}} for at in range(hidden)]
         rows += [{"kind": "estopped", "text": "e-stop", "time": 9.0, "data": {}}] * 2
-        return redaction.events([{**row, "number": at} for at, row in enumerate(rows, 1)], EVERYTHING)
+        return redaction.redact_events(
+            [{**row, "number": at} for at, row in enumerate(rows, 1)], FULL_VISIBILITY
+        )
 
     assert told(0) == told(5)
     assert [row["number"] for row in told(3)] == [2_500_000, 9_000_000, 9_000_001]
-    states = [redaction.state({"state": "ready", "newest_event": newest}, EVERYTHING) for newest in (3, 8)]
+    states = [
+        redaction.redact_state({"state": "ready", "newest_event": newest}, FULL_VISIBILITY)
+        for newest in (3, 8)
+    ]
     assert states[0] == states[1]

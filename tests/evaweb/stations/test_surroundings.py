@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import robots
-from evaweb.stations.robot_geometry import looks_of
-from evaweb.stations.surroundings import AREA, BENCH, bounds, surroundings
+from evaweb.stations.robot_geometry import drawn_robot
+from evaweb.stations.surroundings import AREA, BENCH, bounds, scene_surroundings
 from robots.visuals import Visual
 from runtime.sim.bench import Bench
 
@@ -20,7 +20,7 @@ def test_the_bench_that_is_drawn_is_the_one_that_is_simulated():
     for drawn, painted in (
         (BENCH["plate_colour"], bench.plate_colour),
         (BENCH["plate_rim_colour"], bench.plate_rim_colour),
-        (surroundings(looks_of("agilex_piper"))["table"]["colour"], bench.table_colour),
+        (scene_surroundings(drawn_robot("agilex_piper"))["table"]["colour"], bench.table_colour),
         *zip(BENCH["block_colours"], bench.block_colours, strict=True),
     ):
         assert drawn[:3] == pytest.approx([part / 255 for part in painted])
@@ -33,8 +33,8 @@ def rectangle(table):
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_things_lie_on_the_table_and_no_body_stands_in_it(name):
-    looks = looks_of(name)
-    found = surroundings(looks)
+    looks = drawn_robot(name)
+    found = scene_surroundings(looks)
     x_from, x_to, y_from, y_to = rectangle(found["table"])
     assert x_from <= AREA[0] < AREA[1] <= x_to
     assert y_from <= AREA[2] < AREA[3] <= y_to
@@ -48,8 +48,8 @@ def test_things_lie_on_the_table_and_no_body_stands_in_it(name):
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_the_whole_robot_is_in_view_in_each_of_its_poses(name):
-    looks = looks_of(name)
-    view = surroundings(looks)["view"]
+    looks = drawn_robot(name)
+    view = scene_surroundings(looks)["view"]
     for pose in looks.robot.poses.values():
         at = looks.scene.poses(pose)[:, :3, 3]
         shown = {visual.part for visual in looks.scene.visuals}
@@ -60,18 +60,18 @@ def test_the_whole_robot_is_in_view_in_each_of_its_poses(name):
 
 @pytest.mark.parametrize("name", robots.robot_names())
 def test_a_robot_looks_at_the_table(name):
-    ahead = surroundings(looks_of(name))["ahead"]
+    ahead = scene_surroundings(drawn_robot(name))["ahead"]
     assert np.hypot(*ahead) == pytest.approx(1.0)
     assert ahead[1] > 0.7  # robots stand at the near side
 
 
 def test_arms_on_the_table_need_neither_floor_nor_mount():
-    found = surroundings(looks_of("agilex_piper"))
+    found = scene_surroundings(drawn_robot("agilex_piper"))
     assert (found["floor"], found["mounts"], found["table"]["legs"]) == (None, [], None)
 
 
 def test_bases_above_the_table_share_a_mount_that_reaches_them():
-    found = surroundings(looks_of("dual_franka"))
+    found = scene_surroundings(drawn_robot("dual_franka"))
     assert len(found["mounts"]) == 1
     mount = found["mounts"][0]
     assert mount["from"] == 0.0

@@ -18,9 +18,9 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, NotFound
 from evaweb.stations import commands, leases, unwritten
-from evaweb.stations.journal import take_up
+from evaweb.stations.journal import recover_journals
 from evaweb.stations.models import Command, CommandStatus, Station
-from evaweb.stations.unwritten import Unwritten
+from evaweb.stations.unwritten import UnwrittenCommands
 from runtime.recording.files import DiskFullError
 from tests.processes import PATIENCE_S, eventually
 
@@ -35,7 +35,7 @@ def folder(monkeypatch, tmp_path):
 @pytest.fixture
 def asleep(monkeypatch):
     """No thread looks: the test does."""
-    monkeypatch.setattr(Unwritten, "look", lambda self: None)
+    monkeypatch.setattr(UnwrittenCommands, "start_writing", lambda self: None)
 
 
 @pytest.fixture
@@ -61,9 +61,9 @@ def test_a_halt_during_a_locked_database_is_carried_out_and_written_when_the_loc
     live, ann, runtime, monkeypatch, folder
 ):
     monkeypatch.setattr(unwritten, "_AGAIN_S", 0.01)
-    monkeypatch.setattr(commands.notes, "note", commands.unwritten.keep)
+    monkeypatch.setattr(commands.notes, "record", commands.unwritten.store)
     tried = []
-    written = commands._written
+    written = commands._stored_row
 
     def counted(row):
         tried.append(row.uuid)
@@ -75,10 +75,10 @@ def test_a_halt_during_a_locked_database_is_carried_out_and_written_when_the_loc
     runtime.ready()
     lease = leases.claim(user=ann, station=live, page="p1")
     page = {"user": ann, "station": live, "page": "p1", "epoch": lease.epoch}
-    commands.issue(kind="run", **page, boot=runtime.boot, sequence=runtime.session.sequence)
+    commands.issue_command(kind="run", **page, boot=runtime.boot, sequence=runtime.session.sequence)
     other = sqlite3.connect(connection.settings_dict["NAME"], isolation_level=None)
     other.execute("BEGIN IMMEDIATE")
-    row = commands.issue(kind="halt", **page)
+    row = commands.issue_command(kind="halt", **page)
     assert (row.status, runtime.session.state) == (CommandStatus.ACCEPTED, "holding")
     assert not Command.objects.filter(kind="halt").exists()
     over = timezone.now()
@@ -99,11 +99,11 @@ def test_a_halt_during_a_locked_database_is_carried_out_and_written_when_the_loc
 def test_another_process_writes_what_one_that_has_ended_left(halted, ann, folder):
     row = halted(ann)
     row.issued_at = timezone.now() - timedelta(minutes=5)
-    Unwritten(away).keep(row)
-    assert Unwritten(away).attempt() is True
+    UnwrittenCommands(away).store(row)
+    assert UnwrittenCommands(away).write_all() is True
     assert [path.name for path in folder.iterdir()] == [f"{row.uuid}.{os.getpid()}.json"]
-    later = Unwritten(commands._written)
-    assert later.attempt() is False
+    later = UnwrittenCommands(commands._stored_row)
+    assert later.write_all() is False
     found = Command.objects.get()
     for name in ("uuid", "station", "user", "kind", "holder", "epoch", "status", "allowed", "issued_at"):
         assert getattr(found, name) == getattr(row, name)
@@ -115,9 +115,9 @@ def test_another_process_writes_what_one_that_has_ended_left(halted, ann, folder
 def test_what_two_processes_write_is_one_row(halted):
     row = halted()
     for _ in range(2):
-        one = Unwritten(commands._written)
-        one.keep(row)
-        one.attempt()
+        one = UnwrittenCommands(commands._stored_row)
+        one.store(row)
+        one.write_all()
     assert Command.objects.get().uuid == row.uuid
 
 
@@ -127,9 +127,9 @@ def test_an_answer_that_came_later_is_written_into_the_row_that_has_none(halted)
     Command.objects.create(
         uuid=row.uuid, station=row.station, kind="halt", status=CommandStatus.UNKNOWN, reason="no answer"
     )
-    one = Unwritten(commands._written)
-    one.keep(row)
-    one.attempt()
+    one = UnwrittenCommands(commands._stored_row)
+    one.store(row)
+    one.write_all()
     assert (Command.objects.get().status, Command.objects.get().reason) == (CommandStatus.ACCEPTED, "")
 
 
@@ -140,14 +140,14 @@ def test_where_the_disk_does_not_take_them_either_the_newest_are_kept(halted, mo
 
     monkeypatch.setattr(unwritten, "write_atomic", full)
     monkeypatch.setattr(unwritten, "_MOST", 3)
-    one, rows = Unwritten(commands._written), [halted() for _ in range(5)]
+    one, rows = UnwrittenCommands(commands._stored_row), [halted() for _ in range(5)]
     for row in rows:
-        one.keep(row)
-    assert one.attempt() is False
+        one.store(row)
+    assert one.write_all() is False
     assert set(Command.objects.values_list("uuid", flat=True)) == {row.uuid for row in rows[2:]}
     for row in rows[:2]:
         assert f'"uuid": "{row.uuid}"' in caplog.text, "the log has those that were given up"
-    assert one.attempt() is False
+    assert one.write_all() is False
 
 
 @pytest.mark.usefixtures("asleep")
@@ -158,12 +158,12 @@ def test_what_the_database_refuses_for_good_keeps_nothing_else_waiting(halted, f
         rows.append(row.uuid)
 
     rows: list[UUID] = []
-    one, refused, row = Unwritten(written), halted(), halted()
+    one, refused, row = UnwrittenCommands(written), halted(), halted()
     refused.kind = "estop"
     for each in (refused, row):
-        one.keep(each)
+        one.store(each)
     (folder / f"{uuid4()}.json").write_text("half a fi")
-    assert one.attempt() is False
+    assert one.write_all() is False
     assert rows == [row.uuid]
     assert {path.suffix for path in folder.iterdir()} == {".refused"}
     assert f"{refused.uuid}.{os.getpid()}.refused" in {path.name for path in folder.iterdir()}
@@ -177,21 +177,21 @@ def test_what_the_database_refuses_for_good_keeps_nothing_else_waiting(halted, f
     ids=lambda spoiled: repr(spoiled[:12]),
 )
 def test_a_file_that_holds_something_else_keeps_nothing_else_waiting(halted, folder, spoiled):
-    one, row = Unwritten(commands._written), halted()
-    one.keep(row)
+    one, row = UnwrittenCommands(commands._stored_row), halted()
+    one.store(row)
     (folder / "0.json").write_bytes(spoiled)
-    assert one.attempt() is False
+    assert one.write_all() is False
     assert Command.objects.get().uuid == row.uuid
     assert [path.name for path in folder.iterdir()] == ["0.refused"]
 
 
 @pytest.mark.usefixtures("asleep")
 def test_a_number_that_no_database_has_keeps_nothing_else_waiting(halted, folder):
-    one, refused, row = Unwritten(commands._written), halted(), halted()
+    one, refused, row = UnwrittenCommands(commands._stored_row), halted(), halted()
     refused.epoch = 1 << 70
     for each in (refused, row):
-        one.keep(each)
-    assert one.attempt() is False
+        one.store(each)
+    assert one.write_all() is False
     assert Command.objects.get().uuid == row.uuid
     assert [path.name for path in folder.iterdir()] == [f"{refused.uuid}.{os.getpid()}.refused"]
 
@@ -200,18 +200,21 @@ def test_a_number_that_no_database_has_keeps_nothing_else_waiting(halted, folder
 def test_a_file_that_the_disk_does_not_give_is_tried_again_and_the_others_are_written(
     halted, folder, monkeypatch
 ):
-    one, rows = Unwritten(commands._written), sorted((halted() for _ in range(3)), key=lambda row: row.uuid)
+    one, rows = (
+        UnwrittenCommands(commands._stored_row),
+        sorted((halted() for _ in range(3)), key=lambda row: row.uuid),
+    )
     for row in rows:
-        one.keep(row)
+        one.store(row)
     (folder / "0.json").mkdir()
     path = unwritten._path
     with monkeypatch.context() as patch:
         patch.setattr(
             unwritten, "_path", lambda name: folder if name.startswith(str(rows[0].uuid)) else path(name)
         )
-        assert one.attempt() is True
+        assert one.write_all() is True
     assert set(Command.objects.values_list("uuid", flat=True)) == {row.uuid for row in rows[1:]}
-    assert one.attempt() is False
+    assert one.write_all() is False
     assert Command.objects.count() == 3
 
 
@@ -230,12 +233,12 @@ def pressed(halted, ann, bob):
 def test_two_processes_that_carried_out_one_press_have_a_file_each_and_it_is_one_row(
     pressed, folder, monkeypatch
 ):
-    web, stops = Unwritten(commands._written), Unwritten(commands._written)
-    web.keep(pressed(CommandStatus.FAILED, reason="the station is gone"))
+    web, stops = UnwrittenCommands(commands._stored_row), UnwrittenCommands(commands._stored_row)
+    web.store(pressed(CommandStatus.FAILED, reason="the station is gone"))
     monkeypatch.setattr(os, "getpid", lambda: 1)
-    stops.keep(pressed())
+    stops.store(pressed())
     assert len(list(folder.iterdir())) == 2
-    assert [one.attempt() for one in (web, stops)] == [False, False]
+    assert [one.write_all() for one in (web, stops)] == [False, False]
     assert list(folder.iterdir()) == []
     assert (Command.objects.get().status, Command.objects.get().reason) == ("done", "")
 
@@ -244,7 +247,7 @@ def test_two_processes_that_carried_out_one_press_have_a_file_each_and_it_is_one
 def test_whichever_way_is_written_first_the_row_has_what_was_done_and_by_whom(pressed, ann, order):
     ways = [pressed(), pressed(CommandStatus.UNKNOWN, None, args={"unverified": "the database hung"})]
     for number in order:
-        commands._written(ways[number])
+        commands._stored_row(ways[number])
     row = Command.objects.get()
     assert (row.status, row.user, row.args) == ("done", ann, {})
 
@@ -256,7 +259,7 @@ def latched(at, how="anew"):
 def test_a_press_that_latched_anew_with_the_uuid_of_an_earlier_one_has_a_row_of_its_own(pressed, ann):
     first, again = pressed(data=latched(10.0)), pressed(data=latched(20.0))
     for row in (first, again, again, first):  # each may be tried more than once
-        commands._written(copy(row))
+        commands._stored_row(copy(row))
     kept, late = Command.objects.order_by("answered_at", "issued_at")
     assert (kept.uuid, kept.data) == (first.uuid, latched(10.0))
     assert late.uuid != first.uuid
@@ -274,15 +277,15 @@ def test_the_answer_to_an_earlier_press_is_no_row_more_and_hides_not_that_it_lat
         pressed(CommandStatus.UNKNOWN, None),
     ]
     for number in order:
-        commands._written(ways[number])
+        commands._stored_row(ways[number])
     assert Command.objects.get().data == latched(10.0)
 
 
 @pytest.mark.parametrize("how", ["anew", "already", "before"])
 def test_a_press_with_the_uuid_of_another_persons_has_a_row_of_its_own(pressed, ann, bob, how):
-    commands._written(pressed(data=latched(10.0)))
+    commands._stored_row(pressed(data=latched(10.0)))
     for _ in range(2):  # both ways
-        commands._written(pressed(user=bob, data=latched(10.0 if how == "before" else 11.0, how)))
+        commands._stored_row(pressed(user=bob, data=latched(10.0 if how == "before" else 11.0, how)))
     rows = {row.user: row for row in Command.objects.all()}
     assert len(rows) == Command.objects.count() == 2
     assert rows[bob].data["sent_uuid"] == str(rows[ann].uuid)
@@ -294,15 +297,15 @@ def test_a_press_with_the_uuid_of_another_persons_has_a_row_of_its_own(pressed, 
 def test_a_press_with_the_uuid_of_a_run_has_a_row_of_its_own(pressed, ann, user):
     run = pressed(kind="run")
     run.save(force_insert=True)
-    commands._written(pressed(user=ann if user else None, data=latched(10.0)))
+    commands._stored_row(pressed(user=ann if user else None, data=latched(10.0)))
     row = Command.objects.get(kind="estop")
     assert (row.user, row.data["sent_uuid"]) == (ann if user else None, str(run.uuid))
 
 
 def test_a_uuid_is_still_no_other_commands(pressed):
-    commands._written(pressed())
+    commands._stored_row(pressed())
     with pytest.raises(Conflict):
-        commands._written(pressed(kind="halt"))
+        commands._stored_row(pressed(kind="halt"))
 
 
 def in_a_process_that_is_killed(work):
@@ -323,9 +326,9 @@ def test_what_a_killed_process_had_foreseen_is_kept_by_whoever_looks_next_as_one
     rows = [halted(ann) for _ in range(3)]
     stop = halted(ann)
     stop.kind = "stop"
-    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([*rows, stop]))
+    in_a_process_that_is_killed(lambda: UnwrittenCommands(away).prepare([*rows, stop]))
     assert len(list(folder.iterdir())) == 1
-    assert Unwritten(commands._written).attempt() is False
+    assert UnwrittenCommands(commands._stored_row).write_all() is False
     assert {(row.uuid, row.kind): row.data for row in Command.objects.all()} == {
         (rows[-1].uuid, "halt"): {"times": 3},
         (stop.uuid, "stop"): {},
@@ -335,26 +338,26 @@ def test_what_a_killed_process_had_foreseen_is_kept_by_whoever_looks_next_as_one
 
 @pytest.mark.usefixtures("asleep")
 def test_what_a_living_process_foresees_is_left_to_it(halted, folder):
-    one, other = Unwritten(commands._written), Unwritten(commands._written)
-    one.foresee([halted()])
-    one.foresee([halted()])
+    one, other = UnwrittenCommands(commands._stored_row), UnwrittenCommands(commands._stored_row)
+    one.prepare([halted()])
+    one.prepare([halted()])
     assert len(list(folder.iterdir())) == 1
-    assert other.attempt() is False
+    assert other.write_all() is False
     assert not Command.objects.exists()
-    one.foresee([])
+    one.prepare([])
     assert list(folder.iterdir()) == []
-    one.foresee([halted()])
+    one.prepare([halted()])
     assert len(list(folder.iterdir())) == 1
 
 
 @pytest.mark.usefixtures("asleep")
 def test_half_a_line_of_a_killed_process_keeps_no_other_from_being_written(halted, ann, folder, caplog):
     row = halted(ann)
-    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([row]))
+    in_a_process_that_is_killed(lambda: UnwrittenCommands(away).prepare([row]))
     (left,) = folder.iterdir()
     with left.open("ab") as file:
         file.write(b'[]\n{"uuid": "0b')
-    Unwritten(commands._written).attempt()
+    UnwrittenCommands(commands._stored_row).write_all()
     assert [found.uuid for found in Command.objects.all()] == [row.uuid]
     assert caplog.text.count("a command is not in the database") == 2
     assert [path.name for path in folder.iterdir()] == [f"{left.stem}.refused"]
@@ -369,14 +372,14 @@ def test_half_a_line_of_a_killed_process_keeps_no_other_from_being_written(halte
 def test_an_odd_line_keeps_no_other_from_being_written(halted, ann, folder, caplog, odd):
     first, last, other = (halted(ann) for _ in range(3))
     last.kind = "stop"
-    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([other]))
+    in_a_process_that_is_killed(lambda: UnwrittenCommands(away).prepare([other]))
     good = [json.dumps(unwritten._document(row)).encode() for row in (first, last)]
     if isinstance(odd, dict):
         odd = json.dumps(unwritten._document(halted(ann)) | odd).encode()
     lines = [good[0], odd, good[1], b""]
     (folder / "0.lines").write_bytes(b"\n".join(lines))
     for _ in range(2):
-        assert Unwritten(commands._written).attempt() is False
+        assert UnwrittenCommands(commands._stored_row).write_all() is False
     assert {row.uuid for row in Command.objects.all()} == {first.uuid, last.uuid, other.uuid}
     assert caplog.text.count("a command is not in the database") == 1
     assert [path.name for path in folder.iterdir()] == ["0.refused"]
@@ -388,7 +391,7 @@ def test_what_is_no_file_of_ours_is_put_aside_once_and_the_others_are_written(
     halted, ann, folder, caplog, monkeypatch, tmp_path, odd
 ):
     row, path = halted(ann), folder / "0.lines"
-    in_a_process_that_is_killed(lambda: Unwritten(away).foresee([row]))
+    in_a_process_that_is_killed(lambda: UnwrittenCommands(away).prepare([row]))
     if odd == "fifo":
         os.mkfifo(path)
     elif odd == "directory":
@@ -401,7 +404,7 @@ def test_what_is_no_file_of_ours_is_put_aside_once_and_the_others_are_written(
         path.touch()
         forbidden(monkeypatch, path)
     for _ in range(2):
-        assert Unwritten(commands._written).attempt() is False
+        assert UnwrittenCommands(commands._stored_row).write_all() is False
     assert Command.objects.get().uuid == row.uuid
     assert [path.name for path in folder.iterdir()] == ["0.refused"]
     assert caplog.text.count("is put aside") == 1
@@ -425,13 +428,13 @@ def test_a_file_of_a_killed_process_that_the_disk_does_not_give_is_tried_again(
 ):
     rows = [halted(ann) for _ in range(2)]
     for row in rows:
-        in_a_process_that_is_killed(lambda row=row: Unwritten(away).foresee([row]))
+        in_a_process_that_is_killed(lambda row=row: UnwrittenCommands(away).prepare([row]))
     first, _ = sorted(folder.iterdir())
     with monkeypatch.context() as patch:
         forbidden(patch, first, errno.EIO)
-        assert Unwritten(commands._written).attempt() is True
+        assert UnwrittenCommands(commands._stored_row).write_all() is True
     assert Command.objects.count() == 1
-    assert Unwritten(commands._written).attempt() is False
+    assert UnwrittenCommands(commands._stored_row).write_all() is False
     assert {row.uuid for row in Command.objects.all()} == {row.uuid for row in rows}
 
 
@@ -445,7 +448,7 @@ def test_a_file_that_nobody_can_take_is_put_aside_and_the_next_one_is_taken(tmp_
     taken = []
     for name in "01":
         (tmp_path / f"{name}.lines").write_text(f"{name}\n")
-    assert take_up(tmp_path, take) is False
+    assert recover_journals(tmp_path, take) is False
     assert taken == [[b"1"]]
     assert [path.name for path in tmp_path.iterdir()] == ["0.refused"]
 
@@ -460,8 +463,8 @@ def test_the_thread_survives_whatever_happens_in_one_turn(monkeypatch, caplog):
             raise RuntimeError("anything")
         return False
 
-    one = Unwritten(away)
-    one.attempt = attempt
-    one.look()
+    one = UnwrittenCommands(away)
+    one.write_all = attempt
+    one.start_writing()
     eventually(lambda: len(turns) == 3, "it goes on", 3 * PATIENCE_S)
     assert caplog.text.count("RuntimeError: anything") == 1, "one line for many"

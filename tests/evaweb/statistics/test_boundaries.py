@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.boundaries import SHAPES, Boundary, Look, boundary, extremeness, in_pairs
+from evaweb.statistics.boundaries import SHAPES, Boundary, Look, boundary, extremeness_of, pair_counts
 from evaweb.statistics.planning import exact_power
 from tests.examples import some
 
@@ -49,12 +49,14 @@ def counted(found, p, q):
     return [float(stop) for stop in stops]
 
 
-@pytest.mark.parametrize("looks", [in_pairs(5), in_pairs(6, [3]), [(1, 2), (3, 2), (4, 6)]])
+@pytest.mark.parametrize("looks", [pair_counts(5), pair_counts(6, [3]), [(1, 2), (3, 2), (4, 6)]])
 @pytest.mark.parametrize("margin", [None, 0.3])
 def test_the_course_is_that_of_all_sequences_there_are(looks, margin):
     found = boundary(looks, alpha=0.3, shape="early", margin=margin)
     for p, q in ((Fraction(1, 2), Fraction(1, 2)), (Fraction(1, 5), Fraction(9, 10))):
-        assert found.course(float(p), float(q)).stops == pytest.approx(counted(found, p, q), abs=1e-12)
+        assert found.operating_characteristics(float(p), float(q)).stops == pytest.approx(
+            counted(found, p, q), abs=1e-12
+        )
     assert any(look.least for look in found.looks)
 
 
@@ -66,7 +68,7 @@ def test_no_rates_of_the_null_stop_it_more_often_than_alpha(growth, alpha, shape
     assert highest <= bound <= alpha
     for p in (0.0, 0.01, 0.1, 0.37, 0.5, 0.9, 1.0):
         first, second = (p, p) if margin is None else (margin + (1 - margin) * p, (1 - margin) * p)
-        assert found.course(first, second).power <= bound + 1e-12
+        assert found.operating_characteristics(first, second).power <= bound + 1e-12
 
 
 @given(GROWTH, MARGINS.filter(bool))
@@ -75,7 +77,9 @@ def test_what_is_worse_by_more_than_the_margin_stops_less_often_still(growth, ma
     found = boundary(looks_of(growth), alpha=0.1, margin=margin)
     bound = found.error()[1]
     rates = np.linspace(0, 1, 9)
-    assert all(found.course(p, q).power <= bound for p in rates for q in rates if q <= p - margin)
+    assert all(
+        found.operating_characteristics(p, q).power <= bound for p in rates for q in rates if q <= p - margin
+    )
 
 
 @given(GROWTH, MARGINS)
@@ -104,7 +108,7 @@ def test_a_table_that_is_more_extreme_stops_too(growth, margin):
     ],
 )
 def test_power_and_median_are_those_that_are_wanted(shape, pairs, rates, power, median):
-    found = boundary(in_pairs(pairs), shape=shape).course(*rates)
+    found = boundary(pair_counts(pairs), shape=shape).operating_characteristics(*rates)
     assert found.power >= power
     assert found.median / 2 <= median
     assert found.second_better > 0.99 * found.power
@@ -112,11 +116,11 @@ def test_power_and_median_are_those_that_are_wanted(shape, pairs, rates, power, 
 
 
 def test_fewer_looks_leave_more_of_alpha_to_the_last_one():
-    every, one = boundary(in_pairs(40)), boundary(in_pairs(40, []))
+    every, one = boundary(pair_counts(40)), boundary(pair_counts(40, []))
     assert len(one.looks) == 1
-    assert one.course(0.5, 0.8).power == pytest.approx(exact_power(40, 0.5, 0.8), abs=0.02)
-    assert one.course(0.5, 0.8).median == 80
-    assert every.course(0.5, 0.8).mean < 80
+    assert one.operating_characteristics(0.5, 0.8).power == pytest.approx(exact_power(40, 0.5, 0.8), abs=0.02)
+    assert one.operating_characteristics(0.5, 0.8).median == 80
+    assert every.operating_characteristics(0.5, 0.8).mean < 80
 
 
 @given(st.integers(1, 250), st.integers(1, 250), st.lists(st.floats(0, 1), min_size=4, max_size=4), MARGINS)
@@ -132,7 +136,7 @@ def test_extremeness_is_the_statistic_in_whole_numbers(n, m, shares, margin):
         lead = q - p + margin
         return lead * abs(lead) / (p * (1 - p) / (n + 2) + q * (1 - q) / (m + 2))
 
-    one, other = Fraction(*extremeness(a, n, b, m, margin)), Fraction(*extremeness(c, n, d, m, margin))
+    one, other = Fraction(*extremeness_of(a, n, b, m, margin)), Fraction(*extremeness_of(c, n, d, m, margin))
     scale = float(n * m) ** 2 / (n + m) ** 2 if margin is None else 1.0
     assert float(one) == pytest.approx(scale * statistic(a, b), rel=1e-9, abs=1e-12)
     assert (one > other) == (statistic(a, b) > statistic(c, d)) or statistic(a, b) == pytest.approx(
@@ -148,9 +152,9 @@ def test_extremeness_is_the_statistic_in_whole_numbers(n, m, shares, margin):
         ([(251, 250)], {}, "after 251 and 250 trials"),
         ([(2, 2), (2, 2)], {}, r"after 2 and 2 trials follows one after \(2, 2\)"),
         ([(2, 2), (3, 1)], {}, "follows one after"),
-        (in_pairs(3), {"alpha": 1.0}, "alpha = 1.0"),
-        (in_pairs(3), {"shape": "flat"}, "shape = 'flat'; allowed: late, early"),
-        (in_pairs(3), {"margin": 0.0}, "margin = 0.0; allowed: above 0 and below 1"),
+        (pair_counts(3), {"alpha": 1.0}, "alpha = 1.0"),
+        (pair_counts(3), {"shape": "flat"}, "shape = 'flat'; allowed: late, early"),
+        (pair_counts(3), {"margin": 0.0}, "margin = 0.0; allowed: above 0 and below 1"),
     ],
 )
 def test_a_design_that_cannot_be_is_an_error_in_words(looks, options, words):
@@ -163,4 +167,4 @@ def test_where_nothing_may_stop_nothing_does():
     assert found.winner(0, 0, 2) is None
     assert found.winner(1, 3, 0) == "first"
     with pytest.raises(StatisticsError, match=r"p_first = 1\.2"):
-        found.course(1.2, 0.5)
+        found.operating_characteristics(1.2, 0.5)

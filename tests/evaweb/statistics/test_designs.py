@@ -7,16 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.boundaries import in_pairs
+from evaweb.statistics.boundaries import pair_counts
 from evaweb.statistics.designs import (
     RULES,
     Conclusion,
-    conclude,
+    boundary_from_table,
+    boundary_table,
     design,
+    evaluate_design,
     findings,
     in_blocks,
-    of_table,
-    table,
 )
 
 BETTER, WORSE, SAME = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
@@ -28,7 +28,7 @@ def made(rule, pairs=20, **options):
 
 
 def told(found, pairs):
-    return conclude(found, in_blocks(pairs))
+    return evaluate_design(found, in_blocks(pairs))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -107,8 +107,8 @@ def test_mirrored_pairs_end_it_for_the_other_one_at_the_same_pair(pairs, rule):
 @pytest.mark.parametrize("margin", [None, 0.1])
 def test_a_boundary_comes_back_from_the_plan_as_it_was(margin):
     found = made("early", 25, looks=[5, 15], margin=margin).boundary
-    rows = table(found)
-    assert of_table(rows, found.alpha, margin) == found
+    rows = boundary_table(found)
+    assert boundary_from_table(rows, found.alpha, margin) == found
     assert all(type(number) is int for row in rows for number in row)
 
 
@@ -152,7 +152,7 @@ def test_a_design_that_cannot_be_is_an_error_in_words(options, words):
 
 def test_a_fixed_number_may_be_large():
     assert made("none", 5000).blocks == 5000
-    assert in_pairs(3, [1]) == [(1, 1), (3, 3)]
+    assert pair_counts(3, [1]) == [(1, 1), (3, 3)]
 
 
 # --- several comparisons ----------------------------------------------------------------------------------------
@@ -208,9 +208,9 @@ def test_a_comparison_ends_with_the_checkpoint_that_was_dropped():
     said = findings(found, blocks_of_three(rows))
     by_itself = findings(made("early", 40, comparisons=ALL_OF_THREE), blocks_of_three(rows))
     third = said.each[2]
-    assert (third.winner, third.dropped, third.at) == (None, True, said.dropped[2])
+    assert (third.winner, third.dropped, third.ended_at_pair) == (None, True, said.dropped[2])
     assert by_itself.each[2].winner == "first"  # and was not waited for
-    assert by_itself.each[2].at > third.at
+    assert by_itself.each[2].ended_at_pair > third.ended_at_pair
 
 
 @pytest.mark.parametrize("margin", [None, 0.3])
@@ -219,8 +219,10 @@ def test_a_control_stays_and_each_comparison_with_it_ends_by_itself(margin):
     rows = [(False, True, number % 2 > 0) for number in range(30)]
     said = findings(made("late", 30, **star, drops=True), blocks_of_three(rows))
     by_itself = findings(made("late", 30, **star), blocks_of_three(rows))
-    assert [(one.winner, one.at) for one in said.each] == [(one.winner, one.at) for one in by_itself.each]
-    assert said.dropped[1] == said.each[0].at < said.each[1].at == said.dropped[0]
+    assert [(one.winner, one.ended_at_pair) for one in said.each] == [
+        (one.winner, one.ended_at_pair) for one in by_itself.each
+    ]
+    assert said.dropped[1] == said.each[0].ended_at_pair < said.each[1].ended_at_pair == said.dropped[0]
     assert not any(one.dropped for one in said.each)
 
 
@@ -274,12 +276,14 @@ def in_random_order(chance, rates, blocks=30):
 def test_two_arms_in_random_order_are_judged_by_the_counts_that_were_drawn(rule):
     blocks, counts = in_random_order(random.Random(5), (1.0, 0.0))
     found = made(rule, 30, counts=counts)
-    said = conclude(found, blocks)
+    said = evaluate_design(found, blocks)
     assert said.winner == "first"
-    assert conclude(found, [[(1 - arm, value) for arm, value in block] for block in blocks]).blocks < 30
-    assert conclude(found, [*blocks[:10], blocks[10][:1], *blocks[11:]]).blocks == 10
+    assert (
+        evaluate_design(found, [[(1 - arm, value) for arm, value in block] for block in blocks]).blocks < 30
+    )
+    assert evaluate_design(found, [*blocks[:10], blocks[10][:1], *blocks[11:]]).blocks == 10
     if rule != "none":
-        assert said.at < 30
+        assert said.ended_at_pair < 30
         assert [look.first + look.second for look in found.boundary.looks][-1] == 60
         assert found.boundary.error()[1] <= 0.05
 
@@ -297,7 +301,7 @@ def test_two_arms_in_random_order_that_are_equal_are_told_apart_at_most_as_often
         blocks = [
             [(arm, float(chance.random() < rate)) for arm in of] for rate, of in zip(rates, arms, strict=True)
         ]
-        wrong += conclude(found, blocks).winner is not None
+        wrong += evaluate_design(found, blocks).winner is not None
     assert wrong <= 0.05 * runs + 3 * (0.05 * 0.95 * runs) ** 0.5
 
 
@@ -305,9 +309,9 @@ def test_not_worse_by_the_margin_is_asked_in_random_order_too():
     chance = random.Random(2)
     blocks, counts = in_random_order(chance, (1.0, 1.0), 40)
     found = made("late", 40, counts=counts, margin=0.3)
-    assert conclude(found, blocks).winner == "first"
+    assert evaluate_design(found, blocks).winner == "first"
     worse = [[(arm, float(arm == 1)) for arm, _ in block] for block in blocks]
-    assert conclude(found, worse).winner is None
+    assert evaluate_design(found, worse).winner is None
 
 
 @pytest.mark.parametrize(

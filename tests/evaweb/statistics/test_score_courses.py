@@ -6,8 +6,8 @@ import random
 import pytest
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.designs import conclude, design, in_blocks
-from evaweb.statistics.permutation import sign_flips
+from evaweb.statistics.designs import design, evaluate_design, in_blocks
+from evaweb.statistics.permutation import sign_flip_test
 from evaweb.statistics.score_courses import (
     Scores,
     _differences,
@@ -45,7 +45,7 @@ def test_assumed_scores_have_the_means_and_deviations_that_are_said(scores, spre
 @pytest.mark.parametrize("pairs", [1, 5, 12, 40])
 def test_the_test_of_all_evaluations_at_once_is_that_of_each(pairs):
     rows = _differences(SCORES)[:40, :pairs]
-    expected = [sign_flips([int(d) / SCORES.points for d in row]).p for row in rows]
+    expected = [sign_flip_test([int(d) / SCORES.points for d in row]).p for row in rows]
     assert _flipped(rows, SCORES.points) == pytest.approx(expected, abs=1e-12)
 
 
@@ -56,11 +56,13 @@ def test_the_power_is_how_often_the_design_itself_finds_a_winner(rule):
     ends = []
     for _ in range(runs):
         one, other = (chance.choices(range(5), SCORES.chances(mean), k=30) for mean in (0.7, 0.5))
-        ends.append(conclude(found, in_blocks([(a / 4, b / 4) for a, b in zip(one, other, strict=True)])))
+        ends.append(
+            evaluate_design(found, in_blocks([(a / 4, b / 4) for a, b in zip(one, other, strict=True)]))
+        )
     share = sum(end.winner is not None for end in ends) / runs
     expected = score_course(rule, 30, SCORES, 0.05)
     assert share == pytest.approx(expected.power, abs=4 * math.sqrt(0.25 / runs))
-    assert sum(end.at for end in ends) / runs == pytest.approx(expected.mean, abs=1.5)
+    assert sum(end.ended_at_pair for end in ends) / runs == pytest.approx(expected.mean, abs=1.5)
 
 
 def test_scores_of_one_point_are_the_sign_test_of_successes():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.sequential import in_pairs, score_evidence, success_evidence
+from evaweb.statistics.sequential import pair_by_order, score_evidence, success_evidence
 
 PAIRS = st.lists(st.tuples(st.booleans(), st.booleans()), max_size=60)
 
@@ -138,4 +138,4 @@ def test_a_score_beyond_its_range_is_refused():
 
 
 def test_pairs_are_made_in_order_and_the_rest_waits():
-    assert in_pairs([True, False, True], [False, False]) == [(True, False), (False, False)]
+    assert pair_by_order([True, False, True], [False, False]) == [(True, False), (False, False)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.boundaries import boundary, in_pairs
+from evaweb.statistics.boundaries import boundary, pair_counts
 from evaweb.statistics.difference import newcombe
 from evaweb.statistics.stagewise import stagewise
 
@@ -17,7 +17,7 @@ PAIRS = 12
 
 @cache
 def design(shape):
-    return boundary(in_pairs(PAIRS), shape=shape)
+    return boundary(pair_counts(PAIRS), shape=shape)
 
 
 @cache

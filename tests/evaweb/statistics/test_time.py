@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.rates import rate
 from evaweb.statistics.smoothness import sparc
-from evaweb.statistics.success_times import incidence, restricted_mean
+from evaweb.statistics.success_times import cumulative_incidence, restricted_mean
 
 TIMES = st.lists(st.one_of(st.none(), st.floats(0, 60)), min_size=1, max_size=40)
 
 
 def test_the_curve_counts_all_trials_at_every_time():
-    found = incidence([5.0, None, 10.0, 10.0, None], until=40.0)
+    found = cumulative_incidence([5.0, None, 10.0, 10.0, None], until=40.0)
     assert found.times == (5.0, 10.0)
     assert found.share == pytest.approx((0.2, 0.6))
     assert (found.low[1], found.high[1]) == pytest.approx((0.2307, 0.8824), abs=1e-4)  # Wilson, 3 of 5
@@ -25,13 +25,13 @@ def test_a_failure_counts_in_full_and_so_does_a_success_after_the_horizon():
     found = restricted_mean([2.0, None, 9.0], until=6.0, seed=1)
     assert found.value == pytest.approx((2 + 6 + 6) / 3)
     assert found.interval.low < found.value < found.interval.high <= 6.0
-    assert incidence([2.0, None, 9.0], until=6.0).successes == 1
-    assert incidence([None, 9.0], until=6.0).median is None
+    assert cumulative_incidence([2.0, None, 9.0], until=6.0).successes == 1
+    assert cumulative_incidence([None, 9.0], until=6.0).median is None
 
 
 @given(TIMES, st.floats(1, 60))
 def test_the_restricted_mean_is_the_area_above_the_curve(times, until):
-    found, curve = restricted_mean(times, until, seed=1), incidence(times, until)
+    found, curve = restricted_mean(times, until, seed=1), cumulative_incidence(times, until)
     steps = [0.0, *curve.times, until]
     areas = [
         (1 - share) * (after - t)
@@ -44,7 +44,7 @@ def test_the_restricted_mean_is_the_area_above_the_curve(times, until):
 
 @given(TIMES)
 def test_at_the_horizon_the_curve_is_the_success_rate(times):
-    curve = incidence(times, until=60.0)
+    curve = cumulative_incidence(times, until=60.0)
     assert curve.successes == sum(t is not None for t in times)
     assert all(one < other for one, other in zip(curve.share, curve.share[1:], strict=False))
 
@@ -60,7 +60,7 @@ def test_at_the_horizon_the_curve_is_the_success_rate(times):
 )
 def test_times_that_cannot_be_are_refused(times, until, said):
     with pytest.raises(StatisticsError, match=said):
-        incidence(times, until)
+        cumulative_incidence(times, until)
 
 
 def test_rates_have_garwoods_interval():

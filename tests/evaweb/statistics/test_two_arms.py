@@ -13,7 +13,7 @@ from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.difference import barnard, newcombe, probability_better
 from evaweb.statistics.paired import mcnemar, over_conditions
 from evaweb.statistics.proportions import posterior
-from evaweb.statistics.strata import Table, exact_within, interaction, mantel_haenszel
+from evaweb.statistics.strata import StratumTable, exact_within, interaction, mantel_haenszel
 from tests.examples import some
 
 COUNTS = st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))
@@ -138,7 +138,7 @@ def test_conditions_that_were_not_shared_say_nothing():
 
 def test_simpsons_paradox_is_seen():
     # Kidney stones (Charig et al. 1986): better in both strata, worse when pooled.
-    found = mantel_haenszel([Table(81, 87, 234, 270), Table(192, 263, 55, 80)])
+    found = mantel_haenszel([StratumTable(81, 87, 234, 270), StratumTable(192, 263, 55, 80)])
     assert found.crude == pytest.approx(273 / 350 - 289 / 350)
     assert found.stratified > 0
     assert found.reversed
@@ -146,7 +146,7 @@ def test_simpsons_paradox_is_seen():
 
 
 def test_one_stratum_is_a_plain_table():
-    found = mantel_haenszel([Table(9, 10, 3, 10)])
+    found = mantel_haenszel([StratumTable(9, 10, 3, 10)])
     assert found.odds_ratio == pytest.approx((9 * 7) / (1 * 3))
     assert found.crude == pytest.approx(found.stratified) == pytest.approx(0.6)
     assert not found.reversed
@@ -156,13 +156,13 @@ def test_one_stratum_is_a_plain_table():
 
 
 def test_no_difference_anywhere_is_no_evidence():
-    found = mantel_haenszel([Table(5, 5, 7, 7)])
+    found = mantel_haenszel([StratumTable(5, 5, 7, 7)])
     assert (found.p, found.odds_ratio, found.reversed) == (1.0, None, False)
 
 
 SIZES, WINS = st.integers(1, 5), st.integers(0, 5)
 TABLES = st.lists(
-    st.builds(lambda n1, n2, a, b: Table(min(a, n1), n1, min(b, n2), n2), SIZES, SIZES, WINS, WINS),
+    st.builds(lambda n1, n2, a, b: StratumTable(min(a, n1), n1, min(b, n2), n2), SIZES, SIZES, WINS, WINS),
     min_size=1,
     max_size=3,
 )
@@ -198,11 +198,11 @@ def test_exact_tests_over_strata_count_every_way_to_fill_the_tables(tables):
 
 def test_a_confounded_difference_is_none_within_strata():
     """One checkpoint had the better operator more often; with each operator both are alike."""
-    assert exact_within([Table(18, 20, 4, 5), Table(1, 5, 5, 20)]) > 0.5
+    assert exact_within([StratumTable(18, 20, 4, 5), StratumTable(1, 5, 5, 20)]) > 0.5
     assert barnard(19, 25, 9, 25).p < 0.01
 
 
 def test_an_interaction_is_found_where_the_difference_turns_and_not_where_it_is_the_same():
-    assert interaction([Table(18, 20, 4, 20), Table(5, 20, 17, 20)]) < 1e-6
-    assert interaction([Table(18, 20, 4, 20), Table(17, 20, 5, 20)]) > 0.5
-    assert interaction([Table(125, 250, 125, 250)] * 4) is None  # too many ways to count
+    assert interaction([StratumTable(18, 20, 4, 20), StratumTable(5, 20, 17, 20)]) < 1e-6
+    assert interaction([StratumTable(18, 20, 4, 20), StratumTable(17, 20, 5, 20)]) > 0.5
+    assert interaction([StratumTable(125, 250, 125, 250)] * 4) is None  # too many ways to count

@@ -15,7 +15,7 @@ from evaweb.stations.models import Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, FailureTerm, Milestone, Position, Scene, Trial
 from runtime.ipc.messages import Ack, AckStatus, Command
-from tests.standing import standing
+from tests.standing import state_flags
 
 BOOT = "boot-1"
 
@@ -54,7 +54,7 @@ def failure_terms() -> None:
         FailureTerm.objects.create(level=level, words=words, key=key, order=order, active=words != "retired")
 
 
-def over(trial: Trial, seconds: float | None = 12.5, **facts: Any) -> Trial:
+def finished_trial(trial: Trial, seconds: float | None = 12.5, **facts: Any) -> Trial:
     """The trial as a run leaves it that was recorded; `facts` are those of its episode."""
     row = {"station": trial.station, "status": "finished", "frames": 375, "duration_s": seconds, **facts}
     episode = Episode.objects.create(**row)
@@ -64,7 +64,7 @@ def over(trial: Trial, seconds: float | None = 12.5, **facts: Any) -> Trial:
 
 
 @dataclass
-class Bench:
+class TrialBench:
     """A station, a scene, a checkpoint, an operator: what a trial is made of."""
 
     station: Station
@@ -82,7 +82,7 @@ class Bench:
             "position": self.scene.positions.get(number=position),
             "checkpoint": self.checkpoint,
         }
-        return services.trial_prepare(**{**choice, **given})
+        return services.prepare_trial(**{**choice, **given})
 
     def ticks(self, *reached: bool) -> dict[object, bool]:
         """Milestone id -> reached, in their order."""
@@ -90,13 +90,13 @@ class Bench:
 
     def ended(self, position: int = 1, seconds: float = 12.5, **given: Any) -> Trial:
         """A trial whose run is over, without a station."""
-        return over(self.prepare(position, **given), seconds)
+        return finished_trial(self.prepare(position, **given), seconds)
 
     def scored(self, success: bool = True, **given: Any) -> Trial:
         """A trial that has its score."""
         trial = self.ended(**given)
         ticks = self.ticks(True, success, success)
-        services.trial_score(user=self.operator, trial=trial, milestones=ticks)
+        services.score_trial(user=self.operator, trial=trial, milestones=ticks)
         return trial
 
     def unrecorded(self, success: bool = True, seconds: float = 12.5) -> Trial:
@@ -104,28 +104,28 @@ class Bench:
         trial = self.prepare()
         Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=seconds)
         trial.refresh_from_db()
-        with patch.object(services, "unrecorded_because", return_value=""):
+        with patch.object(services, "why_unrecorded", return_value=""):
             ticks = self.ticks(True, success, success)
-            services.trial_score(user=self.operator, trial=trial, milestones=ticks)
+            services.score_trial(user=self.operator, trial=trial, milestones=ticks)
         return trial
 
     def event(self, kind: str, text: str = "", time: float = 0.0, **data: Any) -> Trial | None:
         """The station's next event, taken as the chronicle passes it on."""
         self.number += 1
         row = {"number": self.number, "kind": kind, "text": text, "time": time, "data": data}
-        return services.run_changed(station=self.station, event=row, boot=BOOT)
+        return services.apply_station_event(station=self.station, event=row, boot=BOOT)
 
 
-def bench(station: str = "bench-1", operator: str = "ann") -> Bench:
+def bench(station: str = "bench-1", operator: str = "ann") -> TrialBench:
     """A lab of one of each."""
     made = Station.objects.create(name=station, robot="agilex_piper", simulated=True, boot=BOOT)
     policy = {"url": "ws://127.0.0.1:8000"}
     checkpoint = Checkpoint.objects.create(name="pi0-block", policy=policy)
-    return Bench(made, scene(), checkpoint, user(operator))
+    return TrialBench(made, scene(), checkpoint, user(operator))
 
 
 @dataclass
-class Wire:
+class FakeConnection:
     """Stands where the wire to a runtime stands; answers "accepted" unless told otherwise."""
 
     status_word: AckStatus = "accepted"
@@ -133,7 +133,7 @@ class Wire:
     fault: Exception | None = None
     episode: uuid.UUID = field(default_factory=uuid.uuid4)
     heard: list[Command] = field(default_factory=list)
-    snapshot: Mapping[str, Any] = field(default_factory=lambda: {**standing("ready"), "boot": BOOT})
+    snapshot: Mapping[str, Any] = field(default_factory=lambda: {**state_flags("ready"), "boot": BOOT})
 
     def request(self, command: Command, **how: Any) -> Ack:
         """The answer, or the fault."""

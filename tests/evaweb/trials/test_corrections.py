@@ -2,14 +2,14 @@ import pytest
 from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.blinding_rules import look
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Lease
 from evaweb.trials import corrections, services, voids
 from evaweb.trials.models import Milestone
-from evaweb.trials.record import JUDGEMENTS, file_of
+from evaweb.trials.record import JUDGEMENTS, journal_uuid
 from tests.evaweb.trials import builders
 
 SAID = {"failure_phase": "grasp", "failure": "dropped"}
@@ -22,7 +22,7 @@ def terms(db):
 
 def score(bench, trial, **given):
     ticks = bench.ticks(True, False, False)
-    return services.trial_score(**{"user": bench.operator, "trial": trial, "milestones": ticks, **given})
+    return services.score_trial(**{"user": bench.operator, "trial": trial, "milestones": ticks, **given})
 
 
 def corrected(bench, trial, **given):
@@ -62,7 +62,7 @@ def test_only_a_failure_that_counts_is_corrected_by_operators_in_the_labs_words(
     refused = [
         (bench.scored(True), EvaError, "the trial is a success"),
         (
-            voids.trial_void(user=bench.operator, trial=bench.scored(False), reason="a hand"),
+            voids.void_trial(user=bench.operator, trial=bench.scored(False), reason="a hand"),
             Conflict,
             "is voided",
         ),
@@ -83,10 +83,12 @@ def test_who_has_looked_behind_a_blind_corrects_no_failure_of_it(bench, terms):
     plan = Plan.objects.create(name="blocks", title="Blocks", owner=owner, repetitions=1)
     plan.checkpoints.set([bench.checkpoint])
     plan.positions.set(bench.scene.positions.all())
-    plan = plan_freeze(user=owner, plan=plan)
-    trial = builders.over(hand_out(user=bench.operator, station=bench.station, plan=plan).trial)
+    plan = freeze_plan(user=owner, plan=plan)
+    trial = builders.finished_trial(
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    )
     score(bench, trial, **SAID)
-    look(plan, owner)
+    record_unblinding(plan, owner)
     with pytest.raises(NotAllowed, match="you have seen results of Blocks"):
         corrected(bench, trial, user=owner, failure="missed")
     assert corrected(bench, trial, failure="missed").why == "grasp: missed"
@@ -106,7 +108,7 @@ def test_a_scene_that_changed_since_changes_no_score_whose_failure_is_corrected(
     assert said[0] == said[1]
     trial.refresh_from_db()
     assert trial.verdict == after
-    *_, line = JUDGEMENTS.read(file_of(trial), pytest.fail)
+    *_, line = JUDGEMENTS.read(journal_uuid(trial), pytest.fail)
     assert (line.uuid, line.score) == (after.uuid, before.score)
     assert [outcome.points for outcome in line.milestones] == [row.points for row in before.outcomes.all()]
 
@@ -120,7 +122,7 @@ def test_what_another_has_done_is_undone_by_who_has_the_station_now_and_administ
         "score": lambda who: score(
             bench, trial, user=who, reason=f"{who} saw it", milestones=bench.ticks(True, True, False)
         ),
-        "abandon": lambda who: services.trial_abandon(user=who, trial=trial),
+        "abandon": lambda who: services.abandon_trial(user=who, trial=trial),
     }[what]
     bob, alma = builders.user("bob"), builders.user("alma", "admin")
     lease = Lease.objects.create(station=bench.station, user=bench.operator, holder="web:ann:p1", epoch=1)

@@ -9,7 +9,7 @@ from django.test import Client
 
 from evaweb.errors import EvaError
 from evaweb.trials import services, voids
-from evaweb.trials.failures import in_order, offered
+from evaweb.trials.failures import failure_choices, ordered_terms
 from evaweb.trials.models import FailureTerm, Milestone, Score, Trial
 from evaweb.trials.record import JUDGEMENTS
 from tests.evaweb.trials import builders
@@ -31,7 +31,7 @@ def admin(bench):
 
 def score(bench, trial, success=False, **given):
     ticks = bench.ticks(True, success, success)
-    return services.trial_score(**{"user": bench.operator, "trial": trial, "milestones": ticks, **given})
+    return services.score_trial(**{"user": bench.operator, "trial": trial, "milestones": ticks, **given})
 
 
 def words(levels):
@@ -45,7 +45,7 @@ def test_what_a_lab_begins_with_is_a_valid_taxonomy(db):
         term = FailureTerm(level=level, words=text, key=key, order=order)
         term.full_clean()
         term.save()
-    found = offered()
+    found = failure_choices()
     assert [(level.field, len(level.choices)) for level in found] == [("failure_phase", 5), ("failure", 8)]
     assert all(choice.key for level in found for choice in level.choices)
 
@@ -88,7 +88,7 @@ def test_a_scene_may_want_both_of_whoever_scores_and_of_no_bench(bench, terms):
     for given, field in (({"failure": "dropped"}, "failure_phase"), ({"failure_phase": "grasp"}, "failure")):
         with pytest.raises(EvaError, match=f"{field} is missing: scene block-on-plate wants it"):
             score(bench, trial := bench.ended(), **given)
-        voids.trial_void(user=bench.operator, trial=trial, reason="of this test")
+        voids.void_trial(user=bench.operator, trial=trial, reason="of this test")
     said_by_bench = bench.ended()
     Milestone.objects.filter(order=1).update(truth="held")
     Trial.objects.filter(pk=said_by_bench.pk).update(truth={"milestones": {"held": True}})
@@ -107,16 +107,16 @@ def test_what_was_said_stays_whatever_becomes_of_the_words(bench, terms, admin):
     assert "1 score said &#x27;grasp&#x27; and keep it" in answer.content.decode()
     cause.active = False
     cause.save()
-    assert words(offered()) == {"failure_phase": ["approach", "grip"], "failure": ["missed"]}
+    assert words(failure_choices()) == {"failure_phase": ["approach", "grip"], "failure": ["missed"]}
     before.refresh_from_db()
     assert before.why == "grasp: dropped"
     said = {name: getattr(before, name) for name in SAID}
-    assert words(offered(said)) == {
+    assert words(failure_choices(said)) == {
         "failure_phase": ["approach", "grip", "grasp"],
         "failure": ["missed", "dropped"],
     }
     assert score(bench, trial, reason="the note", note="seen again", **SAID).why == "grasp: dropped"
-    assert "dropped" in in_order()["failure"], "a table has it where it was"
+    assert "dropped" in ordered_terms()["failure"], "a table has it where it was"
 
 
 def test_no_two_have_a_key_or_the_same_words(terms):
@@ -149,5 +149,5 @@ def test_a_score_does_not_say_that_nothing_was_said(bench, terms):
 def test_an_administrator_adds_a_cause(admin, terms):
     form = {"level": "cause", "words": "spilled", "key": "z", "order": "9", "active": "on"}
     assert admin.post("/admin/trials/failureterm/add/", form).status_code == 302
-    assert offered()[1].choices[-1].words == "spilled"
+    assert failure_choices()[1].choices[-1].words == "spilled"
     assert "Shift + Z" in admin.get("/admin/trials/failureterm/").content.decode()

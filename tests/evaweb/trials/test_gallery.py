@@ -5,7 +5,7 @@ import zipfile
 import pytest
 from django.test import Client
 
-from evaweb.blinding import EVERYTHING, HIDDEN, Sight
+from evaweb.blinding import FULL_VISIBILITY, HIDDEN, Visibility
 from evaweb.episodes.folders import preview_folder, preview_video
 from evaweb.episodes.models import Episode
 from evaweb.trials import clip_export, services
@@ -30,7 +30,7 @@ def failed(bench, cause="", phase="", times=(), **given):
     trial = bench.ended(**given)
     Episode.objects.filter(pk=trial.episode_id).update(cameras=["top", "wrist"], fps=30.0)
     ticks = bench.ticks(True, True, False)
-    services.trial_score(
+    services.score_trial(
         user=bench.operator,
         trial=trial,
         milestones=ticks,
@@ -41,7 +41,7 @@ def failed(bench, cause="", phase="", times=(), **given):
     return Trial.objects.select_related("episode", "verdict").get(pk=trial.pk)
 
 
-def groups(by, sight=EVERYTHING, **given):
+def groups(by, sight=FULL_VISIBILITY, **given):
     found = failure_groups(FailureFilters(group=by, **given), sight)
     return [(group.name, group.count) for group in found]
 
@@ -94,14 +94,14 @@ def test_failures_stand_in_groups_the_largest_named_first(bench):
     assert groups("failure", failure_phase="not specified") == [("dropped", 1), ("not specified", 1)]
     assert groups("failure", position="block-on-plate/2") == [("dropped", 1)]
     assert groups("failure", trials=TrialFilters(checkpoint="act")) == [("missed", 1)]
-    shown = [shown_group(trial, FailureFilters()) for trial in failed_list(FailureFilters(), EVERYTHING)]
+    shown = [shown_group(trial, FailureFilters()) for trial in failed_list(FailureFilters(), FULL_VISIBILITY)]
     assert shown == ["dropped", "dropped", "missed", "not specified"]
 
 
 def test_hidden_checkpoints_are_one_group_in_the_order_of_their_trials_and_no_filter(bench):
     names = [Checkpoint.objects.create(name=name) for name in ("zeta", "alpha")]
     trials = [failed(bench, checkpoint=names[i]) for i in (0, 1, 0)]
-    sight = Sight(checkpoints=frozenset(row.pk for row in names))
+    sight = Visibility(checkpoints=frozenset(row.pk for row in names))
     failed(bench)
     filters = FailureFilters(group="checkpoint")
     assert groups("checkpoint", sight) == [(HIDDEN, 3), ("pi0-block", 1)]
@@ -237,7 +237,7 @@ def test_what_is_too_much_for_one_archive_is_said_before_it_begins(bench, browse
 
 def test_of_a_hidden_checkpoint_the_zip_names_the_code_alone(bench):
     trial = failed(bench)
-    sight = Sight(frozenset({trial.checkpoint_id}), frozenset({trial.checkpoint.name}))
+    sight = Visibility(frozenset({trial.checkpoint_id}), frozenset({trial.checkpoint.name}))
     told = b"".join(clip_export.clip_archive(FailureFilters(), sight, "http://lab"))
     with zipfile.ZipFile(io.BytesIO(told)) as packed:
         (row,) = csv.DictReader(io.StringIO(packed.read("failures.csv").decode()))

@@ -25,7 +25,7 @@ def sql(statement):
 def correct(bench, trial):
     ticks = bench.ticks(True, False, False)
     reason = f"seen again, {Score.objects.count()}"
-    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason=reason)
+    services.score_trial(user=bench.operator, trial=trial, milestones=ticks, reason=reason)
 
 
 def refused(change):
@@ -83,12 +83,12 @@ def test_a_verdict_is_a_score_of_the_trial_and_gives_way_to_a_later_one_alone(sc
 def test_a_judged_trial_goes_no_other_way(scored, status):
     bench, trial = scored
     if status == "voided":
-        voids.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
-    row, way = Trial.objects.filter(pk=trial.pk), Trial.append_only.moves["status"][status]
+        voids.void_trial(user=bench.operator, trial=trial, reason="the camera had moved")
+    row, way = Trial.objects.filter(pk=trial.pk), Trial.append_only.allowed_changes["status"][status]
     for other in TrialStatus:
         if other not in (status, *way):
             refused(lambda to=other: row.update(status=to))
-    foreseen = {after for (before, _), after in lifecycle.MOVES.items() if before == status}
+    foreseen = {after for (before, _), after in lifecycle.TRANSITIONS.items() if before == status}
     assert foreseen - {status} == set(way)
     changes = {"number": 50, "duration_s": 1.0, "time_limit_s": 3.0, "started_at": timezone.now(), "id": 99}
     for name, value in changes.items():
@@ -97,7 +97,7 @@ def test_a_judged_trial_goes_no_other_way(scored, status):
 
 def test_why_a_trial_was_voided_stays(scored):
     bench, trial = scored
-    voids.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
+    voids.void_trial(user=bench.operator, trial=trial, reason="the camera had moved")
     refused(lambda: Trial.objects.filter(pk=trial.pk).update(reason="it was too slow"))
     refused(lambda: Trial.objects.filter(pk=trial.pk).update(voided_by=builders.user("eve")))
 
@@ -128,7 +128,7 @@ def test_corrections_and_voids_go_on(scored):
     bench, trial = scored
     correct(bench, trial)
     assert Score.objects.filter(trial=trial).count() == 2
-    voids.trial_void(user=bench.operator, trial=trial, reason="the camera had moved")
+    voids.void_trial(user=bench.operator, trial=trial, reason="the camera had moved")
     assert trial.status == "voided"
 
 

@@ -6,16 +6,16 @@ from contextlib import contextmanager
 
 import pytest
 
-from evaweb.blinding import sight_of
-from evaweb.console.event_ingest import events_written
+from evaweb.blinding import visibility_for_user
+from evaweb.console.event_ingest import ingest_events
 from evaweb.console.feed import History
 from evaweb.episodes.models import Episode
 from evaweb.errors import Conflict
 from evaweb.jobs.models import Job
 from evaweb.plans import bench_checks as looking
-from evaweb.plans.allocation import hand_out, progress
+from evaweb.plans.allocation import allocate_trial, plan_progress
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Command, Station
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Trial
@@ -69,7 +69,7 @@ def bench(lab, disk):
     def listen():
         rows = tuple(lab.station.coordinator.events.since(0))
         station = Station.objects.get(pk=lab.bench.station.pk)
-        events_written(station=station, history=History(lab.station.coordinator.boot, rows))
+        ingest_events(station=station, history=History(lab.station.coordinator.boot, rows))
 
     lab.listen = listen
     return lab
@@ -157,7 +157,7 @@ def test_an_answer_that_is_heard_after_all_events_begins_nothing(bench, disk, mo
             goes_on(bench, trial)  # all is over before the one who asked hears of it
             return ack
 
-    monkeypatch.setattr("evaweb.stations.commands.wire_to", lambda name: Late(bench.station))
+    monkeypatch.setattr("evaweb.stations.commands.connection_to", lambda name: Late(bench.station))
     row = fails_to_open(bench, disk, trial)
     is_as_it_was(trial)
     order = {"page": "p", "epoch": 1, "boot": bench.station.coordinator.boot, "sequence": 0}
@@ -174,7 +174,7 @@ def test_events_that_come_again_after_the_trial_was_given_back_or_runs_anew_chan
 
     def again():
         for event in old:
-            services.run_changed(
+            services.apply_station_event(
                 station=bench.bench.station, event=event, boot=bench.station.coordinator.boot
             )
         trial.refresh_from_db()
@@ -208,18 +208,18 @@ def test_a_blind_plans_trial_keeps_its_place_and_its_code_and_says_why_without_t
     drawn = Plan.objects.create(name="blocks", title="Blocks", owner=owner, repetitions=2, blind=True)
     drawn.checkpoints.set([first, other])
     drawn.positions.set(bench.bench.scene.positions.all())
-    drawn = plan_freeze(user=owner, plan=drawn)
-    monkeypatch.setattr(looking, "achieve", lambda **given: [])
-    handout = hand_out(user=bench.bench.operator, station=bench.bench.station, plan=drawn)
-    trial, before = handout.trial, progress(drawn)
+    drawn = freeze_plan(user=owner, plan=drawn)
+    monkeypatch.setattr(looking, "record_layout", lambda **given: [])
+    handout = allocate_trial(user=bench.bench.operator, station=bench.bench.station, plan=drawn)
+    trial, before = handout.trial, plan_progress(drawn)
     ready(bench, trial)
     fails_to_open(bench, disk, trial)
     is_as_it_was(trial)
     handout.refresh_from_db()
-    assert (handout.trial, handout.number, progress(drawn)) == (trial, 1, before)
+    assert (handout.trial, handout.number, plan_progress(drawn)) == (trial, 1, before)
     with pytest.raises(Conflict, match="is prepared: run it, or abandon it"):
-        hand_out(user=bench.bench.operator, station=bench.bench.station, plan=drawn)
-    seen = sight_of(bench.bench.operator)
+        allocate_trial(user=bench.bench.operator, station=bench.bench.station, plan=drawn)
+    seen = visibility_for_user(bench.bench.operator)
     assert seen.hides(trial)
     assert seen.reason(trial) == trial.reason
     for name in (first.name, other.name):

@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.db import OperationalError
 
 from evaweb.api.trials import TrialDetail
-from evaweb.blinding import EVERYTHING
+from evaweb.blinding import FULL_VISIBILITY
 from evaweb.episodes import reconcile as reconciling
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
@@ -33,7 +33,7 @@ from evaweb.trials.record import JUDGEMENTS
 from evaweb.trials.selectors import statistics, trial_get, trial_list
 from tests.evaweb.trials import builders
 from tests.evaweb.trials.whole_lab import lab
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 __all__ = ["lab"]
 
@@ -45,7 +45,7 @@ CHOICES = (Milestone, Position, Scene, Checkpoint, Station, User)
 
 def lose(*models):
     """All rows of these are gone, as with the file they were in."""
-    with unguarded("trials"):
+    with without_triggers("trials"):
         Trial.objects.update(verdict=None)
         for model in models:
             model.objects.all().delete()
@@ -53,7 +53,7 @@ def lose(*models):
 
 def told(*without):
     """The trials as the API tells them, the newest first."""
-    found = [TrialDetail.of(trial_get(id=trial.pk), EVERYTHING) for trial in trial_list()]
+    found = [TrialDetail.of(trial_get(id=trial.pk), FULL_VISIBILITY) for trial in trial_list()]
     for trial in found:
         trial["scores"] = [{**one, "milestones": outcomes(one["milestones"])} for one in trial["scores"]]
     return [{name: value for name, value in trial.items() if name not in without} for trial in found]
@@ -85,7 +85,7 @@ def judged(lab):
     lab.score(corrected, True, True, True, reason="seen on the video")
     voided = lab.run()
     lab.score(voided, True, False, False)
-    voids.trial_void(user=lab.bench.operator, trial=voided, reason="a hand was in the picture")
+    voids.void_trial(user=lab.bench.operator, trial=voided, reason="a hand was in the picture")
     lab.bench.unrecorded(success=False)
     lab.run(smoke=True)
     assert [trial.status for trial in trial_list().order_by("pk")] == [
@@ -152,7 +152,7 @@ def test_a_score_that_an_earlier_version_took_for_a_run_that_never_began_is_name
     ghost = Episode.objects.create(station=lab.bench.station, status="recording")
     Trial.objects.filter(pk=trial.pk).update(status="ended", duration_s=0.01, episode=ghost)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(services, "unrecorded_because", lambda episode: "")
+        patch.setattr(services, "why_unrecorded", lambda episode: "")
         lab.score(trial, True, True, True)
     if lost:
         lose(*RECORDS)
@@ -163,7 +163,7 @@ def test_a_score_that_an_earlier_version_took_for_a_run_that_never_began_is_name
         )
         assert problem.endswith(": void it with a reason")
     trial = Trial.objects.get()
-    voids.trial_void(user=lab.bench.operator, trial=trial, reason="it never ran")
+    voids.void_trial(user=lab.bench.operator, trial=trial, reason="it never ran")
     assert reconcile().problems == ()
 
 
@@ -264,7 +264,7 @@ def test_a_row_from_an_old_backup_is_brought_up_to_the_disk(lab):
     trial = lab.run()
     lab.score(trial, True, True, True)
     lose(MilestoneOutcome, Score)
-    with unguarded("trials"):
+    with without_triggers("trials"):
         Trial.objects.update(status="running", episode=None, ended_at=None, duration_s=None)
     assert reconcile().restored == 1
     found = Trial.objects.get(pk=trial.pk)
@@ -457,10 +457,10 @@ def test_voids_that_were_asked_for_and_their_answers_come_back(lab, monkeypatch,
     monkeypatch.setattr(voids, "_rules", [lambda trial: True])
     trial, second = lab.run(), builders.user("sam")
     lab.score(trial, True, False, False)
-    voids.trial_void(user=lab.bench.operator, trial=trial, reason="the plate had slipped")
+    voids.void_trial(user=lab.bench.operator, trial=trial, reason="the plate had slipped")
     lab.score(lab.run(), True, True, True)
     if answer:
-        voids.void_answer(user=second, trial=trial, agree=answer == "agreed", reason="seen on the video")
+        voids.answer_void(user=second, trial=trial, agree=answer == "agreed", reason="seen on the video")
     before = told()
     assert [(one["status"], one["attempt"]) for one in before] == {
         "": [("scored", 2), ("void_asked", 1)],
@@ -479,10 +479,10 @@ def test_an_answer_that_a_backup_does_not_have_comes_back(lab, monkeypatch):
     monkeypatch.setattr(voids, "_rules", [lambda trial: True])
     trial = lab.run()
     lab.score(trial, True, False, False)
-    voids.trial_void(user=lab.bench.operator, trial=trial, reason="the plate had slipped")
-    voids.void_answer(user=builders.user("sam"), trial=trial, agree=False, reason="it had not")
+    voids.void_trial(user=lab.bench.operator, trial=trial, reason="the plate had slipped")
+    voids.answer_void(user=builders.user("sam"), trial=trial, agree=False, reason="it had not")
     before = told()
-    with unguarded("trials"):
+    with without_triggers("trials"):
         trial.void_requests.update(answer="", answer_reason="", answered_by=None, answered_at=None)
         Trial.objects.filter(pk=trial.pk).update(status="void_asked")
     assert reconcile().restored == 1

@@ -7,7 +7,7 @@ from django.contrib.admin.models import LogEntry
 
 from evaweb.errors import Conflict, NotAllowed
 from evaweb.plans.models import Plan, Reference
-from evaweb.plans.services import plan_freeze
+from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Station
 from evaweb.trials.models import Milestone, Scene
 from evaweb.trials.scene_reading import kept_positions, running_plans, scene_table, seen_of
@@ -184,7 +184,7 @@ def test_positions_of_a_draft_move_and_those_of_a_frozen_plan_do_not(bench, alma
     draft.positions.set(scene.positions.all())
     draft.checkpoints.set([bench.checkpoint])
     assert kept_positions(scene) == {}
-    plan_freeze(user=bench.operator, plan=draft)
+    freeze_plan(user=bench.operator, plan=draft)
     assert set(kept_positions(scene).values()) == {"plan Blocks v1"}
     assert running_plans(scene) == ["Blocks v1"]
     table, seen = scene_table(scene), seen_of(scene)

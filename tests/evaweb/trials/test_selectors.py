@@ -21,7 +21,7 @@ def test_statistics_count_scored_trials_per_scene_and_checkpoint_and_name_the_ot
     for success in (True, True, False):
         bench.scored(success)
     bench.scored(True, checkpoint=other)
-    voids.trial_void(user=bench.operator, trial=bench.scored(), reason="a hand")
+    voids.void_trial(user=bench.operator, trial=bench.scored(), reason="a hand")
     interrupted = bench.prepare(position=2)
     Trial.objects.filter(pk=interrupted.pk).update(status="interrupted")
     bench.ended()
@@ -58,7 +58,7 @@ def test_the_list_takes_one_query_whatever_its_length(bench, django_assert_num_q
 def test_a_corrected_score_is_the_one_that_counts(bench):
     trial = bench.scored(True)
     ticks = bench.ticks(True, False, False)
-    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="it fell")
+    services.score_trial(user=bench.operator, trial=trial, milestones=ticks, reason="it fell")
     (row,) = selectors.statistics()
     assert (row.summary.success.successes, row.summary.success.n) == (0, 1)
 
@@ -121,7 +121,7 @@ def test_the_open_trial_of_a_station_is_the_one_that_is_not_finished(bench):
     assert selectors.trial_open(bench.station) is None
     trial = bench.ended()
     assert selectors.trial_open(bench.station) == trial
-    voids.trial_void(user=bench.operator, trial=trial, reason="x")
+    voids.void_trial(user=bench.operator, trial=trial, reason="x")
     assert selectors.trial_open(bench.station) is None
 
 
@@ -152,7 +152,7 @@ def test_of_many_cells_only_those_are_made_anew_that_have_a_changed_trial(bench,
     act, pi0 = selectors.statistics()
     assert (act.summary.success.n, pi0.summary.success.n) == (2, 1)
     assert made[1:] == [both[1:]]
-    voids.trial_void(user=bench.operator, trial=first, reason="a hand")
+    voids.void_trial(user=bench.operator, trial=first, reason="a hand")
     assert [row.summary.success.n for row in selectors.statistics()] == [2, 0]
     long_ago = timezone.now() - timedelta(
         minutes=5

@@ -8,11 +8,11 @@ from django.db.models import ProtectedError
 
 from evaweb import journal as disk
 from evaweb.episodes.models import Episode
-from evaweb.episodes.selectors import unrecorded_because
+from evaweb.episodes.selectors import why_unrecorded
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.trials import services, voids
-from evaweb.trials.lifecycle import MOVES, Move
+from evaweb.trials.lifecycle import TRANSITIONS, Transition
 from evaweb.trials.models import Checkpoint, Evaluation, Milestone, Position, Score, Trial, TrialStatus
 from evaweb.trials.record import JUDGEMENTS
 from evaweb.trials.selectors import statistics
@@ -29,7 +29,7 @@ def lines(uuid):
 
 def score(bench, trial, *reached, **given):
     ticks = bench.ticks(*reached) if reached else bench.ticks(True, True, True)
-    return services.trial_score(**{"user": bench.operator, "trial": trial, "milestones": ticks, **given})
+    return services.score_trial(**{"user": bench.operator, "trial": trial, "milestones": ticks, **given})
 
 
 # --- preparing ---------------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def test_what_does_not_count_is_repeated_as_a_new_attempt_of_the_same_number(ben
 def test_a_voided_trial_in_the_middle_is_repeated_before_the_next_number(bench):
     first = bench.scored()
     bench.scored()
-    voids.trial_void(user=bench.operator, trial=first, reason="the plate was missing")
+    voids.void_trial(user=bench.operator, trial=first, reason="the plate was missing")
     again = bench.prepare()
     assert (again.number, again.attempt) == (1, 2)
 
@@ -147,7 +147,7 @@ def test_what_is_switched_off_is_not_tried(bench, kind):
 def test_a_position_of_another_scene_is_refused(bench):
     other = builders.scene("other-scene")
     with pytest.raises(NotFound, match="not one of scene block-on-plate"):
-        services.trial_prepare(
+        services.prepare_trial(
             user=bench.operator,
             station=bench.station,
             scene=bench.scene,
@@ -169,8 +169,8 @@ def test_a_viewer_can_neither_prepare_nor_score_nor_void_nor_abandon(bench):
     trial = bench.ended()
     for act in (
         lambda: score(bench, trial, user=viewer),
-        lambda: voids.trial_void(user=viewer, trial=trial, reason="because"),
-        lambda: services.trial_abandon(user=viewer, trial=trial),
+        lambda: voids.void_trial(user=viewer, trial=trial, reason="because"),
+        lambda: services.abandon_trial(user=viewer, trial=trial),
     ):
         with pytest.raises(NotAllowed):
             act()
@@ -239,7 +239,7 @@ def test_without_required_milestones_success_has_to_be_said(bench):
 def test_without_any_milestone_the_score_is_the_success(bench):
     trial = bench.ended()
     Milestone.objects.all().delete()
-    found = services.trial_score(user=bench.operator, trial=trial, milestones={}, success=True)
+    found = services.score_trial(user=bench.operator, trial=trial, milestones={}, success=True)
     assert (found.success, found.score) == (True, 1.0)
 
 
@@ -249,7 +249,7 @@ def test_in_the_name_of_a_bench_nobody_scores_anything_but_what_it_says(bench):
     trial = bench.ended()
 
     def score(*reached):
-        return services.trial_score(
+        return services.score_trial(
             user=bench.operator, trial=trial, milestones=bench.ticks(*reached), source="truth"
         )
 
@@ -272,7 +272,7 @@ def test_a_success_that_contradicts_the_required_milestones_is_refused(bench):
 def test_unknown_milestones_are_refused_with_those_that_there_are(bench, key):
     trial = bench.ended()
     with pytest.raises(EvaError, match=r"is not one of this scene; allowed: \d+ \(held\)"):
-        services.trial_score(
+        services.score_trial(
             user=bench.operator, trial=trial, milestones={**bench.ticks(True, True, True), key: True}
         )
     assert Score.objects.count() == 0
@@ -282,13 +282,13 @@ def test_a_milestone_that_is_not_answered_is_refused(bench):
     ticks = bench.ticks(True, True, True)
     missing = ticks.popitem()[0]
     with pytest.raises(EvaError, match=f"milestone {missing} is not answered"):
-        services.trial_score(user=bench.operator, trial=bench.ended(), milestones=ticks)
+        services.score_trial(user=bench.operator, trial=bench.ended(), milestones=ticks)
 
 
 def test_an_answer_that_is_neither_true_nor_false_is_refused(bench):
     ticks = dict.fromkeys(bench.ticks(True, True, True), "yes")
     with pytest.raises(EvaError, match="allowed: true, false"):
-        services.trial_score(user=bench.operator, trial=bench.ended(), milestones=ticks)
+        services.score_trial(user=bench.operator, trial=bench.ended(), milestones=ticks)
 
 
 def test_to_score_twice_is_a_correction_that_needs_a_reason_and_counts(bench):
@@ -353,20 +353,20 @@ def test_what_somebody_else_says_word_by_word_is_no_repetition(bench):
     trial = bench.scored()
     ticks = {outcome.milestone_id: outcome.reached for outcome in trial.verdict.outcomes.all()}
     with pytest.raises(EvaError, match="has a score already"):
-        services.trial_score(user=builders.user("otto"), trial=trial, milestones=ticks)
+        services.score_trial(user=builders.user("otto"), trial=trial, milestones=ticks)
 
 
 def test_who_voids_or_gives_up_once_more_gets_the_first_answer(bench):
-    voided = voids.trial_void(user=bench.operator, trial=bench.scored(), reason="the camera fell")
+    voided = voids.void_trial(user=bench.operator, trial=bench.scored(), reason="the camera fell")
     at = voided.voided_at
-    again = voids.trial_void(user=bench.operator, trial=voided, reason="the camera fell")
+    again = voids.void_trial(user=bench.operator, trial=voided, reason="the camera fell")
     assert (again.status, again.voided_at, len(lines(voided.episode_id or voided.uuid))) == ("voided", at, 2)
     with pytest.raises(Conflict, match="cannot be voided"):
-        voids.trial_void(user=bench.operator, trial=voided, reason="another reason")
-    given_up = services.trial_abandon(user=bench.operator, trial=bench.prepare(), reason="wrong block")
-    assert services.trial_abandon(user=bench.operator, trial=given_up, reason="wrong block") == given_up
+        voids.void_trial(user=bench.operator, trial=voided, reason="another reason")
+    given_up = services.abandon_trial(user=bench.operator, trial=bench.prepare(), reason="wrong block")
+    assert services.abandon_trial(user=bench.operator, trial=given_up, reason="wrong block") == given_up
     with pytest.raises(Conflict, match="cannot be abandoned"):
-        services.trial_abandon(user=bench.operator, trial=given_up)
+        services.abandon_trial(user=bench.operator, trial=given_up)
 
 
 def test_a_score_is_never_changed(bench):
@@ -437,18 +437,18 @@ def test_what_left_no_recorded_row_is_never_scored_and_can_be_voided(bench, stat
         score(bench, trial)
     assert not JUDGEMENTS.path(trial.episode_id or trial.uuid).exists()
     assert [row.summary.success.n for row in statistics()] == [0]
-    assert voids.trial_void(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
+    assert voids.void_trial(user=bench.operator, trial=trial, reason="it never ran").status == "voided"
 
 
 def test_what_is_still_being_closed_is_scored_as_soon_as_a_row_of_it_is_on_the_disk(bench, tmp_path):
     journal_of, folder = begun(tmp_path / "episodes")
-    trial = builders.over(bench.prepare(), uuid=folder.name, status="recording", frames=0)
+    trial = builders.finished_trial(bench.prepare(), uuid=folder.name, status="recording", frames=0)
     with pytest.raises(
         Conflict, match=r"no row of episode .* is on the disk yet: look again once it is closed"
     ):
         score(bench, trial)
     journal_of.append(row(0))
-    eventually(lambda: not unrecorded_because(episode=trial.episode), "a row on the disk")
+    eventually(lambda: not why_unrecorded(episode=trial.episode), "a row on the disk")
     assert score(bench, trial).success is True
     journal_of.end(Outcome("finished", "stopped", 1.7e9))
 
@@ -522,7 +522,7 @@ def test_the_note_of_one_trial_is_not_that_of_the_next(bench):
 
 def test_void_is_not_fail_and_says_who_and_why(bench):
     trial = bench.scored(success=False)
-    voids.trial_void(user=bench.operator, trial=trial, reason="  a hand was in the picture ")
+    voids.void_trial(user=bench.operator, trial=trial, reason="  a hand was in the picture ")
     assert (trial.status, trial.reason) == ("voided", "a hand was in the picture")
     assert trial.voided_by == bench.operator
     assert trial.scores.count() == 1
@@ -533,22 +533,22 @@ def test_void_is_not_fail_and_says_who_and_why(bench):
 def test_nothing_is_voided_without_a_reason(bench, reason):
     trial = bench.ended()
     with pytest.raises(EvaError, match="reason is empty"):
-        voids.trial_void(user=bench.operator, trial=trial, reason=reason)
+        voids.void_trial(user=bench.operator, trial=trial, reason=reason)
 
 
 def test_only_a_trial_that_never_ran_is_abandoned(bench):
     with pytest.raises(Conflict, match="cannot be abandoned"):
-        services.trial_abandon(user=bench.operator, trial=bench.ended())
+        services.abandon_trial(user=bench.operator, trial=bench.ended())
     Trial.objects.update(status="voided")
     trial = bench.prepare()
-    services.trial_abandon(user=bench.operator, trial=trial, reason="wrong checkpoint")
+    services.abandon_trial(user=bench.operator, trial=trial, reason="wrong checkpoint")
     assert (trial.status, trial.reason) == ("abandoned", "wrong checkpoint (ann)")
 
 
 def test_the_table_names_every_status_and_nothing_leaves_voided():
-    assert {before for before, _ in MOVES} | {TrialStatus.VOIDED} == set(TrialStatus)
-    assert {move for _, move in MOVES} == set(Move)
-    assert not [move for before, move in MOVES if before is TrialStatus.VOIDED]
+    assert {before for before, _ in TRANSITIONS} | {TrialStatus.VOIDED} == set(TrialStatus)
+    assert {move for _, move in TRANSITIONS} == set(Transition)
+    assert not [move for before, move in TRANSITIONS if before is TrialStatus.VOIDED]
 
 
 def test_a_position_that_was_tried_cannot_be_deleted(bench):

@@ -127,10 +127,10 @@ def test_a_set_up_that_was_refused_is_none(bench, wire):
 def test_nothing_is_run_after_the_station_was_set_up_for_something_else(bench, wire):
     trial = bench.prepare()
     give(bench, trial, "setup")
-    services.trial_abandon(user=bench.operator, trial=trial)
+    services.abandon_trial(user=bench.operator, trial=trial)
     other = bench.prepare(checkpoint=Checkpoint.objects.create(name="other"))
     give(bench, other, "setup")
-    services.trial_abandon(user=bench.operator, trial=other)
+    services.abandon_trial(user=bench.operator, trial=other)
     third = bench.prepare()
     Trial.objects.filter(pk=third.pk).update(setup=trial.setup)
     with pytest.raises(Conflict, match="set up for something else"):
@@ -150,7 +150,7 @@ def test_nothing_is_run_after_a_terminal_set_the_station_up_for_something_else(b
 def test_the_set_up_of_another_trial_is_not_that_of_this_one(bench, wire):
     trial = bench.prepare()
     uuid = give(bench, trial, "setup").pk
-    services.trial_abandon(user=bench.operator, trial=trial)
+    services.abandon_trial(user=bench.operator, trial=trial)
     other = bench.prepare(checkpoint=Checkpoint.objects.create(name="other"))
     with pytest.raises(Conflict, match=f"not for trial {other.pk}"):
         give(bench, other, "setup", uuid=uuid)
@@ -163,7 +163,7 @@ def test_the_run_of_another_trial_is_not_that_of_this_one(bench, wire):
     give(bench, trial, "setup")
     uuid = give(bench, trial, "run").pk
     Trial.objects.filter(pk=trial.pk).update(status="ended")
-    voids.trial_void(user=bench.operator, trial=trial, reason="a person in the way")
+    voids.void_trial(user=bench.operator, trial=trial, reason="a person in the way")
     other = bench.prepare()
     with pytest.raises(Conflict, match=f"not for trial {other.pk}"):
         give(bench, other, "run", uuid=uuid)

@@ -3,7 +3,7 @@ from uuid import uuid4
 import pytest
 
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.episodes.services import episode_opened
+from evaweb.episodes.services import record_opened
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Command
 from evaweb.trials import services
@@ -125,7 +125,7 @@ def test_every_event_twice_and_out_of_order_leaves_the_same_trial(bench, running
         {"number": 4, "kind": "state", "text": "a -> ready: time", "time": 105.0, "data": {"state": "ready"}},
     ]
     for row in (rows[0], rows[0], rows[1], rows[0], rows[2], rows[1], rows[0], rows[2]):
-        services.run_changed(station=bench.station, event=row, boot=BOOT)
+        services.apply_station_event(station=bench.station, event=row, boot=BOOT)
     running.refresh_from_db()
     assert running.status == "ended"
     assert running.duration_s == pytest.approx(4.0)
@@ -133,7 +133,7 @@ def test_every_event_twice_and_out_of_order_leaves_the_same_trial(bench, running
 
 def test_events_from_before_the_run_do_not_touch_it(bench, running):
     old = {"number": 0, "kind": "state", "text": "", "time": 1.0, "data": {"state": "faulted"}}
-    assert services.run_changed(station=bench.station, event=old, boot=BOOT) is None
+    assert services.apply_station_event(station=bench.station, event=old, boot=BOOT) is None
     running.refresh_from_db()
     assert running.status == "running"
 
@@ -143,7 +143,7 @@ def test_another_stations_events_do_not_touch_it(bench, running):
 
     other = Station.objects.create(name="bench-2", robot="agilex_piper")
     row = {"number": 9, "kind": "state", "text": "", "time": 1.0, "data": {"state": "faulted"}}
-    assert services.run_changed(station=other, event=row, boot=BOOT) is None
+    assert services.apply_station_event(station=other, event=row, boot=BOOT) is None
     ours = str(running.episode_id)
     for number, (kind, data) in enumerate(
         [
@@ -152,14 +152,14 @@ def test_another_stations_events_do_not_touch_it(bench, running):
         ]
     ):
         row = {"number": 10 + number, "kind": kind, "text": "", "time": 1.0, "data": data}
-        assert services.run_changed(station=other, event=row, boot=BOOT) is None
+        assert services.apply_station_event(station=other, event=row, boot=BOOT) is None
     running.refresh_from_db()
     assert (running.status, running.truth) == ("running", None)
 
 
 def test_a_restarted_station_interrupts_what_was_under_way(bench, running):
     row = {"number": 0, "kind": "state", "text": "restarted -> idle", "time": None, "data": {"state": "idle"}}
-    found = services.run_changed(station=bench.station, event=row, boot="boot-2")
+    found = services.apply_station_event(station=bench.station, event=row, boot="boot-2")
     assert found.status == "interrupted"
     assert "restarted" in found.reason
 
@@ -168,7 +168,7 @@ def test_a_run_that_ended_while_the_web_was_away_has_ended(bench, running):
     whole = {"status": EpisodeStatus.FINISHED, "duration_s": 9.25, "frames": 278}
     Episode.objects.filter(pk=running.episode_id).update(**whole)
     row = {"number": 0, "kind": "state", "text": "restarted -> idle", "time": None, "data": {"state": "idle"}}
-    found = services.run_changed(station=bench.station, event=row, boot="boot-2")
+    found = services.apply_station_event(station=bench.station, event=row, boot="boot-2")
     assert (found.status, found.duration_s) == ("ended", 9.25)
 
 
@@ -200,7 +200,7 @@ def test_a_trial_that_was_scored_before_its_recording_closed_stays_scored_and_is
     enter(bench, "ready", 110.0)
     Episode.objects.filter(pk=running.episode_id).update(frames=300)
     ticks = bench.ticks(True, True, True)
-    services.trial_score(user=bench.operator, trial=running, milestones=ticks)
+    services.score_trial(user=bench.operator, trial=running, milestones=ticks)
     Job.objects.all().delete()
     found = bench.event("episode_closed", uuid=str(running.episode_id), status="failed", reason="disk full")
     assert found.status == "scored"
@@ -251,14 +251,14 @@ def test_an_episode_whose_name_was_lost_is_asked_for_and_bound_to_its_trial(benc
         row.data = {"episode": uuid}
         return row
 
-    monkeypatch.setattr("evaweb.trials.station_events.settle", settled)
+    monkeypatch.setattr("evaweb.trials.station_events.resolve_unknown_outcome", settled)
     assert bench.event("episode_closed", uuid=str(uuid4()), status="finished") is None
     found = bench.event("episode_closed", "", 109.0, uuid=uuid, status="finished", reason="stopped")
     assert (found.pk, str(found.episode_id), found.status) == (trial.pk, uuid, "ended")
 
 
 def test_a_recording_without_a_run_belongs_to_no_trial(bench, running):
-    episode_opened(station=bench.station, uuid=(alone := uuid4()))
+    record_opened(station=bench.station, uuid=(alone := uuid4()))
     assert bench.event("episode_closed", uuid=str(alone), status="finished", reason="") is None
     running.refresh_from_db()
     assert running.status == "running"
@@ -266,7 +266,7 @@ def test_a_recording_without_a_run_belongs_to_no_trial(bench, running):
 
 def test_a_trial_that_was_given_up_too_early_is_taken_up_again(bench, asked):
     trial, command = asked
-    services.trial_abandon(user=bench.operator, trial=trial)
+    services.abandon_trial(user=bench.operator, trial=trial)
     bench.event("command", "", 100.0, uuid=str(command.pk), **{"from": "ready"}, to="running")
     trial.refresh_from_db()
     assert trial.status == "running"
@@ -274,7 +274,7 @@ def test_a_trial_that_was_given_up_too_early_is_taken_up_again(bench, asked):
 
 def test_it_is_left_where_the_station_has_another_trial_by_now(bench, asked, caplog):
     trial, command = asked
-    services.trial_abandon(user=bench.operator, trial=trial)
+    services.abandon_trial(user=bench.operator, trial=trial)
     bench.prepare()
     bench.event("command", "", 100.0, uuid=str(command.pk), **{"from": "ready"}, to="running")
     trial.refresh_from_db()
@@ -286,7 +286,7 @@ def test_it_is_left_where_the_station_has_another_trial_by_now(bench, asked, cap
 def test_events_that_say_nothing_change_nothing(bench, running, data):
     row = {"number": 50, "kind": "state", "text": None, "time": None, "data": data}
     before = Trial.objects.values().get(pk=running.pk)
-    found = services.run_changed(station=bench.station, event=row, boot=BOOT)
+    found = services.apply_station_event(station=bench.station, event=row, boot=BOOT)
     assert found is None or data == {"state": 3}
     if found is None:
         assert Trial.objects.values().get(pk=running.pk) == before

@@ -41,7 +41,7 @@ def test_nobody_sees_results_without_logging_in(bench):
 def test_every_rate_stands_beside_its_n_and_its_interval(bench, browser):
     for success in (True, True, True, False):
         bench.scored(success)
-    voids.trial_void(user=bench.operator, trial=bench.scored(), reason="a hand")
+    voids.void_trial(user=bench.operator, trial=bench.scored(), reason="a hand")
     text = page(browser, "/result/")
     row = re.search(r'<tr data-checkpoint="pi0-block">.*?</tr>', text, re.S).group()
     cells = re.findall(r'<td class="number[^"]*">(?:<a[^>]*>)?([^<]*)', row)
@@ -99,7 +99,7 @@ def test_many_trials_come_in_pages_with_a_bounded_number_of_queries(
 def test_names_and_notes_are_text_and_never_markup(bench, browser):
     trial = bench.ended()
     ticks = bench.ticks(False, False, False)
-    services.trial_score(
+    services.score_trial(
         user=bench.operator, trial=trial, milestones=ticks, note="<script>x</script>", failure="<b>"
     )
     for path in ("/result/", f"/result/trials/{trial.pk}/"):
@@ -173,7 +173,7 @@ def test_a_correction_begins_with_what_was_said_of_the_failure_before(bench, bro
     where = f"/result/trials/{trial.pk}"
     said = {"failure_phase": "grasp", "failure": "slipped on the way"}
     ticks = bench.ticks(True, False, False)
-    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, failure=said["failure"])
+    services.score_trial(user=bench.operator, trial=trial, milestones=ticks, failure=said["failure"])
     text = page(browser, f"{where}/")
     assert "<dd>slipped on the way</dd>" in text
     assert 'name="failure" value="slipped on the way" checked' in text

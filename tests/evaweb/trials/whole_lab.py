@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from evaweb.episodes.folders import journal_folder
-from evaweb.episodes.services import episode_closed
+from evaweb.episodes.services import record_closed
 from evaweb.jobs import doorbell
 from evaweb.trials import services
 from evaweb.trials.station_commands import trial_command
@@ -38,7 +38,7 @@ class Direct:
 @pytest.fixture
 def lab(tmp_path, monkeypatch, db):
     """A lab around a whole station in lockstep."""
-    monkeypatch.setattr(doorbell, "ring", lambda queue: True)
+    monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     made = Lab(builders.bench("bench"), Lockstep(stubbed(tmp_path, simulated=True)))
     for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
         monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
@@ -94,9 +94,11 @@ class Lab:
             self._heard = event["number"]
             if event["kind"] == "episode_closed":
                 write_export(Path(event["data"]["path"]), self.station.spec.deployment.data)  # as media does
-                episode_closed(station=self.bench.station, data=event["data"])
-            services.run_changed(station=self.bench.station, event=event, boot=self.station.coordinator.boot)
+                record_closed(station=self.bench.station, data=event["data"])
+            services.apply_station_event(
+                station=self.bench.station, event=event, boot=self.station.coordinator.boot
+            )
 
     def score(self, trial, *reached, **words):
         ticks = self.bench.ticks(*reached)
-        return services.trial_score(user=self.bench.operator, trial=trial, milestones=ticks, **words)
+        return services.score_trial(user=self.bench.operator, trial=trial, milestones=ticks, **words)

@@ -11,11 +11,11 @@ from runtime.clients.headless import run_headless, summary
 from runtime.core.errors import RecordingError, RuntimeFault, SetupError, TransportError
 from runtime.recording import export
 from tests.sources import ROOT
-from tests.standing import standing
+from tests.standing import state_flags
 
 STATUS = {
     "boot": "boot-1",
-    **standing("idle"),
+    **state_flags("idle"),
     "reason": "",
     "stage": "idle",
     "mode": "continuous",
@@ -43,7 +43,7 @@ CLOSED = {"path": "/data/episodes/one", "status": "finished", "rows": 240}
 
 
 def status(state, **changes):
-    return deepcopy(STATUS) | standing(state) | changes
+    return deepcopy(STATUS) | state_flags(state) | changes
 
 
 def event(number, kind, text=""):

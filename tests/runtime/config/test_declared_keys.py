@@ -16,7 +16,7 @@ from robots.description import RobotTable
 from robots.robot import Gripper, Group, Robot
 from runtime.config.schema import Deployment
 from runtime.core.plugins import union_members
-from tests.runtime.reading import Reads, reads_of
+from tests.runtime.reading import Reads, attribute_reads
 
 ROOT = Path(__file__).parents[3]
 # They print or judge what was declared. What they read is not obeyed for that.
@@ -134,7 +134,7 @@ def excused(key: str) -> tuple[str, str] | None:
 
 @pytest.mark.exhaustive
 def test_every_declared_key_is_read_by_what_it_is_for() -> None:
-    silent = unread(reads_of(modules(), ROOT), Deployment, RobotTable, Robot, Group, Gripper)
+    silent = unread(attribute_reads(modules(), ROOT), Deployment, RobotTable, Robot, Group, Gripper)
     lies = []
     for key in sorted(silent):
         where = excused(key)
@@ -165,7 +165,7 @@ def test_a_key_that_is_only_checked_and_shown_is_found(tmp_path: Path) -> None:
     }
     for name, text in sources.items():
         (tmp_path / f"{name}.py").write_text(text)
-    found = reads_of({name: tmp_path / f"{name}.py" for name in sources}, tmp_path)
+    found = attribute_reads({name: tmp_path / f"{name}.py" for name in sources}, tmp_path)
     reads = {
         (_name(Table), name): {module.replace("robots_", "robots.") for module in readers}
         for (_, name), readers in found.items()

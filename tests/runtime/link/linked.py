@@ -20,7 +20,7 @@ from runtime.link.key_files import KeyPair, KnownLab
 from runtime.link.station import StationLink
 from runtime.link.uploads import UploadSettings
 from runtime.link.wire import Enrolled
-from tests.evaweb.stand_in import StandIn
+from tests.evaweb.stand_in import FakeStation
 from tests.processes import PATIENCE_S, eventually
 
 STATION = "bench-7"
@@ -144,7 +144,7 @@ class Robot:
 
     def __init__(self, data: Path, lab: Lab, name: str = STATION) -> None:
         self.data, self.lab, self.name = data, lab, name
-        self.station = StandIn(data, name)
+        self.station = FakeStation(data, name)
         self.key = key_files.make_station_key(data)
         self.link: StationLink | None = None
 

@@ -14,7 +14,7 @@ from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, Pref
 from runtime.station.preflight_child import PreflightRun
 from tests.runtime.lockstep_station import Station, stubbed
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned
-from tests.standing import standing
+from tests.standing import state_flags
 
 OWN = planned(WIRES["openpi"], "ws://127.0.0.1:8000")
 GRPC = "grpc://127.0.0.1:8080"
@@ -135,7 +135,7 @@ def test_reports_and_servers_are_told() -> None:
     desk = Desk(planned(WIRES["openpi"], "ws://127.0.0.1:8001"))
     assert desk.ask("preflight_report", id="one").data["running"] is True
     assert "not known here" in desk.ask("preflight_report", id="two").reason
-    assert desk.ask("policy_server").data == {"server": "127.0.0.1:8001", **standing("idle")}
+    assert desk.ask("policy_server").data == {"server": "127.0.0.1:8001", **state_flags("idle")}
     assert desk.ask("policy_server", policy={}).data["server"] == "127.0.0.1:8000"
     assert desk.ask("policy_server", policy={"url": "ws://gpu:7"}).data["server"] == "gpu:7"
     assert desk.ask("policy_server", policy={"uri": "x"}).status == "refused"

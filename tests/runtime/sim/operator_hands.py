@@ -26,7 +26,7 @@ OPEN, SHUT = 0.1, 0.0
 POSITIONS = {"block": [-0.15, 0.2, 20.0], "plate": [-0.2, 0.36]}
 
 
-class Operator:
+class SimulatedOperator:
     """A tabletop with its robot; `yaw` is that of the jaws [rad], `tilt` [rad] outwards from straight down."""
 
     def __init__(self, seed: int = 1, arm: Group = LEFT, blocks: int = 1) -> None:

@@ -10,7 +10,17 @@ from hypothesis import strategies as st
 from runtime.sim.bench import BenchError
 from runtime.sim.tabletop import ResetRequest, Tabletop
 from tests.examples import some
-from tests.runtime.sim.operator_hands import LEFT, OPEN, POSITIONS, RATE, READY, RIGHT, ROBOT, SHUT, Operator
+from tests.runtime.sim.operator_hands import (
+    LEFT,
+    OPEN,
+    POSITIONS,
+    RATE,
+    READY,
+    RIGHT,
+    ROBOT,
+    SHUT,
+    SimulatedOperator,
+)
 
 EDGE = 0.04
 
@@ -20,7 +30,7 @@ EDGE = 0.04
 @pytest.mark.parametrize("turn", [0.0, 0.3, -0.4])
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_a_block_picked_from_above_and_put_on_the_plate_is_a_success(arm, turn, tilt):
-    hands = Operator(arm=arm)
+    hands = SimulatedOperator(arm=arm)
     assert hands.truth["milestones"] == {
         "grasped": False,
         "lifted": False,
@@ -43,7 +53,7 @@ def test_a_block_picked_from_above_and_put_on_the_plate_is_a_success(arm, turn, 
 
 
 def test_jaws_that_close_on_a_block_turn_it_straight_and_move_it_between_them():
-    hands = Operator()
+    hands = SimulatedOperator()
     x, y, _, yaw = hands.block
     hands.goes(x + 0.012, y, 0.09, yaw + 0.4, 0.1)
     hands.goes(x + 0.012, y, 0.02, yaw + 0.4)
@@ -68,7 +78,7 @@ def test_jaws_that_close_on_a_block_turn_it_straight_and_move_it_between_them():
     ids=["beside it", "over it", "at its end", "on its corners", "leaning too far"],
 )
 def test_jaws_that_do_not_close_around_a_block_from_above_do_not_lift_it(how, stops_at):
-    hands = Operator()
+    hands = SimulatedOperator()
     hands.closes_on_block(**how)
     assert hands.jaws == pytest.approx(stops_at, abs=1e-3)
     assert hands.truth["held"] == [""]
@@ -78,7 +88,7 @@ def test_jaws_that_do_not_close_around_a_block_from_above_do_not_lift_it(how, st
 
 
 def test_opening_in_mid_air_drops_the_block_which_comes_to_lie_on_a_face():
-    hands = Operator()
+    hands = SimulatedOperator()
     hands.closes_on_block()
     x, y, _, yaw = hands.block
     hands.goes(x, y + 0.05, 0.15, yaw, tilt=0.5)
@@ -100,7 +110,7 @@ def test_opening_in_mid_air_drops_the_block_which_comes_to_lie_on_a_face():
 
 
 def test_a_block_that_is_taken_off_the_plate_again_is_no_longer_placed():
-    hands = Operator()
+    hands = SimulatedOperator()
     hands.closes_on_block()
     hands.lifts()
     hands.places()
@@ -112,7 +122,7 @@ def test_a_block_that_is_taken_off_the_plate_again_is_no_longer_placed():
 
 
 def test_a_block_on_the_rim_is_placed_and_no_success():
-    hands = Operator()
+    hands = SimulatedOperator()
     hands.closes_on_block()
     hands.lifts()
     x, y = hands.truth["plate"]
@@ -125,7 +135,7 @@ def test_a_block_on_the_rim_is_placed_and_no_success():
 
 
 def test_a_held_block_does_not_go_through_the_table_or_the_plate():
-    hands = Operator()
+    hands = SimulatedOperator()
     hands.closes_on_block()
     hands.lifts()
     x, y = hands.truth["plate"]
@@ -139,7 +149,7 @@ def test_a_held_block_does_not_go_through_the_table_or_the_plate():
 
 
 def test_closed_fingers_push_a_block_along():
-    hands = Operator()
+    hands = SimulatedOperator()
     x, y, _, yaw = hands.block
     hands.jaws_go(SHUT)
     hands.goes(x - 0.06, y, 0.09, 0.0, 0.1)
@@ -151,7 +161,7 @@ def test_closed_fingers_push_a_block_along():
 
 
 def test_a_block_pushed_against_the_plate_stays_beside_it():
-    hands = Operator()
+    hands = SimulatedOperator()
     x, y, _, _ = hands.block
     hands.jaws_go(SHUT)
     hands.goes(x, y - 0.06, 0.08, 0.0)
@@ -164,7 +174,7 @@ def test_a_block_pushed_against_the_plate_stays_beside_it():
 
 
 def test_a_block_put_on_another_one_stands_on_it():
-    hands = Operator(blocks=2)
+    hands = SimulatedOperator(blocks=2)
     low = hands.table._blocks[1]
     low.pose[:2, 3] = -0.26, 0.25
     hands.closes_on_block()
@@ -180,7 +190,7 @@ def test_a_block_put_on_another_one_stands_on_it():
 def test_the_same_commands_from_the_same_reset_give_the_same_course():
     courses = []
     for _ in range(2):
-        hands = Operator(seed=3)
+        hands = SimulatedOperator(seed=3)
         hands.closes_on_block(turn=0.2)
         hands.lifts()
         hands.jaws_go(OPEN)
@@ -190,7 +200,7 @@ def test_the_same_commands_from_the_same_reset_give_the_same_course():
 
 
 def test_a_reset_lays_the_bench_by_its_seed_and_forgets_what_was_reached():
-    hands = Operator(seed=1)
+    hands = SimulatedOperator(seed=1)
     first = hands.truth
     hands.closes_on_block()
     hands.table.reset(ResetRequest("again", 1, POSITIONS))
@@ -202,7 +212,7 @@ def test_a_reset_lays_the_bench_by_its_seed_and_forgets_what_was_reached():
 
 
 def test_a_repeated_reset_changes_nothing():
-    hands = Operator(seed=1)
+    hands = SimulatedOperator(seed=1)
     hands.closes_on_block()
     before = hands.truth
     hands.table.reset(ResetRequest("reset 1", 99))
@@ -210,7 +220,7 @@ def test_a_repeated_reset_changes_nothing():
 
 
 def test_a_reset_that_cannot_be_leaves_everything_as_it_is():
-    hands = Operator(seed=1)
+    hands = SimulatedOperator(seed=1)
     before = hands.truth
     with pytest.raises(BenchError, match="apart"):
         hands.table.reset(ResetRequest("bad", 1, {"block": [0.0, 0.3, 0.0], "plate": [0.0, 0.35]}))
@@ -222,7 +232,7 @@ def test_a_reset_that_cannot_be_leaves_everything_as_it_is():
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_whatever_is_commanded_blocks_stay_above_the_table_and_are_numbers(seed, blocks):
     chance = np.random.default_rng(seed)
-    hands = Operator(seed=seed, blocks=blocks)
+    hands = SimulatedOperator(seed=seed, blocks=blocks)
     for _ in range(12):
         block = hands.block
         if chance.random() < 0.5:
@@ -245,6 +255,6 @@ def test_whatever_is_commanded_blocks_stay_above_the_table_and_are_numbers(seed,
 def test_a_tick_of_any_length_is_one_that_the_bench_can_take(seconds):
     table = Tabletop(ROBOT, 0)
     before = table.truth()
-    hands = Operator()
+    hands = SimulatedOperator()
     table.advance(hands.plant, seconds)
     assert table.truth()["blocks"] == before["blocks"]

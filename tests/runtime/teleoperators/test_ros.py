@@ -16,7 +16,7 @@ from runtime.transports import ros2 as transport
 from runtime.transports.ros import cdr
 from runtime.transports.ros.messages import JointState
 from runtime.transports.ros.middleware import Match
-from tests.runtime.transports.ros.hand import Hand
+from tests.runtime.transports.ros.hand import FakeMiddleware
 
 ROBOT = robots.load_robot("agilex_piper")
 LEFT, RIGHT = (ROBOT.groups[index] for index in (0, 1))
@@ -25,7 +25,7 @@ BOTH = {LEFT.name: {"topic": "/leader/left"}, RIGHT.name: {"topic": "/leader/rig
 
 class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
-        self.hand, self.clock = Hand(), VirtualClock(10.0)
+        self.hand, self.clock = FakeMiddleware(), VirtualClock(10.0)
         monkeypatch.setattr(transport, "middleware", lambda *_: self.hand)
         config = ros2.Config.model_validate({"groups": BOTH, **settings})
         self.leader = ros2.build(config, ROBOT, self.clock)

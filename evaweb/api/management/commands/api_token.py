@@ -7,7 +7,7 @@ from typing import Any
 from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
-from evaweb.api.tokens import DAYS, MOST_DAYS, token_create
+from evaweb.api.tokens import DAYS, MOST_DAYS, create_token
 from evaweb.errors import EvaError
 
 
@@ -31,6 +31,6 @@ class Command(BaseCommand):
             known = ", ".join(User.objects.values_list("username", flat=True)) or "none yet"
             raise CommandError(f"user {options['user']!r} does not exist; there are: {known}")
         try:
-            self.stdout.write(token_create(user=user, name=options["name"], days=options["days"]))
+            self.stdout.write(create_token(user=user, name=options["name"], days=options["days"]))
         except EvaError as fault:
             raise CommandError(str(fault)) from None

@@ -8,7 +8,7 @@ from typing import Any
 from django.conf import settings
 from django.core.management.base import BaseCommand
 
-from evaweb.api.snapshot import snapshot
+from evaweb.api.snapshot import openapi_snapshot
 
 PLACE = Path(settings.BASE_DIR) / "docs" / "openapi.json"
 
@@ -20,5 +20,5 @@ class Command(BaseCommand):
 
     def handle(self, *args: Any, **options: Any) -> None:
         """Write the file and say where."""
-        PLACE.write_text(snapshot(), encoding="utf-8")
+        PLACE.write_text(openapi_snapshot(), encoding="utf-8")
         self.stdout.write(f"wrote {PLACE}")

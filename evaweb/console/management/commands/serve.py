@@ -29,13 +29,13 @@ class Command(BaseCommand):
     def handle(self, *args: Any, host: str, port: int, nice: int, lifeline: bool, **options: Any) -> None:
         from evaweb.asgi import application  # not before models are there
         from evaweb.console import server
-        from evaweb.console.event_ingest import Chronicle
+        from evaweb.console.event_ingest import EventIngest
         from evaweb.errors import EvaError
         from evaweb.jobs.workers import lab_folder_named
-        from evaweb.listening import PortTaken, listen
+        from evaweb.listening import PortTaken, open_listener
 
         try:
-            listener = listen(host, port)
+            listener = open_listener(host, port)
             lab_folder_named()
         except DatabaseError as error:
             log.warning(
@@ -43,4 +43,4 @@ class Command(BaseCommand):
             )
         except (PortTaken, EvaError) as error:
             raise CommandError(str(error)) from None
-        server.serve(application, listener, beside=Chronicle(), lifeline=lifeline, nice=nice)
+        server.serve(application, listener, beside=EventIngest(), lifeline=lifeline, nice=nice)

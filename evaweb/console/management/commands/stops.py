@@ -40,10 +40,10 @@ class Command(BaseCommand):
         lifeline: bool,
         **options: Any,
     ) -> None:
-        from evaweb.api.door import stops_alone  # not before models are there
+        from evaweb.api.door import stop_application  # not before models are there
         from evaweb.console import server
         from evaweb.console.arrivals import StopRequest
-        from evaweb.listening import PortTaken, listen
+        from evaweb.listening import PortTaken, open_listener
         from evaweb.stop_port import StopPort
 
         beside = None
@@ -51,10 +51,12 @@ class Command(BaseCommand):
             if descriptor is not None:  # whose lab says where it is
                 listener = socket.socket(fileno=descriptor)
             else:
-                listener = listen(host, port)
+                listener = open_listener(host, port)
                 beside = StopPort(listener.getsockname()[1], web_port)
         except PortTaken as error:
             raise CommandError(str(error)) from None
         except OSError as error:
             raise CommandError(f"--descriptor {descriptor}: {error.strerror}; allowed: a socket's") from None
-        server.serve(stops_alone(web_port), listener, beside=beside, lifeline=lifeline, request=StopRequest)
+        server.serve(
+            stop_application(web_port), listener, beside=beside, lifeline=lifeline, request=StopRequest
+        )

@@ -11,14 +11,14 @@ from django.core.management.base import BaseCommand, CommandError
 
 from evaweb.datasets import dataset_jobs
 from evaweb.datasets.finding import folder_named, overviews
-from evaweb.datasets.importing import imported
+from evaweb.datasets.importing import import_dataset
 from evaweb.datasets.orders import full_name
-from evaweb.episodes.dataset_membership import places_read
+from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir
 from evaweb.episodes.job_kinds import publish_episode
 from evaweb.episodes.models import Episode
 from evaweb.errors import EvaError
-from evaweb.jobs.kinds import Work
+from evaweb.jobs.kinds import JobContext
 from runtime.datasets.__main__ import add_commands, renamed
 from runtime.recording.files import RecordingError
 
@@ -58,7 +58,7 @@ class Command(BaseCommand):
     def handle(self, *args: Any, **options: Any) -> None:
         try:
             code = int(options["run"](argparse.Namespace(**options)))
-            problems = () if options["what"] in _ONLY_LOOK else places_read()
+            problems = () if options["what"] in _ONLY_LOOK else sync_memberships()
         except (RecordingError, EvaError) as error:
             raise CommandError(str(error)) from error
         for problem in problems:
@@ -72,7 +72,7 @@ class Command(BaseCommand):
             if one.problem:
                 self.stdout.write(f"{one.name}: {one.problem}")
                 continue
-            checked = dataset_jobs.checked(one.name)
+            checked = dataset_jobs.latest_check(one.name)
             state = "not checked" if checked is None else _state(checked)
             self.stdout.write(
                 f"{one.name}: {one.version}, {one.robot or 'robot not said'}, {one.episodes} episodes, "
@@ -83,7 +83,7 @@ class Command(BaseCommand):
         return int(any(one.problem for one in found))
 
     def _import(self, options: argparse.Namespace) -> int:
-        done = imported(
+        done = import_dataset(
             options.dataset,
             to=options.to,
             state=options.state,
@@ -102,7 +102,7 @@ class Command(BaseCommand):
         for uuid in options.episodes:
             if not Episode.objects.filter(uuid=uuid).exists():
                 raise EvaError(f"episode {uuid} is not in the database: run manage.py reconcile")
-            done = publish_episode(Work({"uuid": str(uuid)}, self.stdout.write))
+            done = publish_episode(JobContext({"uuid": str(uuid)}, self.stdout.write))
             if done["published"]:
                 self.stdout.write(
                     f"{uuid} is episode {done['index']} of {done['dataset']}, {done['frames']} rows"
@@ -113,7 +113,7 @@ class Command(BaseCommand):
         return code
 
 
-def _state(checked: dataset_jobs.Checked) -> str:
+def _state(checked: dataset_jobs.LatestCheck) -> str:
     if not checked.fresh:
         return "changed since its check"
     return f"{len(checked.problems)} problems" if checked.problems else "whole"

@@ -32,4 +32,4 @@ class Command(BaseCommand):
             names = queue_names(queues)
         except EvaError as error:
             raise CommandError(str(error)) from None
-        worker.run(names, lifeline=lifeline)
+        worker.run_worker(names, lifeline=lifeline)

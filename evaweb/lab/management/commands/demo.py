@@ -15,20 +15,20 @@ from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
 import robots
-from evaweb.binary_frames import plain
+from evaweb.binary_frames import to_json_value
 from evaweb.errors import EvaError
 from evaweb.lab import evaluate, programs, seed
 from evaweb.lab.benches import Bench
-from evaweb.lab.lab import Lab, a_lab
-from evaweb.lab.lifetime import Ended
-from evaweb.lab.once import Choice, perform, report
+from evaweb.lab.lab import Lab, open_lab
+from evaweb.lab.lifetime import StopRequested
+from evaweb.lab.once import TrialChoice, report, run_one_trial
 from evaweb.lab.progress import Progress, on_terminal
-from evaweb.lab.seed import Login
+from evaweb.lab.seed import DemoLogin
 from evaweb.lab.simulated import CLUMSY, POLICIES, SKILLED, benches_of, known_port, simulated_options
-from evaweb.lab.visitor import Visitor
+from evaweb.lab.visitor import RestClient
 from evaweb.plans.models import Allocation, Plan, StoppingRule
 from evaweb.results.analysis.analysis import Analysis
-from evaweb.results.analysis.caching import analysis_of
+from evaweb.results.analysis.caching import cached_analysis
 from evaweb.results.presentation.headline import headline
 from evaweb.roles import Role
 from evaweb.trials.models import Checkpoint
@@ -101,7 +101,7 @@ class Command(BaseCommand):
         deployment = _deployment(options["robot"])
         progress = on_terminal(Lab.STEPS + _STEPS)
         try:
-            with a_lab(options["host"], options["port"], options["stop_port"], progress) as lab:
+            with open_lab(options["host"], options["port"], options["stop_port"], progress) as lab:
                 url, logins = self._up(lab, deployment, options)
                 if options["ready_file"]:
                     _announce(options["ready_file"], url, logins, lab.processes.pids())
@@ -112,19 +112,19 @@ class Command(BaseCommand):
                 else:
                     self._welcome(url, logins)
                     lab.watch(benches_of(options))
-        except Ended:
+        except StopRequested:
             self.stdout.write("ended; the data stays in " + str(settings.DATA_DIR))
         except EvaError as error:
             if options["json"]:
                 options["json"].write_text(json.dumps({"error": str(error)}), "utf-8")
             raise CommandError(str(error)) from None
 
-    def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[Login]]:
+    def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[DemoLogin]]:
         with lab.progress.step("the simulated bench and its policies"):
             seed.demo_scene()
             in_lockstep = options["evaluate"] or options["lockstep"]
             bench = (self._lockstep if in_lockstep else self._bench)(lab, deployment, options)
-        url = lab.up([bench])
+        url = lab.start([bench])
         with lab.progress.step("accounts and a plan"):
             roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
             logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
@@ -179,7 +179,7 @@ class Command(BaseCommand):
         given = {"owner": "admin", "scene": seed.demo_scene(), "checkpoints": checkpoints}
         return seed.demo_plan(name=name, title=title, repetitions=repetitions, **given, **design)
 
-    def _welcome(self, url: str, logins: list[Login]) -> None:
+    def _welcome(self, url: str, logins: list[DemoLogin]) -> None:
         self.stdout.write(f"\nEVA Web is at {url}\n")
         for login in logins:
             self.stdout.write(f"  {login.username:<10}{login.password}")
@@ -187,7 +187,9 @@ class Command(BaseCommand):
         self.stdout.write("Ctrl-C ends everything.")
         self.stdout.flush()
 
-    def _evaluate(self, url: str, logins: list[Login], options: dict[str, Any], progress: Progress) -> None:
+    def _evaluate(
+        self, url: str, logins: list[DemoLogin], options: dict[str, Any], progress: Progress
+    ) -> None:
         begun, count = time.monotonic(), options["evaluate"]
         name = f"evaluate-{time.strftime('%Y%m%d-%H%M%S')}"
         positions = seed.demo_scene().positions.count()
@@ -200,29 +202,29 @@ class Command(BaseCommand):
             order=options["order"],
         )
         self.stderr.write(f"{plan}: commitment {plan.commitment}")
-        visitors = [Visitor(url) for _ in logins]
+        visitors = [RestClient(url) for _ in logins]
         for visitor, login in zip(visitors, logins, strict=True):
             visitor.login(login.username, login.password)
-        made = evaluate.carry_out(visitors[0], _STATION, name, count, self.stderr.write, progress)
+        made = evaluate.run_plan(visitors[0], _STATION, name, count, self.stderr.write, progress)
         with progress.during("the reveal, and what came out"):
-            result = evaluate.revealed(visitors[1], name, made)
+            result = evaluate.close_and_reveal(visitors[1], name, made)
             plan.refresh_from_db()
-            found = analysis_of(plan)
+            found = cached_analysis(plan)
         said = headline(plan)
         result["headline"] = said.sentence if said else ""
         result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
         if options["json"]:
-            options["json"].write_text(json.dumps(plain(result), indent=1), "utf-8")
+            options["json"].write_text(json.dumps(to_json_value(result), indent=1), "utf-8")
         for line in (*told(found), result["headline"]):
             self.stdout.write(line)
 
-    def _once(self, url: str, operator: Login, options: dict[str, Any]) -> None:
-        visitor = Visitor(url)
+    def _once(self, url: str, operator: DemoLogin, options: dict[str, Any]) -> None:
+        visitor = RestClient(url)
         visitor.login(operator.username, operator.password)
-        choice = Choice(
+        choice = TrialChoice(
             _STATION, "block-on-plate", options["position"], options["checkpoint"], options["seed"]
         )
-        done = perform(visitor, choice)
+        done = run_one_trial(visitor, choice)
         text = json.dumps(report(done), indent=1)
         if options["json"]:
             options["json"].write_text(text, "utf-8")
@@ -270,7 +272,7 @@ def _deployment(robot: str) -> Path:
     return own if own.is_file() else _DEPLOYMENTS / "tabletop.toml"
 
 
-def _announce(path: Path, url: str, logins: list[Login], pids: Mapping[str, int]) -> None:
+def _announce(path: Path, url: str, logins: list[DemoLogin], pids: Mapping[str, int]) -> None:
     """Whole or not at all, and readable by its user alone."""
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     passwords = {login.username: login.password for login in logins}

@@ -9,7 +9,7 @@ from typing import Any
 from django.contrib.auth.models import AnonymousUser
 from django.core.management.base import BaseCommand, CommandError
 
-from evaweb.blinding import EVERYTHING
+from evaweb.blinding import FULL_VISIBILITY
 from evaweb.lab.diagnosis import bundle
 
 
@@ -28,7 +28,7 @@ class Command(BaseCommand):
 
     def handle(self, *args: Any, **options: Any) -> None:
         path = options["out"].expanduser().absolute()
-        sight = EVERYTHING if options["unblinded"] else bundle.sight_for(AnonymousUser())
+        sight = FULL_VISIBILITY if options["unblinded"] else bundle.sight_for(AnonymousUser())
         try:
             notes = bundle.write(path, sight, lambda part: self.stderr.write(f"gathering {part}"))
         except OSError as error:

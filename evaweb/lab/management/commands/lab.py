@@ -12,10 +12,10 @@ from django.core.management.base import BaseCommand, CommandError
 from evaweb.errors import EvaError
 from evaweb.lab import first_account
 from evaweb.lab.benches import Bench
-from evaweb.lab.lab import Lab, a_lab
-from evaweb.lab.lifetime import Ended
+from evaweb.lab.lab import Lab, open_lab
+from evaweb.lab.lifetime import StopRequested
 from evaweb.lab.progress import on_terminal
-from evaweb.lab.seed import nobody_can_log_in
+from evaweb.lab.seed import has_no_accounts
 from evaweb.lab.simulated import benches_of, simulated_options
 
 _FIRST_ACCOUNT = "Nobody can log in yet. Open {url}/first-account/ and type this code:  {code}"
@@ -41,16 +41,16 @@ class Command(BaseCommand):
         benches = [Bench(path.absolute()) for path in options["deployments"]]
         progress = on_terminal(Lab.STEPS + len(benches))
         try:
-            with a_lab(options["host"], options["port"], options["stop_port"], progress) as lab:
-                url = lab.up(benches)
+            with open_lab(options["host"], options["port"], options["stop_port"], progress) as lab:
+                url = lab.start(benches)
                 self.stdout.write(
                     f"EVA Web is at {url}   (data in {settings.DATA_DIR})\nCtrl-C ends everything."
                 )
-                if nobody_can_log_in():
+                if has_no_accounts():
                     self.stdout.write(_FIRST_ACCOUNT.format(url=url.rstrip("/"), code=first_account.offer()))
                 self.stdout.flush()
                 lab.watch(benches_of(options))
-        except Ended:
+        except StopRequested:
             self.stdout.write("ended")
         except EvaError as error:
             raise CommandError(str(error)) from None

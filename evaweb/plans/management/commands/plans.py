@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 from evaweb.errors import EvaError
-from evaweb.plans.exchange import exported, exported_with_pictures, imported
+from evaweb.plans.exchange import export_archive, export_toml, import_file
 from evaweb.plans.models import Plan
 from evaweb.plans.references import unpacked
 from evaweb.trials.models import Checkpoint, Scene
@@ -52,7 +52,7 @@ class Command(BaseCommand):
         except OSError as error:
             raise CommandError(f"{file}: {error}") from error
         text, pictures = unpacked(content)
-        for line in imported(user=user, text=text, pictures=pictures):
+        for line in import_file(user=user, text=text, pictures=pictures):
             self.stdout.write(line)
 
     def _export(self, names: list[str], archive: Path | None) -> None:
@@ -66,9 +66,9 @@ class Command(BaseCommand):
         if not names:
             chosen |= {"scenes": list(Scene.objects.all()), "checkpoints": list(Checkpoint.objects.all())}
         if archive is None:
-            self.stdout.write(exported(**chosen))
+            self.stdout.write(export_toml(**chosen))
             return
         try:
-            archive.write_bytes(exported_with_pictures(**chosen))
+            archive.write_bytes(export_archive(**chosen))
         except OSError as error:
             raise CommandError(f"{archive}: {error}") from error

@@ -23,14 +23,14 @@ from evaweb.results.presentation.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import ends, rate_words
+from evaweb.results.presentation.wording import format_interval, rate_words
 
 _LABELS = 180
 _LETTERS = 22  # of a condition or a failure in a line
 _CELL = 30
 
 
-def grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing | None:
+def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing | None:
     """A row per initial condition, a column per checkpoint: x/n, the darker the more often it succeeded.
 
     `links` by checkpoint and condition lead to those trials.
@@ -74,7 +74,7 @@ def grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing |
     )  # fmt: skip
 
 
-def pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
+def draw_pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
     """Failures of one checkpoint by phase and cause, the most frequent first.
 
     Bars are shares of all its trials, with their intervals as lines. `links` by phase and cause lead to those trials.
@@ -88,7 +88,7 @@ def pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
     parts, said = [_percents(scale, height - 26)], []
     for at, mode in enumerate(arm.failures):
         y, so_far = float(row * at), so_far + mode.count
-        share = f"{mode.count}/{mode.n}, {100 * mode.count / mode.n:.0f} % [{ends(mode.interval)}]"
+        share = f"{mode.count}/{mode.n}, {100 * mode.count / mode.n:.0f} % [{format_interval(mode.interval)}]"
         bar = label(_LABELS - 12, y + 18, mode.words, _LETTERS, "end")
         bar += element(
             "rect", x=scale(0), y=y + 4, width=scale(mode.count / mode.n) - scale(0), height=18.0,

@@ -36,7 +36,7 @@ _LETTERS = 22  # of a milestone or a name in a line
 _LEGEND = 190  # right of a curve
 
 
-def funnel(
+def draw_funnel(
     scene: str, found: Sequence[tuple[int, str, Funnel]], links: Mapping[tuple[str, int], str]
 ) -> Drawing:
     """Of each milestone a bar per checkpoint, each (series, name, its milestones), with its interval as a line.
@@ -91,7 +91,7 @@ def funnel(
     )  # fmt: skip
 
 
-def success_times(arms: Sequence[Arm]) -> Drawing | None:
+def draw_success_times(arms: Sequence[Arm]) -> Drawing | None:
     """Share that has succeeded over time, up to the horizon, with pointwise bands."""
     drawn = [(arm.series, arm, arm.curve) for arm in arms if arm.curve is not None]
     if not drawn:
@@ -137,7 +137,7 @@ def success_times(arms: Sequence[Arm]) -> Drawing | None:
     )  # fmt: skip
 
 
-def evidence(
+def draw_evidence(
     found: Evidence, first: str, second: str, foreseen: int | None = None, drawn: tuple[int, int] = (0, 1)
 ) -> Drawing:
     """The e-processes of both directions pair by pair, on a scale of powers, with the line at which they suffice.

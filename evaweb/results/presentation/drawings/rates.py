@@ -23,7 +23,7 @@ from evaweb.results.presentation.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import points, rate_words
+from evaweb.results.presentation.wording import format_points, rate_words
 from evaweb.statistics.proportions import Proportion
 
 WIDTH = 600
@@ -32,7 +32,9 @@ _LETTERS = 22  # of a name in a line
 _POINTS = 120  # of a violin's outline
 
 
-def intervals(title: str, rows: Sequence[tuple[str, Proportion, str]], order: Mapping[str, int]) -> Drawing:
+def draw_intervals(
+    title: str, rows: Sequence[tuple[str, Proportion, str]], order: Mapping[str, int]
+) -> Drawing:
     """A row each of (name, x of n, address): mark at the rate, band over its 95 % interval, the numbers beside.
 
     `order` says as which series a name is drawn; names without one share the first.
@@ -59,7 +61,7 @@ def intervals(title: str, rows: Sequence[tuple[str, Proportion, str]], order: Ma
     )  # fmt: skip
 
 
-def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
+def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
     """Violins of each checkpoint's rate: the Beta posterior of a uniform prior, all of the same area."""
     row = 64
     height = row * len(arms) + 40
@@ -106,7 +108,7 @@ def violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
     )  # fmt: skip
 
 
-def difference(found: Comparison) -> Drawing:
+def draw_difference(found: Comparison) -> Drawing:
     """The first minus the second in percentage points, with Newcombe's interval, on an axis around nothing."""
     height = 114
     scale = Scale(-1, 1, 30, WIDTH - 30)
@@ -123,7 +125,7 @@ def difference(found: Comparison) -> Drawing:
     low, high = scale(interval.low), scale(interval.high)
     parts.append(element("rect", x=low, y=42.0, width=high - low, height=12.0, class_=f"band {series(None)}"))
     parts.append(mark(None, scale(found.difference.value), 48))
-    said = f"{found.first} minus {found.second}: {points(found.difference)}"
+    said = f"{found.first} minus {found.second}: {format_points(found.difference)}"
     return drawing(
         WIDTH, height, "Difference of the success rates in points", said, *parts, kind="difference",
         columns=("first", "second", "difference", "low", "high"),

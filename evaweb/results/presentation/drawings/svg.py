@@ -10,7 +10,7 @@ from html import escape as html_escape
 from itertools import count
 
 from evaweb.statistics.proportions import Proportion
-from evaweb.tabular_export import csv_lines
+from evaweb.tabular_export import iter_csv
 
 SERIES = 8  # how many the style sheet tells apart; further ones begin again
 LINE = 15.0  # from one line of a label to the next
@@ -53,7 +53,7 @@ def drawing(
     name = f"drawing-{next(_numbers)}"
     inner = "".join(parts)
     role = "group" if "<a " in inner else "img"  # what is one picture has nothing to press in it
-    data = "".join(csv_lines(columns, [[dict(zip(columns, row, strict=True)) for row in rows]]))
+    data = "".join(iter_csv(columns, [[dict(zip(columns, row, strict=True)) for row in rows]]))
     role = "group" if "<a " in inner else "img"  # what is in a picture cannot be pressed
     text = (
         f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" width="{_n(width)}" '

@@ -8,14 +8,14 @@ from django.contrib.auth.models import AnonymousUser
 from django.core.management import CommandError, call_command
 from django.db import OperationalError
 
-from evaweb.blinding import EVERYTHING, HIDDEN, Sight
-from evaweb.jobs.kinds import Work, kind_named
+from evaweb.blinding import FULL_VISIBILITY, HIDDEN, Visibility
+from evaweb.jobs.kinds import JobContext, kind_named
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.lab.diagnosis import bundle, contents
 from evaweb.stations.models import Command, CommandStatus, Station
 
 SECRET = "Zq7-planted-9x"
-BLIND = Sight(
+BLIND = Visibility(
     checkpoints=frozenset({1}),
     names=frozenset({"alder"}),
     stations=frozenset({"bench-1"}),
@@ -69,7 +69,7 @@ def made(folder, sight):
 
 
 def test_no_text_of_it_has_a_secret_and_all_else_is_there(lab):
-    _, texts = made(lab, EVERYTHING)
+    _, texts = made(lab, FULL_VISIBILITY)
     assert [name for name, text in texts.items() if SECRET in text] == []
     assert texts["logs/web.log"].startswith("begin\n")
     assert texts["logs/web.log"].endswith("end\n")
@@ -96,7 +96,7 @@ def test_the_end_of_a_long_log_is_kept_from_a_whole_line_on_and_it_is_said(lab, 
     monkeypatch.setattr(bundle, "LONGEST_LOG", 30)
     lines = "".join(f"line {number}\n" for number in range(100))
     (lab / "logs" / "web.log").write_text(lines)
-    notes, texts = made(lab, EVERYTHING)
+    notes, texts = made(lab, FULL_VISIBILITY)
     assert texts["logs/web.log"] == "line 97\nline 98\nline 99\n"
     assert f"logs/web.log: its last 30 of {len(lines)} bytes" in notes
     assert f"logs/web.log: its last 30 of {len(lines)} bytes" in texts["summary.txt"]
@@ -104,7 +104,7 @@ def test_the_end_of_a_long_log_is_kept_from_a_whole_line_on_and_it_is_said(lab, 
 
 def test_all_logs_together_are_bounded(lab, monkeypatch):
     monkeypatch.setattr(bundle, "LONGEST_LOGS", 10)
-    notes, texts = made(lab, EVERYTHING)
+    notes, texts = made(lab, FULL_VISIBILITY)
     assert sum(len(text) for name, text in texts.items() if name.startswith("logs/")) <= 10
     assert len([note for note in notes if note.startswith("logs/")]) == 2
 
@@ -113,7 +113,7 @@ def test_a_lab_whose_database_is_gone_still_has_a_bundle_and_a_blind_one(lab, mo
     def gone(*given):
         raise OperationalError("no such table")
 
-    monkeypatch.setattr(bundle, "sight_of", gone)
+    monkeypatch.setattr(bundle, "visibility_for_user", gone)
     monkeypatch.setattr(contents, "database", gone)
     monkeypatch.setattr(contents, "station_parts", gone)
     notes, texts = made(lab, bundle.sight_for(AnonymousUser()))
@@ -125,7 +125,7 @@ def test_a_lab_whose_database_is_gone_still_has_a_bundle_and_a_blind_one(lab, mo
 
 
 def test_the_summary_is_a_page_that_needs_nothing_from_elsewhere(lab):
-    page = made(lab, EVERYTHING)[1]["summary.html"]
+    page = made(lab, FULL_VISIBILITY)[1]["summary.html"]
     assert "<script" not in page
     assert "http" not in page
     assert "<a href='stations/bench-1/state.json'>" in page
@@ -139,7 +139,7 @@ def test_the_command_is_as_blind_as_who_has_looked_behind_nothing(lab, monkeypat
     monkeypatch.setattr(bundle, "sight_for", lambda user: user)
     call_command("diagnose", out=tmp_path / "a.zip")
     call_command("diagnose", out=tmp_path / "b.zip", unblinded=True)
-    assert seen == [AnonymousUser(), EVERYTHING]
+    assert seen == [AnonymousUser(), FULL_VISIBILITY]
 
 
 def test_a_folder_that_cannot_be_written_is_named(lab, tmp_path):
@@ -152,7 +152,7 @@ def test_the_job_leaves_three_bundles_for_who_asked_and_nobody_else(lab, alma, a
     told = []
     for number in range(4):
         name = f"eva-diagnosis-20260101-00000{number}.zip"
-        done = kind_named("diagnose")(Work({"user": alma.pk, "name": name}, told.append))
+        done = kind_named("diagnose")(JobContext({"user": alma.pk, "name": name}, told.append))
     assert done["bytes"] > 1000
     assert "gathering logs" in told
     client.force_login(alma)
@@ -169,13 +169,13 @@ def test_a_bundle_of_another_administrator_is_not_given(lab, alma, client):
     from tests.evaweb.conftest import person
 
     name = "eva-diagnosis-20260101-000000.zip"
-    kind_named("diagnose")(Work({"user": alma.pk, "name": name}, lambda part: None))
+    kind_named("diagnose")(JobContext({"user": alma.pk, "name": name}, lambda part: None))
     client.force_login(person("ada", "admin"))
     assert client.get(f"/setup/diagnosis/{name}").status_code == 404
 
 
 def test_the_button_asks_for_one_and_the_page_says_how_far_it_is(lab, alma, client, monkeypatch):
-    monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
+    monkeypatch.setattr("evaweb.jobs.doorbell.notify_workers", lambda queue: True)
     client.force_login(alma)
     assert client.post("/setup/diagnosis/").status_code == 302
     job = Job.objects.get(kind="diagnose")

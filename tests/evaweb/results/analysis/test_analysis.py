@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from evaweb.results.analysis.analysis import Standing, Verdict, analyse
-from evaweb.results.analysis.outcomes import Outcome, paired
+from evaweb.results.analysis.outcomes import Outcome, pair_by_block
 from evaweb.statistics.proportions import clopper_pearson
 
 LABELS = ("held", "lifted", "on the plate")
@@ -61,7 +61,7 @@ def test_the_better_one_comes_first_with_everything_that_is_said_of_it():
 
 def test_a_comparison_has_all_its_evidence():
     found = analyse(trials({"old": 0.4, "new": 0.9}), planned={("old", "new"): DECIDED})
-    compared = found.compared("new", "old")
+    compared = found.comparison_of("new", "old")
     assert (compared.first, compared.second) == ("old", "new")
     assert compared.difference.value < 0
     assert compared.difference.interval.high < 0
@@ -83,7 +83,7 @@ def test_a_planned_comparison_whose_design_has_not_ended_is_described_and_nothin
     found = analyse(
         trials({"old": 0.4, "new": 0.9, "other": 0.1}), planned={("old", "new"): Verdict(evidence=evidence)}
     )
-    of_it = found.compared("old", "new")
+    of_it = found.comparison_of("old", "new")
     assert of_it.standing is Standing.OPEN
     assert of_it.difference.interval.high < 0
     for name in ("test", "corrected", "better", "paired", "scored", "anytime", "score_anytime", "sooner"):
@@ -93,7 +93,7 @@ def test_a_planned_comparison_whose_design_has_not_ended_is_described_and_nothin
         evidence != "score",
     )
     assert found.letters == {}
-    beside = found.compared("other", "new")
+    beside = found.comparison_of("other", "new")
     assert (beside.standing, beside.corrected < 0.001) == (Standing.UNPLANNED, True)
 
 
@@ -131,7 +131,7 @@ def test_nine_of_ten_are_sooner_than_five_of_ten_that_gave_up_early():
     found = analyse(first + second, planned={("A", "B"): DECIDED}, limits={"cups": 40.0, "plates": 60.0})
     assert found.arm("A").mean_time.value == pytest.approx(22.0)
     assert found.arm("B").mean_time.value == pytest.approx(25.0)
-    sooner = found.comparisons[0].sooner
+    sooner = found.comparisons[0].time_test
     assert (sooner.pairs, sooner.value) == (10, pytest.approx(-3.0))
     assert sooner.p > 0.05
 
@@ -150,8 +150,8 @@ def test_one_horizon_for_all_is_the_smallest_limit_or_the_longest_run():
 def test_a_time_that_is_not_known_has_no_part_in_who_is_sooner():
     runs = timed("A", [(True, None), (True, 5.0)]) + timed("B", [(True, 9.0), (True, 9.0)])
     found = analyse(runs, planned={("A", "B"): DECIDED})
-    assert (found.comparisons[0].sooner.pairs, found.comparisons[0].sooner.value) == (1, -4.0)
-    assert analyse(timed("A", [(True, None)]) + timed("B", [(True, None)])).comparisons[0].sooner is None
+    assert (found.comparisons[0].time_test.pairs, found.comparisons[0].time_test.value) == (1, -4.0)
+    assert analyse(timed("A", [(True, None)]) + timed("B", [(True, None)])).comparisons[0].time_test is None
 
 
 def test_three_checkpoints_are_corrected_for_three_comparisons():
@@ -189,7 +189,7 @@ def test_several_scenes_are_stratified_and_a_reversal_is_seen():
         for i, (block, name, scene, ok) in enumerate(easy + hard)
     ]
     found = analyse(outcomes)
-    compared = found.compared("a", "b")
+    compared = found.comparison_of("a", "b")
     assert compared.stratified.reversed
     assert "2 of 2 initial conditions were not tried equally often" in found.notes[0]
     assert found.arm("a").macro.value > found.arm("b").macro.value
@@ -220,7 +220,7 @@ def test_pairs_are_in_the_order_in_which_they_were_completed():
 
     first = [one("a", "x", 0), one("a", "y", 1)]
     second = [one("b", "y", 2), one("b", "x", 3)]
-    assert [pair.first.block for pair in paired(first, second)] == ["y", "x"]
+    assert [pair.first.block for pair in pair_by_block(first, second)] == ["y", "x"]
 
 
 def test_pairs_of_a_plan_are_in_the_order_of_its_blocks_whichever_station_was_faster():
@@ -229,7 +229,7 @@ def test_pairs_of_a_plan_are_in_the_order_of_its_blocks_whichever_station_was_fa
 
     first = [one("a", 9, 1), one("a", 10, 0)]
     second = [one("b", 10, 2), one("b", 9, 3)]
-    assert [pair.first.block for pair in paired(first, second)] == ["9", "10"]
+    assert [pair.first.block for pair in pair_by_block(first, second)] == ["9", "10"]
 
 
 def test_what_cannot_be_computed_says_why():

@@ -9,10 +9,10 @@ from django.db import connection
 from django.test import Client
 from django.test.utils import CaptureQueriesContext
 
-from evaweb.plans.allocation import give_back, hand_out
-from evaweb.plans.blinding_rules import look
+from evaweb.plans.allocation import allocate_trial, release_slots
+from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
-from evaweb.plans.services import plan_amend, plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
 from evaweb.results.analysis.conduct import balance
 from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.stations.models import Station
@@ -30,8 +30,8 @@ def make(bench, request):
     """Makes the next trial: `wait` [s] from hand-out to run by checkpoint."""
 
     def one(wait=None, success=None, user=bench.operator, station=bench.station, plan=None, **facts):
-        trial = hand_out(user=user, station=station, plan=plan or request.getfixturevalue("plan")).trial
-        builders.over(trial, 9.0, **facts)
+        trial = allocate_trial(user=user, station=station, plan=plan or request.getfixturevalue("plan")).trial
+        builders.finished_trial(trial, 9.0, **facts)
         name = trial.checkpoint.name
         seconds = (wait or {}).get(name, 10 + trial.number % 2)
         begun = trial.handout.handed_at + timedelta(seconds=seconds)
@@ -41,7 +41,7 @@ def make(bench, request):
         )
         trial.refresh_from_db()
         ok = name == NEW if success is None else success
-        services.trial_score(user=user, trial=trial, milestones=bench.ticks(True, ok, ok))
+        services.score_trial(user=user, trial=trial, milestones=bench.ticks(True, ok, ok))
         trial.refresh_from_db()
         return trial
 
@@ -89,13 +89,13 @@ def test_voids_have_who_asked_and_who_answered(bench, plan, make):
     asked, refused, alone = (
         make(),
         make(),
-        hand_out(user=bench.operator, station=bench.station, plan=plan).trial,
+        allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial,
     )
     for trial, agree in ((asked, True), (refused, False)):
-        voids.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
-        voids.void_answer(user=second, trial=trial, agree=agree, reason="it had not" if not agree else "")
-    builders.over(alone, 9.0)
-    voids.trial_void(user=bench.operator, trial=alone, reason="no light")
+        voids.void_trial(user=bench.operator, trial=trial, reason="the plate had slipped")
+        voids.answer_void(user=second, trial=trial, agree=agree, reason="it had not" if not agree else "")
+    builders.finished_trial(alone, 9.0)
+    voids.void_trial(user=bench.operator, trial=alone, reason="no light")
     rows = {row["trial_id"]: row for row in integrity_document(plan)["voids"]}
     assert (rows[asked.pk]["by_name"], rows[asked.pk]["answered_by_name"]) == ("ann", "sam")
     assert rows[asked.pk]["answer"] == "agreed"
@@ -106,12 +106,12 @@ def test_voids_have_who_asked_and_who_answered(bench, plan, make):
 
 def test_corrections_are_told_before_and_after_the_reveal(bench, plan, owner, make):
     first, second = make(success=True), make(success=False)
-    services.trial_score(
+    services.score_trial(
         user=bench.operator, trial=first, milestones=bench.ticks(True, False, False), reason="it slipped off"
     )
-    plan_close(user=owner, plan=plan, reason="enough")
-    plan_reveal(user=owner, plan=plan)
-    services.trial_score(
+    close_plan(user=owner, plan=plan, reason="enough")
+    reveal_plan(user=owner, plan=plan)
+    services.score_trial(
         user=bench.operator, trial=second, milestones=bench.ticks(True, True, True), reason="on the video"
     )
     plan.refresh_from_db()
@@ -130,13 +130,13 @@ def test_corrections_are_told_before_and_after_the_reveal(bench, plan, owner, ma
 
 def test_categories_and_notes_that_are_corrected_after_the_reveal_change_no_score(bench, plan, owner, make):
     first, second = make(success=False), make(success=False)
-    plan_close(user=owner, plan=plan, reason="enough")
-    plan_reveal(user=owner, plan=plan)
+    close_plan(user=owner, plan=plan, reason="enough")
+    reveal_plan(user=owner, plan=plan)
     for trial in (first, second):
         trial_failure(user=bench.operator, trial=trial, failure="slid")
     ticks = bench.ticks(True, False, False)
     said = {"failure": "slid", "note": "to the left", "reason": "a word more"}
-    services.trial_score(user=bench.operator, trial=first, milestones=ticks, **said)
+    services.score_trial(user=bench.operator, trial=first, milestones=ticks, **said)
     plan.refresh_from_db()
     record = integrity_document(plan)
     assert [(row["changed"], row["late"]) for row in record["corrections"]] == [
@@ -149,7 +149,7 @@ def test_categories_and_notes_that_are_corrected_after_the_reveal_change_no_scor
     assert [row["late"] for row in record["checkpoints"]] == [0, 0]
     # Milestones that come to the same points are another verdict.
     ticks = bench.ticks(False, True, False)
-    services.trial_score(user=bench.operator, trial=first, milestones=ticks, reason="on the video")
+    services.score_trial(user=bench.operator, trial=first, milestones=ticks, reason="on the video")
     assert "1 score came after the reveal" in integrity_document(plan)["remarks"]
 
 
@@ -176,9 +176,9 @@ def test_balance_is_that_of_operators_and_not_of_what_was_tried_more_often(made,
 
 def test_looks_and_amendments_are_named(plan, owner, make):
     make()
-    look(plan, owner)
-    plan_close(user=owner, plan=plan, reason="too dark")
-    plan_amend(user=owner, plan=plan, reason="a brighter lamp")
+    record_unblinding(plan, owner)
+    close_plan(user=owner, plan=plan, reason="too dark")
+    amend_plan(user=owner, plan=plan, reason="a brighter lamp")
     found = integrity_document(plan)
     assert [row["by_name"] for row in found["looks"]] == ["olga"]
     assert found["amendments"] == [{"version": 2, "amends": 1, "because": "a brighter lamp"}]
@@ -188,7 +188,7 @@ def test_looks_and_amendments_are_named(plan, owner, make):
 def test_blocks_that_were_split_or_handed_out_of_turn_are_counted(bench, plan, make):
     other, sam = Station.objects.create(name="bench-2", robot="agilex_piper", boot="b"), builders.user("sam")
     make()
-    give_back(user=bench.operator, plan=plan, station=bench.station, reason="the arm broke")
+    release_slots(user=bench.operator, plan=plan, station=bench.station, reason="the arm broke")
     make(station=other, user=sam)
     found = integrity_document(plan)
     assert found["deviations"]["split_stations"] == found["deviations"]["split_operators"] == [0]
@@ -235,9 +235,9 @@ def test_what_the_headline_would_be_without_an_operator(bench, plan, make):
 
 
 def test_repetitions_and_benches_below_the_least_match_are_left_out(bench, plan, make):
-    again = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-    builders.over(again, 9.0)
-    voids.trial_void(user=bench.operator, trial=again, reason="no light")
+    again = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+    builders.finished_trial(again, 9.0)
+    voids.void_trial(user=bench.operator, trial=again, reason="no light")
     trials = [make() for _ in range(16)]
     plan.document["match_gate"] = 0.8
     for trial, match in ((trials[2], 0.9), (trials[4], 0.5)):
@@ -251,7 +251,7 @@ def test_repetitions_and_benches_below_the_least_match_are_left_out(bench, plan,
 def test_nothing_is_left_out_of_a_design_that_did_not_end(plan, owner, make):
     make()
     make()
-    plan_close(user=owner, plan=plan, reason="enough")
+    close_plan(user=owner, plan=plan, reason="enough")
     plan.refresh_from_db()
     assert not any(what.startswith("without") for what in ways(plan))
     assert "before the design ended" in ways(plan)["as it was decided"]["sentence"]
@@ -268,7 +268,7 @@ def test_the_page_and_the_program_have_it_once_the_plan_is_revealed_and_not_befo
     assert NEW not in page
     assert client.get("/api/v1/plans/blocks/1/integrity").status_code == 403
     plan.refresh_from_db()
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     page = client.get(ADDRESS).content.decode()
     for words in ("What the headline would be", "Delays of pi0-new and pi0-block differ", "Balanced"):
         assert words in page, words
@@ -301,7 +301,7 @@ def test_what_ran_below_the_least_match_is_told_by_its_worst_region_when_last_lo
     drafted = Plan.objects.create(name="gated", title="Gated", owner=owner, match_gate=0.75)
     drafted.checkpoints.set([bench.checkpoint])
     drafted.positions.set(bench.scene.positions.all())
-    plan = plan_freeze(user=owner, plan=drafted)
+    plan = freeze_plan(user=owner, plan=drafted)
     for number in range(2):
         trial = make(plan=plan)
         references = [

@@ -2,10 +2,10 @@
 
 import pytest
 
-from evaweb.plans.allocation import hand_out
-from evaweb.plans.services import plan_close, plan_reveal
-from evaweb.results.analysis.filters import Chosen
-from evaweb.results.analysis.integrity import changes_of
+from evaweb.plans.allocation import allocate_trial
+from evaweb.plans.services import close_plan, reveal_plan
+from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.pages.pages import summary_page
 from evaweb.results.presentation.headline import headline
 from evaweb.trials import services, voids
@@ -19,10 +19,10 @@ def tried(bench, plan):
     """Makes the next trial and scores it."""
 
     def one(success, **said):
-        trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
-        builders.over(trial, 9.0)
+        trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
+        builders.finished_trial(trial, 9.0)
         ticks = bench.ticks(True, success, success)
-        services.trial_score(user=bench.operator, trial=trial, milestones=ticks, **said)
+        services.score_trial(user=bench.operator, trial=trial, milestones=ticks, **said)
         trial.refresh_from_db()
         return trial
 
@@ -35,11 +35,11 @@ def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_chan
     for left in range(16, 0, -1):
         trial = tried(success=False)
         if trial.checkpoint.name == NEW and left > 1:  # the last one ends the plan
-            voids.trial_void(user=bench.operator, trial=trial, reason="the plate had slipped")
-            voids.void_answer(user=second, trial=trial, agree=True)
+            voids.void_trial(user=bench.operator, trial=trial, reason="the plate had slipped")
+            voids.answer_void(user=second, trial=trial, agree=True)
             tried(success=True)
             voided += 1
-    found = {row.checkpoint: row for row in changes_of(plan)}
+    found = {row.checkpoint: row for row in checkpoint_changes(plan)}
     assert (found[NEW].voided_failures, found[NEW].voided_successes, found[NEW].voided) == (voided, 0, voided)
     assert (found[OLD].voided, found[OLD].attempts, found[OLD].counted) == (0, 8, 8)
     assert (found[NEW].attempts, found[NEW].counted) == (8 + voided, 8)
@@ -52,13 +52,13 @@ def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_chan
 @pytest.mark.exhaustive
 def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_have_been(bench, plan, tried):
     for left in range(16, 0, -1):
-        thrown = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+        thrown = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
         new = thrown.checkpoint.name == NEW
         if new and left > 4:
-            builders.over(thrown, 9.0)
-            voids.trial_void(user=bench.operator, trial=thrown, reason="the plate had slipped")
+            builders.finished_trial(thrown, 9.0)
+            voids.void_trial(user=bench.operator, trial=thrown, reason="the plate had slipped")
         else:
-            services.trial_abandon(user=bench.operator, trial=thrown)  # it never ran: it cannot have failed
+            services.abandon_trial(user=bench.operator, trial=thrown)  # it never ran: it cannot have failed
         tried(success=new)
     said = headline(plan)
     assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: 8/8 against 0/8")
@@ -74,13 +74,13 @@ def test_where_nothing_was_voided_there_is_one_sentence(plan, tried):
 def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan, owner, tried):
     first, second = tried(success=True), tried(success=False)
     ticks = bench.ticks(True, False, False)
-    services.trial_score(user=bench.operator, trial=first, milestones=ticks, reason="it had slipped off")
-    plan_close(user=owner, plan=plan, reason="enough")
-    plan_reveal(user=owner, plan=plan)
+    services.score_trial(user=bench.operator, trial=first, milestones=ticks, reason="it had slipped off")
+    close_plan(user=owner, plan=plan, reason="enough")
+    reveal_plan(user=owner, plan=plan)
     ticks = bench.ticks(True, True, True)
-    services.trial_score(user=bench.operator, trial=second, milestones=ticks, reason="seen on the video")
+    services.score_trial(user=bench.operator, trial=second, milestones=ticks, reason="seen on the video")
     plan.refresh_from_db()
-    rows = {row.checkpoint: row for row in changes_of(plan)}
+    rows = {row.checkpoint: row for row in checkpoint_changes(plan)}
     one, other = rows[first.checkpoint.name], rows[second.checkpoint.name]
     assert (one.to_failure, one.to_success, one.late) == (1, 0, 0)
     assert (other.to_failure, other.to_success, other.late) == (0, 1, 1)
@@ -89,11 +89,11 @@ def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan
 
 def test_the_page_says_that_the_plan_was_closed_as_soon_as_it_is(plan, owner, tried):
     def sentence():
-        return summary_page(plan, Chosen())["headline"].sentence
+        return summary_page(plan, TrialFilter())["headline"].sentence
 
     tried(success=True)
     tried(success=False)
     assert "the design goes on" in sentence()
-    plan_close(user=owner, plan=plan, reason="enough")
+    close_plan(user=owner, plan=plan, reason="enough")
     assert "closed after 1 of 8 pairs, before the design ended" in sentence()
-    assert [row.attempts for row in summary_page(plan, Chosen())["changes"]] == [1, 1]
+    assert [row.attempts for row in summary_page(plan, TrialFilter())["changes"]] == [1, 1]

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from django.test import Client
 
-from evaweb.api.tokens import token_create
+from evaweb.api.tokens import create_token
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze
+from evaweb.plans.services import close_plan, freeze_plan
 from evaweb.results.analysis.simulated import is_simulated, set_beside, simulated_plans
 from evaweb.stations.models import Station
 from tests.evaweb.results.conftest import _carried_out
@@ -28,7 +28,7 @@ def played(revealed, bench, owner):
     made.positions.set(revealed.positions.all())
     made.first, made.second = revealed.first, revealed.second
     made.save()
-    plan = plan_freeze(user=owner, plan=made)
+    plan = freeze_plan(user=owner, plan=made)
     station = Station.objects.create(name="sim-1", robot="agilex_piper", simulated=True)
     _carried_out(replace(bench, station=station), plan, 16, pictures=False)
     plan.refresh_from_db()
@@ -56,12 +56,12 @@ def test_page_and_rest_show_those_that_the_reader_may_see(revealed, played, owne
     text = client.get(PAGE).content.decode()
     assert "Played v1" in text
     assert "needs eight matched trials of each, five successes and five failures" in text
-    bearer = Client(headers={"Authorization": f"Bearer {token_create(user=owner, name='x')}"})
+    bearer = Client(headers={"Authorization": f"Bearer {create_token(user=owner, name='x')}"})
     (row,) = bearer.get("/api/v1/plans/blocks/1/simulated").json()
     assert (row["plan"], row["checkpoints"]["pi0-new"]["simulated"]["n"]) == ("played", 8)
     again = Plan.objects.create(name="blind", title="Blind", question="?", owner=owner, repetitions=1)
     again.checkpoints.set(revealed.checkpoints.all())
     again.positions.set(revealed.positions.all())
-    plan_close(user=owner, plan=plan_freeze(user=owner, plan=again), reason="it hides its checkpoints")
+    close_plan(user=owner, plan=freeze_plan(user=owner, plan=again), reason="it hides its checkpoints")
     assert "Played" not in client.get(PAGE).content.decode()
     assert bearer.get("/api/v1/plans/blocks/1/simulated").status_code == 403

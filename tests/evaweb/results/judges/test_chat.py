@@ -16,16 +16,28 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import NameOID
 
 from evaweb.errors import EvaError
-from evaweb.results.judges.base import Case, NoVerdict, Said, Setup, Step, Still, Verdict
+from evaweb.results.judges.base import (
+    CaseJudgement,
+    MilestoneJudgement,
+    MilestonePrompt,
+    NoVerdict,
+    Setup,
+    StillImage,
+    TrialCase,
+)
 from evaweb.results.judges.chat import LARGEST_ANSWER, build, endpoint_of
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.results.judges.server import http, message, said, serving
 
-CASE = Case(
+CASE = TrialCase(
     "put the block on the plate",
     "the block rests on the plate",
-    (Step("held"), Step("on the plate", 20.0)),
-    (Still("camera 1", 0.0, jpeg(1)), Still("camera 1", 7.5, jpeg(2)), Still("camera 2", 0.0, jpeg(3))),
+    (MilestonePrompt("held"), MilestonePrompt("on the plate", 20.0)),
+    (
+        StillImage("camera 1", 0.0, jpeg(1)),
+        StillImage("camera 1", 7.5, jpeg(2)),
+        StillImage("camera 2", 0.0, jpeg(3)),
+    ),
 )
 GOOD = said((2, "not reached", 0.25), (1, "reached", 1))
 KEY = "sk-canary-71"
@@ -43,12 +55,14 @@ def asked(play, **setup):
 
 def test_a_verdict_of_each_milestone_comes_back_with_the_model_that_answered():
     verdict, _ = asked(GOOD)
-    assert verdict == Verdict((Said(True, 1.0), Said(False, 0.25)), "seer-2026-11-01")
+    assert verdict == CaseJudgement(
+        (MilestoneJudgement(True, 1.0), MilestoneJudgement(False, 0.25)), "seer-2026-11-01"
+    )
 
 
 def test_no_verdict_on_one_milestone_is_none_and_the_others_stand():
     verdict, _ = asked(said((1, "no verdict", None), (2, "reached", 0.9)))
-    assert verdict.milestones == (Said(), Said(True, 0.9))
+    assert verdict.milestones == (MilestoneJudgement(), MilestoneJudgement(True, 0.9))
 
 
 def test_what_is_sent_is_the_question_and_the_pictures(monkeypatch):

@@ -7,10 +7,17 @@ import pytest
 
 from evaweb.errors import EvaError
 from evaweb.results import judges
-from evaweb.results.judges.base import Case, NoVerdict, Said, Setup, Step, Verdict
-from evaweb.results.judges.finding import built
+from evaweb.results.judges.base import (
+    CaseJudgement,
+    MilestoneJudgement,
+    MilestonePrompt,
+    NoVerdict,
+    Setup,
+    TrialCase,
+)
+from evaweb.results.judges.finding import build_judge
 
-CASE = Case("put it there", "", (Step("held"), Step("there")), truth=(True, None))
+CASE = TrialCase("put it there", "", (MilestonePrompt("held"), MilestonePrompt("there")), truth=(True, None))
 
 
 @pytest.fixture
@@ -23,30 +30,33 @@ def plug_in(monkeypatch):
         module.SEES, module.SERVED, module.build = "pictures", False, lambda setup: one()
         monkeypatch.setitem(sys.modules, "odd_judge", module)
         monkeypatch.setitem(judges.KINDS, "odd", "odd_judge")
-        return built("mine", "odd", Setup())
+        return build_judge("mine", "odd", Setup())
 
     return make
 
 
 def test_the_two_that_come_with_the_product_are_found_by_name():
-    bench, chat = built("b", "bench", Setup()), built("c", "chat", Setup("https://judge.example", "seer"))
+    bench, chat = (
+        build_judge("b", "bench", Setup()),
+        build_judge("c", "chat", Setup("https://judge.example", "seer")),
+    )
     assert [(one.pictures, one.served, one.version) for one in (bench, chat)] == [
         (False, False, "bench 1"),
         (True, True, "chat 1, seer"),
     ]
     with pytest.raises(EvaError, match="judge x: kind = 'none'; allowed: bench, chat"):
-        built("x", "none", Setup())
+        build_judge("x", "none", Setup())
 
 
 def test_the_bench_is_certain_of_what_it_reports_and_silent_about_the_rest():
-    bench = built("b", "bench", Setup())
-    assert bench.asked(CASE).milestones == (Said(True, 1.0), Said())
+    bench = build_judge("b", "bench", Setup())
+    assert bench.judge_case(CASE).milestones == (MilestoneJudgement(True, 1.0), MilestoneJudgement())
     with pytest.raises(NoVerdict, match="reports none"):
-        bench.asked(Case("", "", (Step("held"),), truth=(None,)))
+        bench.judge_case(TrialCase("", "", (MilestonePrompt("held"),), truth=(None,)))
 
 
 def test_a_judge_of_somebodys_own_joins_by_its_name(plug_in):
-    verdict = Verdict((Said(True, 0.5), Said(False, 0.5)))
+    verdict = CaseJudgement((MilestoneJudgement(True, 0.5), MilestoneJudgement(False, 0.5)))
     assert plug_in(lambda self, case: verdict).asked(CASE) == verdict
 
 
@@ -57,7 +67,7 @@ def test_one_that_fails_is_named(plug_in):
     with pytest.raises(EvaError, match=r"^judge mine: KeyError: 'weights'$"):
         plug_in(fails).asked(CASE)
     with pytest.raises(EvaError, match=r"^judge mine: 1 verdicts on 2 milestones$"):
-        plug_in(lambda self, case: Verdict((Said(),))).asked(CASE)
+        plug_in(lambda self, case: CaseJudgement((MilestoneJudgement(),))).asked(CASE)
 
 
 def test_one_that_cannot_be_loaded_is_named_with_its_file(monkeypatch):
@@ -65,7 +75,7 @@ def test_one_that_cannot_be_loaded_is_named_with_its_file(monkeypatch):
     with pytest.raises(
         EvaError, match=r"judge mine: .*kind 'gone' cannot be loaded: .*gone\.py: ModuleNotFound"
     ):
-        built("mine", "gone", Setup())
+        build_judge("mine", "gone", Setup())
 
 
 @pytest.mark.parametrize(
@@ -73,4 +83,4 @@ def test_one_that_cannot_be_loaded_is_named_with_its_file(monkeypatch):
 )
 def test_a_word_that_cannot_be_is_none(said):
     with pytest.raises(ValueError, match=r"probability|contradicts"):
-        Said(*said)
+        MilestoneJudgement(*said)

@@ -9,7 +9,7 @@ from django.urls import reverse
 
 from evaweb.plans.counting import ENDS
 from evaweb.plans.models import Plan, PlanState
-from evaweb.plans.services import plan_amend
+from evaweb.plans.services import amend_plan
 from evaweb.results.analysis import power
 from evaweb.statistics.score_courses import Scores, score_course
 from evaweb.trials.models import Checkpoint
@@ -219,7 +219,7 @@ def test_an_operator_writes_the_draft_that_is_theirs_and_no_other(as_, alma, ver
 
 def test_checkpoints_that_are_hidden_are_not_told_and_stay(as_, bench, plan, owner):
     """The draft of an amendment of a plan that is blind for its own owner."""
-    amended = plan_amend(user=owner, plan=plan, reason="more positions")
+    amended = amend_plan(user=owner, plan=plan, reason="more positions")
     client = as_(owner)
     text = client.get(address(amended)).content.decode()
     names = [row.name for row in plan.checkpoints.all()]
@@ -260,13 +260,13 @@ def test_the_power_is_that_of_the_draft_at_the_rates_that_are_assumed(as_, alma,
     )
     filled(client, draft, bench, two)
     text = asked(client, draft, rate="0.2", better="0.9", cycle_s="600")
-    expected = power.course("none", 6, 0.9, 0.2, 0.05).power
+    expected = power.design_power("none", 6, 0.9, 0.2, 0.05).power
     assert f"{100 * expected:.0f} of 100" in text
     assert "6 trials of each" in text
     assert "<dd>2.0</dd>" in text  # hours: 12 trials of ten minutes
     was, form = shown(client, draft)
     saved(client, draft, was, form | {"repetitions": 20})
-    assert f"{100 * power.course('none', 40, 0.9, 0.2, 0.05).power:.0f} of 100" in asked(
+    assert f"{100 * power.design_power('none', 40, 0.9, 0.2, 0.05).power:.0f} of 100" in asked(
         client, draft, rate="0.2", better="0.9"
     )
     assert "rate and better are both 0.5" in asked(client, draft, rate="0.5", better="0.5")

@@ -15,7 +15,7 @@ from evaweb import computing
 from evaweb.computing import Questions
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
-from evaweb.plans.services import plan_close
+from evaweb.plans.services import close_plan
 from evaweb.results.analysis import caching
 from evaweb.results.presentation.facts import comparison_facts
 from evaweb.results.ratings import judging
@@ -119,7 +119,7 @@ def test_closed_and_revealed_on_the_page(plan, owner, carry_out, as_, viewer):
 
 def test_the_page_says_the_comparison_with_n_and_interval(revealed, as_, viewer):
     text = as_(viewer).get(PLAN).content.decode()
-    found = caching.analysis_of(revealed).comparisons[0]
+    found = caching.cached_analysis(revealed).comparisons[0]
     assert f"difference {100 * found.difference.value:.0f} points [" in text
     for method in (
         "Newcombe",
@@ -150,14 +150,14 @@ def test_the_page_says_the_comparison_with_n_and_interval(revealed, as_, viewer)
 def test_of_several_intervals_the_plans_own_is_marked(revealed, rule, outcome, own):
     revealed.stopping = rule
     revealed.document["stopping"] |= {"rule": rule, "outcome": outcome}
-    analysis = caching.analysis_of(revealed)
+    analysis = caching.cached_analysis(revealed)
     facts = comparison_facts(revealed, analysis, analysis.comparisons[0])["facts"]
     assert [fact.question for fact in facts if fact.own] == own
 
 
 def test_every_number_leads_to_its_trials(revealed, as_, viewer):
     client = as_(viewer)
-    arm = caching.analysis_of(revealed).arms[0]
+    arm = caching.cached_analysis(revealed).arms[0]
     listed = client.get(f"{PLAN}trials/?checkpoint={arm.checkpoint}&success=yes")
     assert f'<span class="muted">{arm.success.successes} trial' in listed.content.decode()
     failed = client.get(f"{PLAN}trials/?failure=%3Ddropped&success=no").content.decode()
@@ -179,7 +179,7 @@ def test_every_count_of_failures_leads_to_its_trials_and_all_failures_are_counte
     said = [{"failure_phase": "grasp", "failure": "dropped"}, {"failure_phase": "approach"}, {}]
     for trial, given in zip(failed, said, strict=False):
         ticks = bench.ticks(True, False, False)
-        services.trial_score(
+        services.score_trial(
             user=bench.operator, trial=trial, milestones=ticks, reason="on the video", **given
         )
     client = as_(viewer)
@@ -256,33 +256,33 @@ def test_a_correction_and_a_void_are_seen_at_once(plan, owner, bench, carry_out,
     client = as_(owner)
     client.post(f"{PLAN}look")
     assert "15/16" in client.get(PLAN).content.decode()
-    before = caching.analysis_of(plan)
-    assert caching.analysis_of(plan) is before
+    before = caching.cached_analysis(plan)
+    assert caching.cached_analysis(plan) is before
     trial = plan.handouts.first().trial
     flipped = not trial.verdict.success
-    services.trial_score(
+    services.score_trial(
         user=bench.operator,
         trial=trial,
         milestones=bench.ticks(True, flipped, flipped),
         reason="seen on the video",
     )
-    after = caching.analysis_of(plan)
+    after = caching.cached_analysis(plan)
     assert sum(a.success.successes for a in after.arms) != sum(a.success.successes for a in before.arms)
-    voids.trial_void(user=bench.operator, trial=plan.handouts.last().trial, reason="a camera had moved")
-    assert caching.analysis_of(plan).n == 14
+    voids.void_trial(user=bench.operator, trial=plan.handouts.last().trial, reason="a camera had moved")
+    assert caching.cached_analysis(plan).n == 14
     Checkpoint.objects.filter(name="pi0-new").update(name="renamed")
     plan.refresh_from_db()
-    assert "renamed" in {arm.checkpoint for arm in caching.analysis_of(plan).arms}
+    assert "renamed" in {arm.checkpoint for arm in caching.cached_analysis(plan).arms}
 
 
 def test_another_blind_plan_of_the_same_checkpoint_hides_the_results(revealed, owner, bench, as_, viewer):
     from evaweb.plans.models import Plan
-    from evaweb.plans.services import plan_freeze
+    from evaweb.plans.services import freeze_plan
 
     again = Plan.objects.create(name="again", title="Again", owner=owner)
     again.checkpoints.set(revealed.checkpoints.all())
     again.positions.set(bench.scene.positions.all())
-    plan_freeze(user=owner, plan=again)
+    freeze_plan(user=owner, plan=again)
     text = as_(viewer).get(PLAN).content.decode()
     assert "compared blind in Again v1" in text
     assert "ask its owner, olga, or an administrator to close and reveal it" in text
@@ -298,11 +298,11 @@ def test_another_blind_plan_of_the_same_checkpoint_hides_the_results(revealed, o
     apart = Plan.objects.create(name="apart", title="Apart", owner=owner)
     apart.checkpoints.set([third])
     apart.positions.set(bench.scene.positions.all())
-    plan_freeze(user=owner, plan=apart)
+    freeze_plan(user=owner, plan=apart)
     both = as_(viewer).get(PLAN).content.decode()
     assert "compared blind in one or more of Again v1, Apart v1" in both  # which of them is not said
     assert "pi0-third" not in both
-    plan_close(user=owner, plan=again, reason="not now")
+    close_plan(user=owner, plan=again, reason="not now")
 
 
 def test_what_is_wide_on_the_labs_page_scrolls_by_itself(plan, bench, carry_out, as_):
@@ -329,7 +329,7 @@ def test_queries_do_not_grow_with_trials(plan, owner, carry_out, as_):
     client.post(f"{PLAN}look")
 
     def asked():
-        caching.forget()
+        caching.clear_caches()
         found = []
         for address in (PLAN, f"{PLAN}compare/", f"{PLAN}trials/", "/result/lab/", "/result/plans/"):
             with CaptureQueriesContext(connection) as captured:
@@ -356,7 +356,7 @@ def test_rating_again_shows_the_code_and_nothing_that_was_said(plan, carry_out, 
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    handout, _ = judging.to_rate(rater)[:2]
+    handout, _ = judging.next_to_rate(rater)[:2]
     text = client.get("/result/rate/").content.decode()
     assert handout.code in text
     for secret in ("pi0-new", "pi0-block", "=dropped", f"/result/trials/{handout.trial_id}"):
@@ -375,7 +375,7 @@ def test_a_rating_that_is_refused_keeps_its_ticks_and_another_trial_gets_none_of
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    handout, _ = judging.to_rate(rater)[:2]
+    handout, _ = judging.next_to_rate(rater)[:2]
     first = bench.scene.milestones.order_by("order").first()
     given = {
         "plan": "blocks",
@@ -416,7 +416,7 @@ def test_preferring_asks_why(plan, carry_out, as_):
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    pair, _ = judging.to_prefer(rater)[:2]
+    pair, _ = judging.next_to_compare(rater)[:2]
     text = client.get("/result/prefer/").content.decode()
     assert pair.first.code in text
     assert "pi0" not in text
@@ -475,10 +475,10 @@ def test_smoothness_stands_with_its_interval_and_how_many_trials_it_is_of(reveal
 
 
 def test_a_smoothness_that_is_measured_later_is_shown(revealed, as_, viewer):
-    before = caching.analysis_of(revealed).arm("pi0-new").smoothness
+    before = caching.cached_analysis(revealed).arm("pi0-new").smoothness
     missing = Episode.objects.filter(trial__handout__plan=revealed, smoothness=None).first()
     Episode.objects.filter(pk=missing.pk).update(smoothness=-9.0)
-    after = [arm.smoothness for arm in caching.analysis_of(revealed).arms]
+    after = [arm.smoothness for arm in caching.cached_analysis(revealed).arms]
     assert (before.n, sorted(found.n for found in after)) == (6, [6, 7])
 
 

@@ -8,13 +8,13 @@ import pytest
 from django.db import transaction
 from django.test import Client
 
-from evaweb.plans.design import at_the_reveal
+from evaweb.plans.design import reveal_record
 from evaweb.plans.models import Plan
-from evaweb.plans.services import plan_close, plan_freeze, plan_reveal
+from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.results.presentation.citing import _looks, citation
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.wording import p_words
-from evaweb.statistics.boundaries import boundary, in_pairs
+from evaweb.statistics.boundaries import boundary, pair_counts
 from evaweb.statistics.designs import Design
 from evaweb.trials import services
 from evaweb.trials.models import Checkpoint, Evaluation
@@ -107,7 +107,7 @@ def test_what_is_corrected_later_changes_no_byte(revealed, bench, client, addres
     told = client.get(f"/api/v1/results/frozen/{revealed.at_reveal['digest']}").json()
     for handout in revealed.handouts.all():
         ticks = bench.ticks(True, True, True)
-        services.trial_score(user=bench.operator, trial=handout.trial, milestones=ticks, reason="seen again")
+        services.score_trial(user=bench.operator, trial=handout.trial, milestones=ticks, reason="seen again")
     for form, kind in FORMS.items():
         answer = client.get(f"{address}result.{form}")
         assert answer.content == before[form].content
@@ -145,9 +145,9 @@ def test_what_is_cited_is_of_the_first_reveal_whatever_backup_was_put_back(owner
     draft.checkpoints.set([new, bench.checkpoint])
     draft.positions.set(bench.scene.positions.all())
     with transaction.atomic():
-        plan = plan_freeze(user=owner, plan=Plan.objects.get(pk=draft.pk))
+        plan = freeze_plan(user=owner, plan=Plan.objects.get(pk=draft.pk))
         carry_out(plan, 4)
-        first = plan_reveal(user=owner, plan=plan)
+        first = reveal_plan(user=owner, plan=plan)
         digest = first.at_reveal["digest"]
         places = [f"/api/v1/results/frozen/{digest}"]
         places += [f"/result/frozen/{digest}/result.{form}" for form in FORMS]
@@ -155,8 +155,8 @@ def test_what_is_cited_is_of_the_first_reveal_whatever_backup_was_put_back(owner
         transaction.set_rollback(True)  # the backup is from before it was frozen
     Evaluation.objects.create(name="back", version=1)  # as the trials on the disk make it
     root = builders.user("root", "admin")
-    plan = plan_freeze(user=root, plan=Plan.objects.get(pk=draft.pk))
-    again = plan_reveal(user=root, plan=plan)
+    plan = freeze_plan(user=root, plan=Plan.objects.get(pk=draft.pk))
+    again = reveal_plan(user=root, plan=plan)
     assert (again.at_reveal, again.key == first.key) == (first.at_reveal, False)
     assert [client.get(place).content for place in places] == shown
     told = json.loads(shown[0])
@@ -181,7 +181,7 @@ def test_a_correction_of_points_alone_is_said_too(revealed, bench, client, addre
     assert said not in client.get(address).content.decode()
     trial = revealed.handouts.filter(trial__verdict__success=False).first().trial
     reached = not trial.verdict.outcomes.get(order=1).reached
-    services.trial_score(
+    services.score_trial(
         user=bench.operator, trial=trial, milestones=bench.ticks(reached, reached, False), reason="seen again"
     )
     assert said in client.get(address).content.decode()
@@ -203,9 +203,9 @@ def test_before_the_reveal_there_is_nothing_to_cite(plan, owner, carry_out, clie
     assert "Sealed" in page
     assert "pi0-new" not in page
     plan.refresh_from_db()
-    digest = at_the_reveal(plan)["digest"]  # that it will have: not known, and worth nothing
+    digest = reveal_record(plan)["digest"]  # that it will have: not known, and worth nothing
     assert client.get(f"/result/frozen/{digest}/").status_code == 404
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     assert client.get(f"/result/frozen/{digest}/").status_code == 200
 
 
@@ -215,7 +215,7 @@ def test_it_is_sealed_while_another_blind_plan_compares_the_same_checkpoint(
     again = Plan.objects.create(name="again", title="Again", owner=owner)
     again.checkpoints.set([bench.checkpoint])
     again.positions.set(bench.scene.positions.all())
-    plan_freeze(user=owner, plan=again)
+    freeze_plan(user=owner, plan=again)
     page = client.get(address).content.decode()
     assert "Sealed" in page
     for answer in (
@@ -242,8 +242,8 @@ def test_an_open_plan_that_has_ended_is_cited_as_it_is_now(plan, owner, bench, c
     other.checkpoints.set([plan.first, plan.second])
     other.positions.set(bench.scene.positions.all())
     carry_out(plan, 16)
-    plan_reveal(user=owner, plan=plan)
-    plan_freeze(user=owner, plan=other)
+    reveal_plan(user=owner, plan=plan)
+    freeze_plan(user=owner, plan=other)
     carry_out(other, 2)
     address = "/result/plans/open/1/cite/"
     going_on = client.get(address)
@@ -251,7 +251,7 @@ def test_an_open_plan_that_has_ended_is_cited_as_it_is_now(plan, owner, bench, c
         going_on.status_code,
         "a result is cited once the plan is closed" in going_on.content.decode(),
     ) == (409, True)
-    plan_close(user=owner, plan=other, reason="enough")
+    close_plan(user=owner, plan=other, reason="enough")
     page = client.get(address).content.decode()
     assert "As it is now: a correction changes it" in page
     assert "were not compared: closed after 1 of 2 pairs" in page
@@ -274,5 +274,5 @@ def test_a_reveal_that_kept_its_pairs_alone_is_cited_by_them(revealed):
     [(None, "after every pair"), ([18, 19, 20], "after 18, 19, 20 pairs"), ([10], "after 10, 20 pairs")],
 )
 def test_looks_that_were_named_are_cited_as_they_were_also_where_they_follow_each_other(looks, said):
-    design = Design("late", 20, 0.05, boundary=boundary(in_pairs(20, looks)))
+    design = Design("late", 20, 0.05, boundary=boundary(pair_counts(20, looks)))
     assert _looks(design) == f"looked at {said}"

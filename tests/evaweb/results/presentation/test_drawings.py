@@ -34,18 +34,18 @@ def figures(analysis):
     order = {arm.checkpoint: i for i, arm in enumerate(analysis.arms)}
     found = analysis.comparisons[0]
     return {
-        "intervals": rates.intervals(
+        "intervals": rates.draw_intervals(
             "Rates", [(a.checkpoint, a.success, "/x?a=1&b=2") for a in analysis.arms], order
         ),
-        "violins": rates.violins(analysis.arms, analysis.letters),
-        "difference": rates.difference(found),
-        "funnel": courses.funnel(
+        "violins": rates.draw_violins(analysis.arms, analysis.letters),
+        "difference": rates.draw_difference(found),
+        "funnel": courses.draw_funnel(
             "s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(analysis.arms)], {}
         ),
-        "success_times": courses.success_times(analysis.arms),
-        "evidence": courses.evidence(found.evidence, found.first, found.second, 40),
-        "grid": conditions.grid(analysis.arms, {}),
-        "pareto": conditions.pareto(analysis.arms[0], {("", NASTY): "/trials/?failure=1&x=2"}),
+        "success_times": courses.draw_success_times(analysis.arms),
+        "evidence": courses.draw_evidence(found.evidence, found.first, found.second, 40),
+        "grid": conditions.draw_grid(analysis.arms, {}),
+        "pareto": conditions.draw_pareto(analysis.arms[0], {("", NASTY): "/trials/?failure=1&x=2"}),
     }
 
 
@@ -91,7 +91,7 @@ def test_every_figure_carries_the_numbers_that_it_was_drawn_from(analysis):
 
 def test_legend_and_bars_are_in_the_order_of_series_whoever_is_best(analysis):
     found = [(arm.series, arm.checkpoint, arm.funnels[0]) for arm in analysis.arms]
-    named = [row["checkpoint"] for row in rows_of(courses.funnel("s0", found[::-1], {}))]
+    named = [row["checkpoint"] for row in rows_of(courses.draw_funnel("s0", found[::-1], {}))]
     assert list(dict.fromkeys(named)) == [name for _, name, _ in sorted(found)]
 
 
@@ -154,7 +154,7 @@ def test_no_text_is_markup(analysis):
 
 def test_a_name_of_before_with_characters_that_xml_has_not_is_drawn_without_them():
     name = "a\x01\x0b\ud800\ufffe\uffffb\u202e"
-    drawn = rates.intervals("Rates \x02", [(name, proportion(3, 4), "")], {name: 0})
+    drawn = rates.draw_intervals("Rates \x02", [(name, proportion(3, 4), "")], {name: 0})
     for svg in (drawn, printable(drawn, [name], [name])):
         root = ElementTree.fromstring(svg.encode())
         assert "a\ufffd\ufffd\ufffd\ufffd\ufffdb\u202e" in [each.text for each in root.iter()]
@@ -204,12 +204,14 @@ def test_checkpoints_whose_names_begin_alike_are_told_apart_in_every_figure(anal
     letters = dict.fromkeys(LONG, "a")
     one = analysis.comparisons[0].evidence
     drawn = {
-        "intervals": rates.intervals("Rates", [(a.checkpoint, a.success, "") for a in arms], {}),
-        "violins": rates.violins(arms, letters),
-        "funnel": courses.funnel("s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(arms)], {}),
-        "success_times": courses.success_times(arms),
-        "evidence": courses.evidence(one, *LONG),
-        "grid": conditions.grid(arms, {}),
+        "intervals": rates.draw_intervals("Rates", [(a.checkpoint, a.success, "") for a in arms], {}),
+        "violins": rates.draw_violins(arms, letters),
+        "funnel": courses.draw_funnel(
+            "s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(arms)], {}
+        ),
+        "success_times": courses.draw_success_times(arms),
+        "evidence": courses.draw_evidence(one, *LONG),
+        "grid": conditions.draw_grid(arms, {}),
     }
     for figure, markup in drawn.items():
         texts = [e.text or "" for e in ElementTree.fromstring(markup).iter() if e.tag.endswith("text")]
@@ -229,5 +231,5 @@ def test_a_checkpoint_has_one_colour_whichever_of_them_are_chosen_and_whichever_
         }
         (found,) = some.comparisons
         places = (whole[found.first], whole[found.second])
-        drawn = courses.evidence(found.evidence, found.first, found.second, drawn=places)
+        drawn = courses.draw_evidence(found.evidence, found.first, found.second, drawn=places)
         assert set(re.findall(r"series-[0-9]+", drawn)) == {f"series-{at + 1}" for at in places}

@@ -3,7 +3,7 @@
 from itertools import combinations
 
 from evaweb.results.presentation.would_be import _of_these, _stepped
-from evaweb.statistics.designs import conclude, design, findings
+from evaweb.statistics.designs import design, evaluate_design, findings
 
 SUCCESSES = (
     38,
@@ -23,9 +23,9 @@ def test_what_is_left_of_several_comparisons_is_decided_by_the_steps_that_decide
     assert winners(found, blocks) == ["first", "first", "first"]
     left = [at for at in range(40) if at != 39]
     alone = [_of_these(found, pair, left, blocks) for pair in pairs]
-    assert conclude(*alone[2], alone[2][0].comparisons[0]).winner is None  # at its share of alpha
+    assert evaluate_design(*alone[2], alone[2][0].comparisons[0]).winner is None  # at its share of alpha
     stepped = _stepped(found, alone)
-    assert [conclude(by, both, by.comparisons[0]).winner for by, both in stepped] == ["first"] * 3
+    assert [evaluate_design(by, both, by.comparisons[0]).winner for by, both in stepped] == ["first"] * 3
 
 
 def test_a_comparison_of_which_nothing_is_left_counts_as_one_all_the_same():

@@ -13,24 +13,24 @@ from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job, JobStatus
-from evaweb.jobs.services import cancel, try_again, work
-from evaweb.plans.commitment import commitment
+from evaweb.jobs.services import cancel, retry_job, run_queue
+from evaweb.plans.commitment import make_commitment
 from evaweb.plans.documents import scene_of, units_of
 from evaweb.plans.models import Plan, PlanEvent
-from evaweb.plans.services import plan_reveal
+from evaweb.plans.services import reveal_plan
 from evaweb.results import job_kinds
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import agreement_of, judges_of
+from evaweb.results.analysis.agreement import judge_agreement, rater_agreement
 from evaweb.results.models import AutomaticJudge, Judgement
 from evaweb.results.ratings import automatic, judging
-from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, stills_of
-from evaweb.results.reports.reporting import numbers_of
+from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, trial_stills
+from evaweb.results.reports.reporting import report_numbers
 from evaweb.results.reports.tables import outcome_pages
 from evaweb.trials import services
 from evaweb.trials.models import Milestone, Scene, Score, Trial
 from tests.evaweb.results.judges.server import http, message, said, serving
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 from tests.runtime.cameras.movies import movie
 
 SAID = said((1, "reached", 0.95), (2, "reached", 0.75), (3, "not reached", 0.2))
@@ -38,8 +38,8 @@ SAID = said((1, "reached", 0.95), (2, "reached", 0.75), (3, "not reached", 0.2))
 
 @pytest.fixture(autouse=True)
 def _quiet(monkeypatch):
-    monkeypatch.setattr("evaweb.jobs.doorbell.ring", lambda queue: True)
-    caching.forget()
+    monkeypatch.setattr("evaweb.jobs.doorbell.notify_workers", lambda queue: True)
+    caching.clear_caches()
 
 
 @pytest.fixture
@@ -68,8 +68,8 @@ def freeze_as_it_is(plan):
     scene = Scene.objects.get()
     document = {**plan.document, "scenes": [scene_of(scene, list(scene.positions.order_by("number")))]}
     changed = {"document": document, "digest": digest(document)}
-    changed["commitment"] = commitment(changed["digest"], units_of(plan), bytes(plan.key))
-    with unguarded("plans"):
+    changed["commitment"] = make_commitment(changed["digest"], units_of(plan), bytes(plan.key))
+    with without_triggers("plans"):
         Plan.objects.filter(pk=plan.pk).update(**changed)
     plan.refresh_from_db()
 
@@ -108,15 +108,15 @@ def chat(admin):
 
 
 def asked(plan, owner, name):
-    automatic.judge_ask(user=owner, plan=plan, name=name)
-    work("gpu")
+    automatic.request_judging(user=owner, plan=plan, name=name)
+    run_queue("gpu")
     return Job.objects.filter(kind="judge").order_by("-pk").first()
 
 
 def test_the_benchs_truth_is_held_against_the_scores(truth, owner):
     job = asked(truth, owner, "truth")
     assert (job.status, job.result) == (JobStatus.DONE, {"shown": 16, "left": 0, "without_pictures": []})
-    (found,) = judges_of(truth)
+    (found,) = judge_agreement(truth)
     assert (found["judge"], found["version"], found["trials"], found["no_verdict"]) == (
         "truth",
         "bench 1",
@@ -196,7 +196,7 @@ def test_no_verdict_is_kept_with_its_reason_and_not_asked_again(filmed, owner, c
     row = Judgement.objects.first()
     assert row.reason.startswith(reason)
     assert len(row.reason) <= automatic.LONGEST_REASON
-    (found,) = judges_of(filmed)
+    (found,) = judge_agreement(filmed)
     assert (list(found["no_verdict"].values()), found["calibration"]) == ([16], None)
     assert found["milestones"]["held"] == {"no_verdict": 16, "agreement": None, "brier": None}
 
@@ -205,18 +205,18 @@ def test_a_server_that_was_never_allowed_or_moved_since_is_not_spoken_to(filmed,
     with serving(SAID) as server:
         judge = chat(server.address, allowed=False)
         with pytest.raises(NotAllowed, match=r"judge seer: .* is not allowed: an administrator allows it"):
-            automatic.judge_ask(user=owner, plan=filmed, name="seer")
+            automatic.request_judging(user=owner, plan=filmed, name="seer")
         automatic.judge_allow(user=admin, judge=judge)
         assert (judge.allowed_by, judge.allowed_address) == (admin, server.address)
         with serving(SAID) as other:
-            automatic.judge_ask(user=owner, plan=filmed, name="seer")
+            automatic.request_judging(user=owner, plan=filmed, name="seer")
             AutomaticJudge.objects.update(address=other.address)
-            work("gpu")
+            run_queue("gpu")
             assert other.heard == []
         AutomaticJudge.objects.update(address=server.address)
         automatic.judge_forbid(user=admin, judge=judge)
         Job.objects.update(not_before=None)
-        work("gpu")
+        run_queue("gpu")
         assert server.heard == []
     job = Job.objects.get(kind="judge")
     assert (job.attempts, "is not allowed" in job.error) == (2, True)
@@ -226,10 +226,10 @@ def test_a_server_that_was_never_allowed_or_moved_since_is_not_spoken_to(filmed,
 def test_one_that_is_forbidden_meanwhile_is_asked_no_further(filmed, owner, chat, admin):
     with serving(SAID) as server:
         judge = chat(server.address)
-        assert automatic.judge_next(plan=filmed, name="seer")
+        assert automatic.judge_next_trial(plan=filmed, name="seer")
         automatic.judge_forbid(user=admin, judge=judge)
         with pytest.raises(NotAllowed):
-            automatic.judge_next(plan=filmed, name="seer")
+            automatic.judge_next_trial(plan=filmed, name="seer")
         assert (len(server.heard), Judgement.objects.count()) == (1, 1)
 
 
@@ -240,17 +240,17 @@ def test_who_may_allow_and_who_may_ask(truth, owner, admin, bench, chat):
             act(user=owner, judge=judge)
     for user in (bench.operator, builders.user("vera", "viewer")):
         with pytest.raises(NotAllowed):
-            automatic.judge_ask(user=user, plan=truth, name="truth")
+            automatic.request_judging(user=user, plan=truth, name="truth")
     with pytest.raises(NotFound, match="there is no judge 'none'; there are: seer, truth"):
-        automatic.judge_ask(user=owner, plan=truth, name="none")
+        automatic.request_judging(user=owner, plan=truth, name="none")
     draft = Plan.objects.create(name="later", title="Later", owner=owner)
     with pytest.raises(Conflict, match="is a draft"):
-        automatic.judge_ask(user=owner, plan=draft, name="truth")
+        automatic.request_judging(user=owner, plan=draft, name="truth")
     with pytest.raises(Conflict, match="has no address"):
         automatic.judge_allow(user=admin, judge=AutomaticJudge.objects.get(name="truth"))
     assert Job.objects.filter(kind="judge").count() == 0
     for user in (owner, admin):
-        automatic.judge_ask(user=user, plan=truth, name="truth")
+        automatic.request_judging(user=user, plan=truth, name="truth")
     assert Job.objects.filter(kind="judge").count() == 1
     events = PlanEvent.objects.filter(plan=truth, what="judge asked")
     assert [event.by for event in events] == [owner, admin]
@@ -258,11 +258,11 @@ def test_who_may_allow_and_who_may_ask(truth, owner, admin, bench, chat):
 
 
 def test_who_may_not_ask_a_judge_does_not_repeat_what_was_asked(truth, owner, admin, bench):
-    job = automatic.judge_ask(user=owner, plan=truth, name="truth")
+    job = automatic.request_judging(user=owner, plan=truth, name="truth")
     cancel(user=owner, job=job)
     with pytest.raises(NotAllowed, match="this needs an admin"):
-        try_again(user=bench.operator, job=job)
-    assert try_again(user=admin, job=job).status == JobStatus.QUEUED
+        retry_job(user=bench.operator, job=job)
+    assert retry_job(user=admin, job=job).status == JobStatus.QUEUED
 
 
 @pytest.mark.exhaustive
@@ -272,7 +272,7 @@ def test_each_trial_is_shown_to_a_version_once_however_often_it_is_asked_or_dies
     monkeypatch.setattr(job_kinds, "_TURN_S", 0.0)  # one trial, then whatever else waits
     with serving(SAID) as server:
         chat(server.address)
-        automatic.judge_next(plan=filmed, name="seer")  # as a worker that was killed after it
+        automatic.judge_next_trial(plan=filmed, name="seer")  # as a worker that was killed after it
         asked(filmed, owner, "seer")
         asked(filmed, owner, "seer")
         assert (len(server.heard), Judgement.objects.count()) == (16, 16)
@@ -280,7 +280,7 @@ def test_each_trial_is_shown_to_a_version_once_however_often_it_is_asked_or_dies
         AutomaticJudge.objects.update(model="seer-2")
         asked(filmed, owner, "seer")
         assert (len(server.heard), Judgement.objects.count()) == (32, 32)
-    assert [(one["version"], one["trials"]) for one in judges_of(filmed)] == [
+    assert [(one["version"], one["trials"]) for one in judge_agreement(filmed)] == [
         ("chat 1, seer-1", 16),
         ("chat 1, seer-2", 16),
     ]
@@ -296,7 +296,7 @@ def test_a_judge_that_fails_itself_keeps_nothing_and_is_named_by_the_job(filmed,
         assert (server.heard, Judgement.objects.count()) == ([], 0)
         monkeypatch.setenv("EVA_JUDGE_KEY", "sk-1")
         Job.objects.update(not_before=None)
-        work("gpu")
+        run_queue("gpu")
     assert Judgement.objects.count() == 16
 
 
@@ -318,20 +318,20 @@ def test_a_trial_that_counts_no_longer_when_the_answer_comes_is_not_judged(filme
 
     def shown(episode):
         Trial.objects.filter(pk=first.pk).update(status="voided")
-        return stills_of(episode)
+        return trial_stills(episode)
 
-    monkeypatch.setattr(automatic, "stills_of", shown)
+    monkeypatch.setattr(automatic, "trial_stills", shown)
     with serving(SAID) as server:
         chat(server.address)
-        assert automatic.judge_next(plan=filmed, name="seer")
+        assert automatic.judge_next_trial(plan=filmed, name="seer")
         assert len(server.heard) == 1
     assert (Judgement.objects.count(), first.judgements.count()) == (0, 0)
 
 
 def everything(plan):
     """All that is said of a plan but what judges said, as bytes."""
-    caching.forget()
-    found = numbers_of(plan, caching.analysis_of(plan))
+    caching.clear_caches()
+    found = report_numbers(plan, caching.cached_analysis(plan))
     found.pop("judges")
     plan.refresh_from_db()
     rows = {
@@ -341,7 +341,7 @@ def everything(plan):
         "states": list(Trial.objects.order_by("pk").values()),
         "plan": [plan.state, plan.digest, plan.commitment, plan.at_reveal, plan.closed_because],
         "handouts": list(plan.handouts.order_by("pk").values()),
-        "ratings": agreement_of(plan),
+        "ratings": rater_agreement(plan),
     }
     return json.dumps(rows, default=str).encode()
 
@@ -350,39 +350,39 @@ def everything(plan):
 def test_with_and_without_judges_the_analysis_is_the_same_to_the_byte(truth, owner, chat, bench):
     rater = builders.user("rita")
     for reached in (True, False, True):
-        handout = judging.to_rate(rater).found
+        handout = judging.next_to_rate(rater).found
         ticks = bench.ticks(True, reached, reached)
-        judging.rate(user=rater, plan=truth, code=handout.code, milestones=ticks)
-    plan_reveal(user=owner, plan=truth)
+        judging.save_rating(user=rater, plan=truth, code=handout.code, milestones=ticks)
+    reveal_plan(user=owner, plan=truth)
     before = everything(truth)
     with serving(SAID) as server:
         chat(server.address)
         asked(truth, owner, "truth")
         asked(truth, owner, "seer")
     assert Judgement.objects.count() == 32
-    assert len(judges_of(truth)) == 2
+    assert len(judge_agreement(truth)) == 2
     assert everything(truth) == before
-    assert agreement_of(truth)["ratings"] == 3
+    assert rater_agreement(truth)["ratings"] == 3
     for trial in Trial.objects.select_related("verdict"):
         assert success_of(scores_file(trial.episode_id)) == trial.verdict.success
 
 
 def test_a_judge_is_held_against_the_score_that_stood_then(truth, owner, bench):
     asked(truth, owner, "truth")
-    before = judges_of(truth)
+    before = judge_agreement(truth)
     trial = truth.handouts.get(number=1).trial
     turned = not trial.verdict.success
     ticks = bench.ticks(True, turned, turned)
-    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="the bench is right")
-    assert judges_of(truth) == before
+    services.score_trial(user=bench.operator, trial=trial, milestones=ticks, reason="the bench is right")
+    assert judge_agreement(truth) == before
 
 
 def test_neither_a_judge_nor_a_second_rater_judges_by_another_scene_than_the_frozen_one(filmed, owner, chat):
     Milestone.objects.filter(order=1).update(required=True)
-    handout, _ = judging.to_rate(rita := builders.user("rita"))[:2]
+    handout, _ = judging.next_to_rate(rita := builders.user("rita"))[:2]
     ticks = dict.fromkeys(handout.trial.scene.milestones.values_list("pk", flat=True), True)
     with pytest.raises(Conflict, match="milestone 1: required was False, is True"):
-        judging.rate(user=rita, plan=filmed, code=handout.code, milestones=ticks)
+        judging.save_rating(user=rita, plan=filmed, code=handout.code, milestones=ticks)
     with serving(SAID) as server:
         chat(server.address)
         job = asked(filmed, owner, "seer")
@@ -396,13 +396,13 @@ def test_what_judges_said_comes_back_from_the_disk(filmed, owner, chat):
     with serving(SAID) as server:
         chat(server.address)
         asked(filmed, owner, "seer")
-    before, told = list(Judgement.objects.order_by("uuid").values()), judges_of(filmed)
-    with unguarded("results"):
+    before, told = list(Judgement.objects.order_by("uuid").values()), judge_agreement(filmed)
+    with without_triggers("results"):
         Judgement.objects.all().delete()
     assert reconcile().restored == 16
     after = list(Judgement.objects.order_by("uuid").values())
     assert [{**row, "id": 0} for row in after] == [{**row, "id": 0} for row in before]
-    assert judges_of(filmed) == told
+    assert judge_agreement(filmed) == told
     assert reconcile().restored == 0
 
 
@@ -418,14 +418,14 @@ def test_before_the_reveal_it_works_and_nobody_sees_what_it_says(filmed, owner, 
         assert "Ask this judge" in client.get(page).content.decode()
         answer = client.post(reverse("result-judge", args=["blocks", 1]), {"judge": "seer"})
         assert (answer.status_code, answer["Location"]) == (302, page)
-        work("gpu")
+        run_queue("gpu")
     assert Judgement.objects.count() == 16
     for user in (owner, admin, bench.operator):
         client.force_login(user)
         said_of = client.get(page).content.decode()
         assert not [word for word in ("agree with the scores", "0.99", "0.987", "Brier") if word in said_of]
         assert client.get(rows).status_code == 403
-    plan_reveal(user=owner, plan=filmed)
+    reveal_plan(user=owner, plan=filmed)
     shown = client.get(page).content.decode()
     assert "Does seer agree with the scores?" in shown
     assert "Brier score" in shown
@@ -471,7 +471,7 @@ def test_a_sample_is_even_bounded_and_has_both_ends(filmed):
     episode.cameras = [f"cam{n}" for n in range(CAMERAS + 2)]
     for camera in episode.cameras[1:]:  # of the first nothing was ever seen
         movie(preview_folder(episode.uuid) / f"{camera}.mp4", pictures=2, size=(1024, 64))
-    found = stills_of(episode)
+    found = trial_stills(episode)
     assert [still.camera for still in found] == [
         "camera 2",
         "camera 2",
@@ -484,7 +484,7 @@ def test_a_sample_is_even_bounded_and_has_both_ends(filmed):
 
 
 def test_nothing_is_said_of_a_plan_that_no_judge_has_seen(revealed, tmp_path):
-    assert judges_of(revealed) is None
-    assert numbers_of(revealed, caching.analysis_of(revealed))["judges"] is None
+    assert judge_agreement(revealed) is None
+    assert report_numbers(revealed, caching.cached_analysis(revealed))["judges"] is None
     with pytest.raises(EvaError, match="there are: none, an administrator adds them"):
-        automatic.judge_ask(user=revealed.owner, plan=revealed, name="x")
+        automatic.request_judging(user=revealed.owner, plan=revealed, name="x")

@@ -7,13 +7,13 @@ import pytest
 from evaweb.episodes.folders import scores_file
 from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
-from evaweb.journal import numbered
+from evaweb.journal import read_numbered_lines
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.agreement import agreement_of, preferences_of
+from evaweb.results.analysis.agreement import preference_ranking, rater_agreement
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings import judging
 from tests.evaweb.trials import builders
-from tests.evaweb.unguarded import unguarded
+from tests.evaweb.unguarded import without_triggers
 
 
 @pytest.fixture
@@ -27,13 +27,15 @@ def judged(plan, carry_out, rater, bench):
     carry_out(plan, 16)
     builders.failure_terms()
     for reached in (True, False):
-        handout = judging.to_rate(rater).found
+        handout = judging.next_to_rate(rater).found
         ticks = bench.ticks(True, reached, reached)
         said = {} if reached else {"failure": "dropped", "failure_phase": "grasp"}
-        judging.rate(user=rater, plan=plan, code=handout.code, milestones=ticks, note="wölbt sich", **said)
-    pair = judging.to_prefer(rater).found
+        judging.save_rating(
+            user=rater, plan=plan, code=handout.code, milestones=ticks, note="wölbt sich", **said
+        )
+    pair = judging.next_to_compare(rater).found
     codes = {"first": pair.first.code, "second": pair.second.code}
-    judging.prefer(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
+    judging.save_preference(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
     return plan
 
 
@@ -42,7 +44,7 @@ def rows():
 
 
 def lose():
-    with unguarded("results"):
+    with without_triggers("results"):
         Rating.objects.all().delete()
         Preference.objects.all().delete()
 
@@ -52,11 +54,11 @@ def without_ids(found):
 
 
 def test_they_come_back_as_they_were_once(judged):
-    before, said = rows(), (agreement_of(judged), preferences_of(judged))
+    before, said = rows(), (rater_agreement(judged), preference_ranking(judged))
     lose()
     assert reconcile().restored == 3
     assert without_ids(rows()) == without_ids(before)
-    assert (agreement_of(judged), preferences_of(judged)) == said
+    assert (rater_agreement(judged), preference_ranking(judged)) == said
     assert reconcile().restored == 0
 
 
@@ -69,7 +71,7 @@ def test_what_the_database_has_is_left_alone(judged):
 def test_a_line_whose_row_was_never_made_is_taken_unless_the_same_was_said_again(judged):
     rating = Rating.objects.order_by("pk").first()
     file = scores_file(rating.trial.episode_id)
-    line = next(row for _, text in numbered(file) if (row := json.loads(text))["kind"] == "rating")
+    line = next(row for _, text in read_numbered_lines(file) if (row := json.loads(text))["kind"] == "rating")
     again = {**line, "uuid": "9d0f5b41-3d2c-4a27-8a4e-8ed4e7d3b0aa"}
     with file.open("a") as lines:
         lines.write(json.dumps(again) + "\n")

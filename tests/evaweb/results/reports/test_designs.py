@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from evaweb.results.reports.recompute import designs as offline
-from evaweb.statistics.designs import design, estimated, findings, in_blocks, table
+from evaweb.statistics.designs import boundary_table, design, estimated, findings, in_blocks
 
 RULES = [
     ("none", "success", None),
@@ -21,7 +21,7 @@ RULES = [
 
 def plan_of(found):
     said = {"rule": found.rule, "alpha": found.alpha, "outcome": found.outcome, "margin": found.margin}
-    said["boundary"] = table(found.boundary) if found.boundary else None
+    said["boundary"] = boundary_table(found.boundary) if found.boundary else None
     said |= {"drops": found.drops, "counts": found.counts}
     scenes = [{"name": "s", "positions": [{"number": 1}]}]
     compared = [["abc"[first], "abc"[second]] for first, second in found.comparisons]
@@ -34,7 +34,7 @@ def same_end(found, blocks):
     here, there = findings(found, blocks), offline.conclusions(blocks, plan_of(found))
     for one, other, sides in zip(here.each, there, found.comparisons, strict=True):
         winner = {"first": "abc"[sides[0]], "second": "abc"[sides[1]], None: None}[one.winner]
-        assert (other["blocks"], other["at"], other["winner"]) == (one.blocks, one.at, winner)
+        assert (other["blocks"], other["at"], other["winner"]) == (one.blocks, one.ended_at_pair, winner)
         assert other["p"] == (one.p and pytest.approx(one.p, rel=1e-6))
         said = estimated(found, blocks, sides, one)
         ends = said and [said.value, said.interval.low, said.interval.high]

@@ -12,17 +12,17 @@ from django.core.management import CommandError, call_command
 from evaweb.canonical import digest
 from evaweb.errors import Conflict
 from evaweb.plans import pictures
-from evaweb.plans.allocation import hand_out
+from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Achieved, Plan, Reference
-from evaweb.plans.services import plan_freeze, plan_reveal
-from evaweb.results.analysis.agreement import comparisons_of
-from evaweb.results.analysis.caching import analysis_of
+from evaweb.plans.services import freeze_plan, reveal_plan
+from evaweb.results.analysis.agreement import preference_comparisons
+from evaweb.results.analysis.caching import cached_analysis
 from evaweb.results.models import Judgement
 from evaweb.results.presentation.headline import headline
 from evaweb.results.ratings import judging
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.recompute.sealed import faults
-from evaweb.results.reports.reporting import seal_of, write_report
+from evaweb.results.reports.reporting import plan_seal, write_report
 from evaweb.trials import services, voids
 from evaweb.trials.corrections import trial_failure
 from evaweb.trials.models import Checkpoint
@@ -45,21 +45,23 @@ def report(revealed, tmp_path, bench):
 
 def _reported(revealed, tmp_path, bench):
     rater = builders.user("rita")
-    for index, handout in enumerate(revealed.handouts.filter(slot__index__in=judging.sample_of(revealed))):
+    for index, handout in enumerate(
+        revealed.handouts.filter(slot__index__in=judging.rating_sample(revealed))
+    ):
         last = (
             index % 2 == 0 if index else not handout.trial.scores.latest("pk").success
         )  # which trials they are is drawn: one differs
         milestones = bench.ticks(True, True, last)
-        judging.rate(user=rater, plan=revealed, code=handout.code, milestones=milestones)
+        judging.save_rating(user=rater, plan=revealed, code=handout.code, milestones=milestones)
     for index in range(8):
-        pair, _ = judging.to_prefer(rater, [revealed])[:2]
+        pair, _ = judging.next_to_compare(rater, [revealed])[:2]
         codes = {"first": pair.first.code, "second": pair.second.code}
         # By checkpoint and not by place, which is drawn: where one wins every time, there is nothing to fit.
         won_by_new = index % 4 in (0, 3)
         new_is_first = pair.first.slot.checkpoint.name == "pi0-new"
         outcome = "tie" if index % 4 == 2 else "first" if won_by_new == new_is_first else "second"
-        judging.prefer(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
-    judging.prefer(user=builders.user("rob"), plan=revealed, outcome="tie", why="alike", **codes)
+        judging.save_preference(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
+    judging.save_preference(user=builders.user("rob"), plan=revealed, outcome="tie", why="alike", **codes)
     for number, handout in enumerate(revealed.handouts.order_by("number")):
         judged_by_machine(handout.trial, number)
     call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
@@ -83,7 +85,7 @@ def test_a_program_without_us_computes_every_number_again(report):
     assert numbers["n"] == 16
     assert numbers["agreement"]["ratings"] == 8
     assert numbers["preferences"]["n"] == 9
-    assert sorted(row.weight for row in comparisons_of(Plan.objects.get())) == [0.5, 0.5, *[1.0] * 7]
+    assert sorted(row.weight for row in preference_comparisons(Plan.objects.get())) == [0.5, 0.5, *[1.0] * 7]
     modes = [mode for arm in numbers["arms"].values() for mode in arm["failure_modes"]]
     assert {(mode["failure_phase"], mode["failure"]) for mode in modes} == {("", "=dropped")}
     assert sum(mode["count"] for mode in modes) == 16 - sum(a["successes"] for a in numbers["arms"].values())
@@ -107,7 +109,7 @@ def test_what_was_corrected_after_the_second_rating_is_recomputed_as_it_stood(
 ):
     for trial in [handout.trial for handout in revealed.handouts.all() if handout.trial.ratings.exists()]:
         ticks = bench.ticks(*(reached for _, reached in trial.ratings.get().milestones))
-        services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="the other is right")
+        services.score_trial(user=bench.operator, trial=trial, milestones=ticks, reason="the other is right")
     call_command("eval_report", "blocks", "--out", str(tmp_path / "later"))
     found = recompute(tmp_path / "later")
     assert found.returncode == 0, found.stdout + found.stderr
@@ -290,12 +292,12 @@ def steered(plan, owner, bench, carry_out, tmp_path):
     """The report of a plan with a trial that was voided by two operators and one that was corrected, then revealed."""
     carry_out(plan, 12)
     first, other = (handout.trial for handout in plan.handouts.order_by("number")[:2])
-    asked = voids.trial_void(user=bench.operator, trial=first, reason="the plate had slipped")
-    voids.void_answer(user=builders.user("bob"), trial=asked, agree=True)
+    asked = voids.void_trial(user=bench.operator, trial=first, reason="the plate had slipped")
+    voids.answer_void(user=builders.user("bob"), trial=asked, agree=True)
     ticks = bench.ticks(False, False, False)
-    services.trial_score(user=bench.operator, trial=other, milestones=ticks, reason="looked again")
+    services.score_trial(user=bench.operator, trial=other, milestones=ticks, reason="looked again")
     carry_out(plan, 5)
-    plan_reveal(user=owner, plan=plan)
+    reveal_plan(user=owner, plan=plan)
     return write_report(plan, tmp_path / "report").parent
 
 
@@ -476,19 +478,19 @@ def test_letters_are_those_of_a_plan_that_compared_all(bench, owner, tmp_path):
     )
     drafted.checkpoints.set(three)
     drafted.positions.set(bench.scene.positions.all())
-    plan = plan_freeze(user=owner, plan=drafted)
+    plan = freeze_plan(user=owner, plan=drafted)
     while plan.state == "frozen":
         try:
-            trial = hand_out(user=bench.operator, station=bench.station, plan=plan).trial
+            trial = allocate_trial(user=bench.operator, station=bench.station, plan=plan).trial
         except Conflict:
             break
-        builders.over(trial, 9.0)
+        builders.finished_trial(trial, 9.0)
         ok = trial.checkpoint.name == "pi0-new" or (
             trial.checkpoint.name == "pi0-z" and trial.number % 2 == 0
         )
-        services.trial_score(user=bench.operator, trial=trial, milestones=bench.ticks(True, ok, ok))
+        services.score_trial(user=bench.operator, trial=trial, milestones=bench.ticks(True, ok, ok))
         plan.refresh_from_db()
-    plan_reveal(user=owner, plan=Plan.objects.get(pk=plan.pk))
+    reveal_plan(user=owner, plan=Plan.objects.get(pk=plan.pk))
     plan.refresh_from_db()
     call_command("eval_report", "three", "--out", str(tmp_path / "report"))
     path = tmp_path / "report" / "data" / "numbers.json"
@@ -561,7 +563,7 @@ def test_a_folder_that_is_not_empty_is_not_written_to(revealed, tmp_path):
 
 
 def test_the_checklist_says_what_the_record_says(revealed):
-    kept = {item.practice: item for item in checklist(revealed, analysis_of(revealed))}
+    kept = {item.practice: item for item in checklist(revealed, cached_analysis(revealed))}
     assert kept["As many trials as planned, or a rule to stop"].kept == "yes"
     assert kept["Every trial that counts recorded"].record == "16 of 16 have a recording"
     assert kept["A second, blind rater"].kept == "no"
@@ -572,7 +574,7 @@ def test_scores_are_kept_where_only_categories_of_failures_were_corrected(reveal
     def kept():
         (item,) = (
             item
-            for item in checklist(revealed, analysis_of(revealed))
+            for item in checklist(revealed, cached_analysis(revealed))
             if item.practice == "Scores kept as they were given"
         )
         return item
@@ -583,7 +585,7 @@ def test_scores_are_kept_where_only_categories_of_failures_were_corrected(reveal
     assert kept().record.startswith("0 corrections, each a row of its own")
     assert kept().record.endswith("failure categories alone corrected 1 times, 1 of them after the reveal")
     ticks = bench.ticks(True, True, True)
-    services.trial_score(user=bench.operator, trial=trial, milestones=ticks, reason="on the video")
+    services.score_trial(user=bench.operator, trial=trial, milestones=ticks, reason="on the video")
     assert (kept().kept, kept().record[:14]) == ("no", "1 corrections,")
 
 
@@ -594,7 +596,7 @@ REGION = {"name": "block", "at": [0.1, 0.2, 0.1, 0.1], "match": 0.41, "dx": None
 def laid_out(revealed, bench, owner):
     """The first trial's bench, with its reference, and another's whose picture was lost."""
     first, second = (handout.trial for handout in revealed.handouts.order_by("number")[:2])
-    before, now, lost = (pictures.keep(jpeg(seed)) for seed in (1, 2, 3))
+    before, now, lost = (pictures.store_image(jpeg(seed)) for seed in (1, 2, 3))
     row = {"station": bench.station, "position": first.position, "camera": "top", "by": owner}
     reference = Reference.objects.create(picture=before, **row)
     seen = {"camera": "top", "by": bench.operator}
@@ -640,7 +642,7 @@ def test_it_says_how_the_trials_were_made(revealed, tmp_path):
 
 
 def test_the_sums_that_the_reveal_kept_are_under_its_digest(revealed):
-    seal = json.loads(json.dumps(seal_of(revealed)))
+    seal = json.loads(json.dumps(plan_seal(revealed)))
     assert faults(seal, revealed.document, []) == []
     seal["at_reveal"]["arms"][0]["successes"] += 1
     assert "not the digest" in faults(seal, revealed.document, [])[0]

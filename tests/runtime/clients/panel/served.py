@@ -14,7 +14,7 @@ from typing import Any
 
 from runtime.clients.panel.pin import PinFile
 from runtime.ipc.bus import Endpoints
-from tests.evaweb.stand_in import StandIn
+from tests.evaweb.stand_in import FakeStation
 from tests.processes import PATIENCE_S, eventually
 from tests.sources import ROOT
 
@@ -28,7 +28,7 @@ class Served:
 
     def __init__(self, data: Path, pin: str = PIN, **settings: Any) -> None:
         self.data, self.folder = data, data / "stations" / STATION
-        self.station = StandIn(data, STATION)
+        self.station = FakeStation(data, STATION)
         said = {"panel": {**PLAIN, **settings}}
         (self.folder / "resolved.json").write_text(json.dumps(said), "utf-8")
         if pin:

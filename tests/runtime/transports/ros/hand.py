@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from runtime.transports.ros.middleware import Deliver, Match, Middleware, Publish, Topic
 
 
-class Hand(Middleware):
+class FakeMiddleware(Middleware):
     """A middleware whose messages come from the test's own hand."""
 
     def __init__(self) -> None:

@@ -17,7 +17,7 @@ from runtime.transports.ros.messages import Image, JointState, Message, PoseStam
 from runtime.transports.ros.middleware import Match
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
-from tests.runtime.transports.ros.hand import Hand
+from tests.runtime.transports.ros.hand import FakeMiddleware
 
 ROBOT = robots.load_robot("ur5e")
 NAMES = ROBOT.groups[0].joints
@@ -30,7 +30,7 @@ WALL = 1_800_000_000.0
 
 class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> None:
-        self.hand, self.clock = Hand(), VirtualClock(50.0)
+        self.hand, self.clock = FakeMiddleware(), VirtualClock(50.0)
         monkeypatch.setattr(ros2, "middleware", lambda *_: self.hand)
         config = ros2.Config(topics=settings.pop("topics", TOPICS), **settings)
         self.source: RosSource = ros2.source(config, ROBOT, self.clock)
