@@ -43,7 +43,7 @@ def session_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Give a command for a session: `setup` and `run` get task and session from it; `given` as in `issue`.
+    """Give a command for a session: `setup` and `run` get task and session from it; `given` as in `issue_command`.
 
     Before each run the station is looked at: SetupChanged where it is not as the session had it. Never within a
     transaction. An accepted run has begun: its episode has a row.

@@ -158,7 +158,7 @@ def replay_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Set a station up to play an episode, by its uuid or as DATASET:INDEX; `given` as in `issue`.
+    """Set a station up to play an episode, by its uuid or as DATASET:INDEX; `given` as in `issue_command`.
 
     EvaError for other commands, Conflict where the station's robot is not the episode's.
     """

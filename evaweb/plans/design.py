@@ -268,7 +268,7 @@ def kept_blocks(plan: Plan) -> list[Block] | None:
 
 
 def blocks_kept(kept: Mapping[str, Any]) -> list[Block]:
-    """Those of `at_the_reveal`, also from before there were several comparisons, when it was pairs."""
+    """Those of `reveal_record`, also from before there were several comparisons, when it was pairs."""
     if "blocks" not in kept:
         return in_blocks([(one, other) for one, other in kept["pairs"]])
     return [tuple((arm, value) for arm, value in block) for block in kept["blocks"]]

@@ -377,7 +377,7 @@ def _put(row: Command, answer: Answer) -> None:
 
 
 def _update(row: Command) -> None:
-    """Save the answer; where the database refuses, `settle` asks the runtime again later."""
+    """Save the answer; where the database refuses, `resolve_unknown_outcome` asks the runtime again later."""
     try:
         row.save(update_fields=_ANSWER)
     except Error as error:

@@ -448,7 +448,7 @@ def _region(look: Look, margin: float | None) -> NDArray[np.bool_]:
 
 
 def _degrees(n: int, m: int, margin: float | None) -> NDArray[np.float64]:
-    """`extremeness` of all tables of a look: float64 [n + 1, m + 1]."""
+    """`extremeness_of` of all tables of a look: float64 [n + 1, m + 1]."""
     import numpy as np
 
     a: NDArray[np.float64] = np.arange(n + 1.0)[:, None]

@@ -219,15 +219,15 @@ MUTANTS = (
     Mutant(
         "blinding/sealed-for-who-looked",
         "evaweb/plans/blinding_rules.py",
-        "return plan.sealed and not has_looked(plan, user)",
-        "return plan.sealed and has_looked(plan, user)",
+        "return plan.sealed and not is_unblinded(plan, user)",
+        "return plan.sealed and is_unblinded(plan, user)",
         _OF_PLANS,
     ),
     Mutant(
         "blinding/code-of-the-slot",
         "evaweb/plans/allocation.py",
-        'blinding.codes(bytes(held.key or b""), number)[-1]',
-        'blinding.codes(bytes(held.key or b""), slot.index + 1)[-1]',
+        'blinding.draw_codes(bytes(held.key or b""), number)[-1]',
+        'blinding.draw_codes(bytes(held.key or b""), slot.index + 1)[-1]',
         _OF_PLANS,
     ),
     Mutant(
@@ -283,7 +283,7 @@ MUTANTS = (
     Mutant(
         "journal/score-of-the-database-alone",
         "evaweb/trials/services.py",
-        "    JUDGEMENTS.append(file_of(trial), ScoreLine.written(score, milestones=milestones))\n",
+        "    JUDGEMENTS.append(journal_uuid(trial), ScoreLine.written(score, milestones=milestones))\n",
         "",
         _OF_SCORES,
     ),
