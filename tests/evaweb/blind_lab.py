@@ -123,8 +123,8 @@ class BlindLab:
         )
         took = {"connect_s": FIGURE, "warm_up_s": FIGURE}
         Trial.objects.filter(pk=trial.pk).update(setup=self.command.pk, setup_took=took)
-        self.runtime.say("setup", "connecting to the policy")
-        self.runtime.say("setup_note", f"{NAMES[0]} answers {ROWS} rows in {FIGURE} ms")
+        self.runtime.emit("setup", "connecting to the policy")
+        self.runtime.emit("setup_note", f"{NAMES[0]} answers {ROWS} rows in {FIGURE} ms")
 
     def _snapshot(self, plain):
         def told():
@@ -178,7 +178,7 @@ class BlindLab:
     def failed(self):
         """The policy's server is lost."""
         assert self.trial is not None
-        self.runtime.say("policy_failed", ERROR)
+        self.runtime.emit("policy_failed", ERROR)
         self.runtime.enter(SessionEvent.CONNECTED, ERROR)
         Trial.objects.filter(pk=self.trial.pk).update(status="interrupted", reason=f"policy lost: {ERROR}")
         self._record(self.trial)

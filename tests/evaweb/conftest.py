@@ -194,5 +194,5 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> builders.FakeConnection:
         "trials.station_commands",
     )
     for place in places:
-        monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
+        monkeypatch.setattr(f"evaweb.{place}.connection_to", lambda name: made)
     return made

@@ -227,7 +227,7 @@ async def heard(lab, user):
         await asyncio.to_thread(lab.publish)
         await page.shown(lambda streams: "joints" in streams)
     last = f"that was all ({uuids.uuid4()})"
-    await asyncio.to_thread(lab.runtime.say, "camera_back", last)
+    await asyncio.to_thread(lab.runtime.emit, "camera_back", last)
     await page.told("events", lambda told: told["events"][-1]["text"] == last)
     await page.shown(lambda streams: "recent" in streams)
     await page.close()

@@ -25,7 +25,7 @@ def lab(live, runtime, ann, recorded, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.setattr("django.conf.settings.DATA_DIR", tmp_path)
     monkeypatch.setattr("evaweb.jobs.doorbell.notify_workers", lambda queue: True)
     lab = BlindLab(live, runtime, ann, recorded["finished"], tmp_path)
-    for stage in ("handed", "running", "failed", "scored", "closed"):
+    for stage in ("allocate", "running", "failed", "scored", "closed"):
         getattr(lab, stage)()
     lab.plan = reveal_plan(user=lab.owner, plan=lab.plan)
     return lab

@@ -38,7 +38,7 @@ def lab(live, runtime, ann, recorded, settings):  # noqa: F811
     return BlindLab(live, runtime, ann, recorded["finished"], settings.DATA_DIR)
 
 
-STAGES = ("before", "handed", "running", "failed", "scored", "closed")
+STAGES = ("before", "allocate", "running", "failed", "scored", "closed")
 
 
 def told_by(lab, user):
@@ -160,7 +160,7 @@ def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administrat
     client = Client()
     client.force_login(alma)
     lab.operator = alma
-    lab.handed()
+    lab.allocate()
     assert not visibility_for_user(alma).sees_everything
     for model in ("trials_trial", "trials_score", "stations_command", "episodes_episode", "jobs_job"):
         answer = client.get(reverse(f"admin:{model}_changelist"), headers={"Accept": "text/html"})
@@ -185,7 +185,7 @@ SEAMS = {
 def test_without_one_seam_something_tells(lab, monkeypatch):
     client = Client()
     client.force_login(lab.operator)
-    for stage in ("handed", "running", "failed", "scored"):
+    for stage in ("allocate", "running", "failed", "scored"):
         getattr(lab, stage)()
     for seam, instead in SEAMS.items():
         with monkeypatch.context() as without:
@@ -197,7 +197,7 @@ def test_without_one_seam_something_tells(lab, monkeypatch):
 def test_without_its_seam_a_filter_tells(lab, monkeypatch):
     client = Client()
     client.force_login(lab.operator)
-    for stage in ("handed", "running", "failed", "scored"):
+    for stage in ("allocate", "running", "failed", "scored"):
         getattr(lab, stage)()
     monkeypatch.setattr(
         "evaweb.blinding.Visibility.filter_visible", SEAMS["evaweb.blinding.Visibility.filter_visible"]
@@ -206,7 +206,7 @@ def test_without_its_seam_a_filter_tells(lab, monkeypatch):
 
 
 def test_without_one_seam_the_live_socket_tells(lab, monkeypatch):
-    lab.handed()
+    lab.allocate()
     lab.running()
     assert websocket_texts(lab, lab.operator) == []
     for seam in ("redacts_snapshot", "redacts_events"):

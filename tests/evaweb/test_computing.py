@@ -131,7 +131,7 @@ def test_a_process_beside_whose_web_is_gone_ends_in_the_middle_of_its_question()
 # --- every address --------------------------------------------------------------------------------------------
 
 LONG = (  # whatever takes long at the sizes that a question may have
-    (boundaries, "_taken"),
+    (boundaries, "_least_extreme"),
     (courses, "_simulated"),
     (planning, "_barnard_tables"),
     (score_courses, "_flipped"),
@@ -170,7 +170,7 @@ def lab(live, runtime, ann, recorded, settings, tmp_path, monkeypatch):  # noqa:
 
 @pytest.mark.django_db(transaction=True)
 def test_no_address_computes_long_outside_of_the_process_for_it(lab, alma, counted):
-    for stage in ("handed", "running", "failed", "scored", "closed"):
+    for stage in ("allocate", "running", "failed", "scored", "closed"):
         getattr(lab, stage)()
     draft = Plan.objects.create(
         name="draft", title="D", question="?", owner=alma, repetitions=3, stopping="late", alpha=0.031
@@ -185,7 +185,7 @@ def test_no_address_computes_long_outside_of_the_process_for_it(lab, alma, count
     eventually(lambda: "progress" not in client.get(DRAFT[1] + asked).content.decode(), "the power")
     assert [address for address, status, _ in told if status == 500] == []
     assert len({address for address, status, _ in told if status == 200}) > 60
-    assert {"_taken", "_simulated", "_barnard_tables"} <= set(counted[True])
+    assert {"_least_extreme", "_simulated", "_barnard_tables"} <= set(counted[True])
     assert counted[False] == []
 
 

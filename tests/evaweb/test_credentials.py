@@ -110,16 +110,16 @@ def run(wanted):
 
 
 def presses(known, secret="a"):
-    return run(known.presser([("key", secret)], HERE))
+    return run(known.resolve_presser([("key", secret)], HERE))
 
 
 def stops(known, secret="a"):
-    found = run(known.stopper([("key", secret)], HERE))
+    found = run(known.resolve_stopper([("key", secret)], HERE))
     return found and found[1]
 
 
 def test_who_is_remembered_presses_at_once_whatever_the_database_does(known, base, now):
-    known.look("key", "a")
+    known.look_up("key", "a")
     base.answers.clear()
     now[0] += 10**6
     login = presses(known)
@@ -146,7 +146,7 @@ def test_a_database_that_answers_others_is_waited_for_longer_and_who_has_no_turn
     known, base, now, ask
 ):
     base.answers.clear()
-    base.meanwhile = known.heard
+    base.meanwhile = known.record_answer
     with pytest.raises(LookupOverload, match="has not come to this login within 1 s"):
         ask(known)
     assert now[0] == pytest.approx(101.0)
@@ -154,7 +154,7 @@ def test_a_database_that_answers_others_is_waited_for_longer_and_who_has_no_turn
 
 def test_a_database_that_falls_silent_meanwhile_is_not_taken_for_a_busy_one(known, base, now):
     base.answers.clear()
-    base.meanwhile = lambda: known.heard() if now[0] < 101.0 else None
+    base.meanwhile = lambda: known.record_answer() if now[0] < 101.0 else None
     with pytest.raises(Unverifiable):
         presses(known)
     assert now[0] == pytest.approx(101.0)
@@ -173,7 +173,7 @@ def test_what_is_nobodys_is_not_asked_again_for_some_seconds(known, base, now):
 
 def test_what_was_nobodys_is_somebodys_as_soon_as_this_process_hears_of_it(known, base):
     presses(known, "x")
-    known.note("key", "x", Person("bob"))
+    known.remember("key", "x", Person("bob"))
     assert presses(known, "x").username == "bob"
 
 
@@ -187,7 +187,7 @@ def test_so_many_are_known_to_be_nobodys(known, base, monkeypatch):
 def test_a_stop_goes_by_what_was_known_where_the_database_hangs_and_by_the_database_where_it_answers(
     known, base, now
 ):
-    known.look("key", "a")
+    known.look_up("key", "a")
     base.answers.clear()
     now[0] += 60
     assert stops(known).role is Role.OPERATOR
@@ -202,22 +202,22 @@ def test_a_stop_goes_by_what_was_known_where_the_database_hangs_and_by_the_datab
 def test_for_what_is_no_stop_a_login_counts_for_a_minute_after_the_database_said_whose_it_is(
     known, base, now
 ):
-    assert known.counted("key", "a") is None
-    known.look("key", "a")
+    assert known.recall_recent("key", "a") is None
+    known.look_up("key", "a")
     base.fault = OperationalError("gone")
     now[0] += COUNTS_S - 0.1
-    assert known.counted("key", "a").username == "ann"
+    assert known.recall_recent("key", "a").username == "ann"
     now[0] += 0.2
-    assert known.counted("key", "a") is None
+    assert known.recall_recent("key", "a") is None
     assert stops(known).username == "ann", "a stop counts for longer"
     base.fault = None
-    known.look("key", "a")
-    assert known.counted("key", "a").username == "ann"
+    known.look_up("key", "a")
+    assert known.recall_recent("key", "a").username == "ann"
     assert base.asked == 3
 
 
 def test_what_was_just_verified_is_not_asked_again(known, base):
-    known.look("key", "a")
+    known.look_up("key", "a")
     stops(known)
     presses(known)
     assert base.asked == 1
@@ -234,7 +234,7 @@ def patient(known, monkeypatch):
 @pytest.mark.usefixtures("patient")
 def test_a_flood_of_one_credential_asks_once(known, base):
     async def flood():
-        waiting = [asyncio.create_task(known.presser(KEY, HERE)) for _ in range(500)]
+        waiting = [asyncio.create_task(known.resolve_presser(KEY, HERE)) for _ in range(500)]
         await asyncio.sleep(0)
         base.answers.set()
         return await asyncio.gather(*waiting)
@@ -245,54 +245,54 @@ def test_a_flood_of_one_credential_asks_once(known, base):
 
 
 def test_of_several_credentials_one_that_is_remembered_presses_and_stops_at_once(known, base, now):
-    known.look("key", "a")
+    known.look_up("key", "a")
     base.answers.clear()
     found = [("key", "x"), ("key", "y"), ("key", "a")]
-    assert run(known.presser(found, HERE)).username == "ann"
-    kind, login = run(known.stopper(found, HERE))
+    assert run(known.resolve_presser(found, HERE)).username == "ann"
+    kind, login = run(known.resolve_stopper(found, HERE))
     assert (kind, login.username, now[0], base.asked) == ("key", "ann", 100.0, 1)
 
 
 @pytest.mark.usefixtures("patient")
 def test_of_several_credentials_any_is_good_and_who_is_found_waits_for_no_other(known, base):
     hangs = threading.Event()
-    known.learn("slow", lambda secret: hangs.wait(PATIENCE_S) and None)
+    known.register_kind("slow", lambda secret: hangs.wait(PATIENCE_S) and None)
     found = [("slow", "x"), ("key", "y"), ("key", "a")]
-    assert run(known.presser(found, HERE)).username == "ann"
+    assert run(known.resolve_presser(found, HERE)).username == "ann"
     hangs.set()
-    assert run(known.stopper(found, HERE))[1].username == "ann"
-    assert run(known.presser(found[:2], HERE)) is None
+    assert run(known.resolve_stopper(found, HERE))[1].username == "ann"
+    assert run(known.resolve_presser(found[:2], HERE)) is None
     base.fault = OperationalError("gone")
     with pytest.raises(Unverifiable):
-        run(known.presser([("slow", "z"), ("key", "new")], HERE))
+        run(known.resolve_presser([("slow", "z"), ("key", "new")], HERE))
 
 
 @pytest.mark.parametrize("kind", [SESSION, TOKEN])
 def test_who_presses_is_one_question_whatever_the_date_and_a_stop_goes_by_the_date(known, base, kind):
-    known.learn(kind, lambda secret: None)
-    known.learn(f"{kind} of any age", base)
-    assert run(known.presser([(kind, "a")], HERE)).username == "ann"
-    assert run(known.stopper([(kind, "a")], HERE)) is None
-    assert run(known.presser([(kind, "a")], HERE)).username == "ann"
+    known.register_kind(kind, lambda secret: None)
+    known.register_kind(f"{kind} of any age", base)
+    assert run(known.resolve_presser([(kind, "a")], HERE)).username == "ann"
+    assert run(known.resolve_stopper([(kind, "a")], HERE)) is None
+    assert run(known.resolve_presser([(kind, "a")], HERE)).username == "ann"
     assert base.asked == 1
 
 
-@pytest.mark.parametrize("ask", ["presser", "stopper", "look"])
+@pytest.mark.parametrize("ask", ["resolve_presser", "resolve_stopper", "look"])
 def test_who_is_remembered_when_their_time_is_over_presses_at_once_all_the_same(known, base, now, ask):
     ends = {"a": Person("ann")}
-    known.learn(SESSION, ends.get)
-    known.learn("session of any age", base)
-    known.look(SESSION, "a")
+    known.register_kind(SESSION, ends.get)
+    known.register_kind("session of any age", base)
+    known.look_up(SESSION, "a")
     ends.clear()
     now[0] += 60.0
     found = [(SESSION, "a")]
     if ask == "look":
-        known.look(SESSION, "a")
+        known.look_up(SESSION, "a")
     else:
         run(getattr(known, ask)(found, HERE))
     known._check(SESSION, "a").result(PATIENCE_S)
     base.answers.clear()
-    assert run(known.presser(found, HERE)).username == "ann"
+    assert run(known.resolve_presser(found, HERE)).username == "ann"
     assert (known.recall(SESSION, "a"), now[0]) == (None, 160.0)
 
 
@@ -337,11 +337,11 @@ def test_a_crowd_waits_behind_itself_and_is_turned_away_where_there_is_no_room(k
 
     async def pressed():
         base.answers.clear()
-        asked = [asyncio.create_task(known.presser([("key", f"x{n}")], crowd)) for n in range(5)]
+        asked = [asyncio.create_task(known.resolve_presser([("key", f"x{n}")], crowd)) for n in range(5)]
         while base.asked == 0:  # the first has its turn, four wait
             await asyncio.sleep(0)
-        refused = asyncio.create_task(known.presser([("key", "x5")], crowd))
-        ann = asyncio.create_task(known.presser(KEY, more))
+        refused = asyncio.create_task(known.resolve_presser([("key", "x5")], crowd))
+        ann = asyncio.create_task(known.resolve_presser(KEY, more))
         await asyncio.sleep(0)
         base.answers.set()
         return await asyncio.gather(*asked, refused, ann, return_exceptions=True)
@@ -358,7 +358,7 @@ def test_so_many_are_remembered(known, base, monkeypatch):
     monkeypatch.setattr(module, "_MOST", 2)
     base.users = {name: Person(name) for name in "abc"}
     for name in "abc":
-        known.look("key", name)
+        known.look_up("key", name)
     assert [known.recall("key", name) is not None for name in "abc"] == [False, True, True]
 
 

@@ -15,7 +15,7 @@ class BenchTruth:
 
     version = "bench 1"
 
-    def words(self, case: TrialCase) -> str:
+    def prompt_text(self, case: TrialCase) -> str:
         """It is asked nothing."""
         return ""
 

@@ -159,7 +159,7 @@ class ChatJudge:
         """With the model that is asked."""
         return f"chat 1, {self._setup.model}"
 
-    def words(self, case: TrialCase) -> str:
+    def prompt_text(self, case: TrialCase) -> str:
         """What stands around the pictures."""
         return json.dumps([_HOW, _question(case)], ensure_ascii=False)
 

@@ -32,7 +32,7 @@ class UsableJudge:
     pictures: bool
     served: bool
 
-    def words(self, case: TrialCase) -> str:
+    def prompt_text(self, case: TrialCase) -> str:
         """All that it is told in words; EvaError that names the judge."""
         with _named(self.name):
             return self.judge.prompt_text(case)

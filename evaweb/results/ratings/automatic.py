@@ -155,7 +155,7 @@ def judge_next_trial(*, plan: Plan, name: str) -> bool:
     said = [MilestoneJudgement()] * len(milestones)
     try:
         case = _case(handout.trial, milestones, found)
-        words = found.words(case)
+        words = found.prompt_text(case)
         judgement.prompt = hashlib.sha256(words.encode()).hexdigest() if words else ""
         judgement.pictures = [
             [still.camera, still.at, hashlib.sha256(still.jpeg).hexdigest()] for still in case.stills

@@ -48,7 +48,7 @@ def at(monkeypatch: pytest.MonkeyPatch) -> FakeConnection:
     made = FakeConnection()
     made.snapshot = {**made.snapshot, "collect": collecting(), "lease": {"holder": "", "epoch": 0}}
     for place in ("stations.commands", "collect.services", "collect.station_commands"):
-        monkeypatch.setattr(f"evaweb.{place}.wire_to", lambda name: made)
+        monkeypatch.setattr(f"evaweb.{place}.connection_to", lambda name: made)
     return made
 
 

@@ -76,14 +76,14 @@ def web(told):
 def happens(robot):
     """What goes on at the robot while nobody else sees it; numbers and kinds of the events that count."""
     station = robot.station
-    station.say("command", "lease_renew: refused", uuid="")
+    station.emit("command", "lease_renew: refused", uuid="")
     station.do(lambda: setattr(station.lease, "_held", None))
     station.enter(SessionEvent.HOLDER_LOST, "nobody commands the station")
     for number in range(40):
-        station.say("limited", f"limited {number}")
+        station.emit("limited", f"limited {number}")
     panel = Command("stop-7", "stop", user="panel:10.0.0.3", holder="panel:10.0.0.3", role="local")
     station.do(lambda: station._answer(panel))
-    station.say("episode_closed", "episode closed", uuid="e1", status="finished")
+    station.emit("episode_closed", "episode closed", uuid="e1", status="finished")
     return station.events.newest
 
 
@@ -96,7 +96,7 @@ def counted(robot, first):
 def test_what_happened_during_a_loss_is_written_down_when_the_link_is_back(lab, robot, told, web):
     station = Station.objects.create(name=STATION, robot="agilex_piper")
     web()
-    robot.station.say("command", "before the loss", uuid="")
+    robot.station.emit("command", "before the loss", uuid="")
     before = robot.station.events.newest
     eventually(lambda: Station.objects.get(pk=station.pk).last_event == before, "what was before")
     assert Lease.objects.get(station=station).ended_at is None
@@ -139,7 +139,7 @@ def test_a_link_that_flaps_while_things_happen_doubles_nothing(lab, robot, told,
     def goes_on():
         number = 0
         while not ended.wait(0.005):
-            robot.station.say("state", f"state {number}", state="running")
+            robot.station.emit("state", f"state {number}", state="running")
             number += 1
 
     busy = threading.Thread(target=goes_on)

@@ -50,11 +50,11 @@ def test_of_all_together_the_oldest_makes_place(arrive, closed):
 
 def test_one_that_sent_its_request_is_closed_for_nobody(arrive, closed, now):
     arrive(0)
-    arrive.all_of_them.gone(0)
+    arrive.all_of_them.remove(0)
     for key in range(1, 10):
         arrive(key)
     now[0] = 100.0
-    arrive.all_of_them.sweep()
+    arrive.all_of_them.close_expired()
     assert sorted(closed) == list(range(1, 10))
     assert len(arrive.all_of_them) == 0
     assert arrive.all_of_them._of == {}
@@ -64,9 +64,9 @@ def test_each_has_its_time(arrive, closed, now):
     arrive(0, seconds=15.0)
     arrive(1, seconds=75.0)
     now[0] = 20.0
-    arrive.all_of_them.sweep()
+    arrive.all_of_them.close_expired()
     assert closed == [0]
     arrive(1, seconds=75.0)  # answered: its time begins anew
     now[0] = 80.0
-    arrive.all_of_them.sweep()
+    arrive.all_of_them.close_expired()
     assert closed == [0]

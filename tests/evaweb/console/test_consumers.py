@@ -425,14 +425,14 @@ def test_an_estop_that_cannot_be_delivered_says_use_the_hardware_stop(ann):
 
 def test_events_come_without_gaps_over_a_restart(live, ann, runtime):
     for number in range(3):
-        runtime.say("before", str(number))
+        runtime.emit("before", str(number))
 
     async def scenario():
         page = await Page(live.name, ann).open()
         await page.say(type="events", after=1)
         told = await page.told("events")
         assert [row["number"] for row in told["events"]] == [2, 3]
-        runtime.say("live", "now")
+        runtime.emit("live", "now")
         assert [row["text"] for row in (await page.told("events"))["events"]] == ["now"]
         runtime.end()
         runtime.boot_up()

@@ -130,7 +130,7 @@ def test_a_scribe_hears_and_writes_down(scribe, live, runtime, services, ann):
     runtime.enter(SessionEvent.CONNECTED)
     scribe.start()
     services.wait(lambda: services.trials == [(runtime.boot, 1, "state")])
-    runtime.say("episode_closed", uuid="e1")
+    runtime.emit("episode_closed", uuid="e1")
     services.wait(lambda: services.episodes == ["e1"])
     until(lambda: Station.objects.get(pk=live.pk).last_event == 2)
 
@@ -187,7 +187,7 @@ def test_a_locked_database_delays_and_loses_nothing(scribe, live, runtime, servi
     scribe.start()
     with caplog.at_level(logging.WARNING):
         for number in range(3):
-            runtime.say("state", str(number))
+            runtime.emit("state", str(number))
         until(lambda: "is written down later: database is locked" in caplog.text)
     locked.clear()
     services.wait(lambda: [number for _, number, _ in services.trials] == [1, 2, 3])
@@ -199,7 +199,7 @@ def test_two_web_processes_write_the_same_and_nothing_twice_in_the_row(live, run
     for one in both:
         one.start()
     for number in range(20):
-        runtime.say("state", str(number))
+        runtime.emit("state", str(number))
     until(lambda: Station.objects.get(pk=live.pk).last_event == 20)
     for one in both:
         one.end()
@@ -213,7 +213,7 @@ def test_a_chronicle_finds_stations_that_are_added_later(runtime, services):
     made = EventIngest(Feeds())
     made.start()
     Station.objects.create(name=runtime.name, robot="agilex_piper")
-    runtime.say("state", "hello")
+    runtime.emit("state", "hello")
     services.wait(lambda: services.trials == [(runtime.boot, 1, "state")])
     made.end()
     joined(made._thread)

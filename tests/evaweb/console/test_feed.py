@@ -64,18 +64,18 @@ def test_a_station_that_was_started_before_an_upgrade_says_what_its_state_means(
 
 def test_events_are_complete_also_those_from_before(runtime):
     for number in range(5):
-        runtime.say("old", str(number))
+        runtime.emit("old", str(number))
     feed, ear = StationFeed(runtime.name), Ear()
     feed.subscribe(ear, pictures=False)
     for number in range(100):
-        runtime.say("new", str(number))
+        runtime.emit("new", str(number))
     ear.wait(lambda stream, content: stream == "events" and content.newest == 105)
     feed.unsubscribe(ear)
     assert [row["number"] for row in feed.history.rows] == list(range(1, 106))
 
 
 def test_a_restarted_runtime_is_found_and_its_events_begin_anew(ear, runtime):
-    runtime.say("before")
+    runtime.emit("before")
     ear.wait(lambda stream, content: stream == "events" and content.newest == 1)
     runtime.end()
     runtime.boot_up()
@@ -130,8 +130,8 @@ def test_who_joins_later_is_told_what_is_known_at_once(ear):
     ear.wait(lambda stream, content: stream == "state")
     ear.wait(lambda stream, content: stream == "events")
     later = Ear()
-    ear.feed.join(later, pictures=False)
-    ear.feed.leave(later)
+    ear.feed.subscribe(later, pictures=False)
+    ear.feed.unsubscribe(later)
     assert {"link", "state", "events"} <= {stream for stream, _ in later.heard}
 
 

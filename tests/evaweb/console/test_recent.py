@@ -23,7 +23,7 @@ def sampled(count, dim=3, recent=None, **words):
             "measured": np.full(dim, number, np.float32),
             "commanded": np.full(dim, -number, np.float32),
         }
-        made = recent.with_one_more(vectors, {"step": number, **words}, float(number))
+        made = recent.add_sample(vectors, {"step": number, **words}, float(number))
     return decode(parts.build_frame([made], 1, 0.0))
 
 

@@ -568,7 +568,7 @@ def test_a_control_stays_whatever_is_found_of_it(bench, three, owner, margin):
     )
     blocks = carry_out_three(bench, plan)
     ends = {
-        names[0]: one.at
+        names[0]: one.ended_at_pair
         for names, one in zip(plan.document["comparisons"], findings_of(plan).each, strict=True)
     }
     assert ends[BETTER] < ends["pi0-third"]

@@ -45,15 +45,15 @@ def halted(user="ann", station="bench-1", pk=1, status=CommandStatus.ACCEPTED):
 
 def test_the_first_is_written_at_once_and_a_flood_is_counted(quiet, kept):
     first = halted()
-    quiet.note(first)
-    assert quiet.write() is None
+    quiet.record(first)
+    assert quiet.write_due() is None
     flood = [halted() for _ in range(5000)]
     for row in flood:
-        quiet.note(row)
-    assert quiet.write() == 1.0
+        quiet.record(row)
+    assert quiet.write_due() == 1.0
     assert kept == [first]
     quiet.now = 1.0
-    assert quiet.write() is None
+    assert quiet.write_due() is None
     assert kept == [first, flood[-1]]
     assert (first.data, flood[-1].data) == ({}, {"times": 5000})
 
@@ -66,8 +66,8 @@ def test_what_differs_is_written_each_for_itself(quiet, kept):
         halted(status=CommandStatus.REFUSED),
     ]
     for row in rows:
-        quiet.note(row)
-    quiet.write()
+        quiet.record(row)
+    quiet.write_due()
     assert kept == rows
 
 
@@ -75,17 +75,17 @@ def test_no_press_that_latched_is_only_counted_with_those_that_came_after_it(qui
     rows = [halted(status=CommandStatus.DONE) for _ in range(4)]
     for row, how, at in zip(rows, ("anew", "already", "anew", "already"), (1.0, 2.0, 3.0, 4.0), strict=True):
         row.kind, row.data = "estop", {"latched": how, "carried_out_at": at}
-        quiet.note(row)
-    quiet.write()
+        quiet.record(row)
+    quiet.write_due()
     assert [row.data["carried_out_at"] for row in kept if row.data["latched"] == "anew"] == [1.0, 3.0]
 
 
 def test_the_end_of_the_process_waits_for_no_second(quiet, kept):
     for _ in range(3):
-        quiet.note(halted())
-        quiet.write()
+        quiet.record(halted())
+        quiet.write_due()
     assert len(kept) == 1
-    quiet.write(all_of_them=True)
+    quiet.write_due(all_of_them=True)
     assert kept[1].data == {"times": 2}
 
 
@@ -124,8 +124,8 @@ def test_names_that_somebody_made_up_fill_no_disk(quiet, kept, settings, tmp_pat
     settings.DATA_DIR = tmp_path
     (tmp_path / "stations" / "real").mkdir(parents=True)
     for name in ("made-up", "x" * 300, "nu\0l", "real"):
-        quiet.note(halted(station=name, pk=None))
-    quiet.write()
+        quiet.record(halted(station=name, pk=None))
+    quiet.write_due()
     assert [row.station.name for row in kept] == ["real"]
     assert "there is no such station" in caplog.text
 
@@ -137,8 +137,8 @@ def test_a_station_that_the_disk_does_not_tell_of_is_one(quiet, kept, monkeypatc
     monkeypatch.setattr(Path, "is_dir", spoiled)
     rows = [halted(pk=None), halted(user="bob")]
     for row in rows:
-        quiet.note(row)
-    quiet.write()
+        quiet.record(row)
+    quiet.write_due()
     assert kept == rows
 
 
@@ -168,15 +168,15 @@ def test_presses_at_names_that_somebody_makes_up_are_few_lines_of_the_log(
     for second in range(5):
         quiet.now = float(second)
         for _ in range(100):
-            quiet.note(halted(station="odd", pk=None))
-        quiet.write()
+            quiet.record(halted(station="odd", pk=None))
+        quiet.write_due()
         for number in range(100):
-            quiet.note(halted(station=f"odd-{second}-{number}", pk=None))
-        quiet.write()
+            quiet.record(halted(station=f"odd-{second}-{number}", pk=None))
+        quiet.write_due()
     assert len(caplog.messages) == module._MOST_NAMES + 1, "of so many names, and one of all others"
     quiet.now = module._EVERY_S
-    quiet.note(halted(station="odd", pk=None))
-    quiet.write()
+    quiet.record(halted(station="odd", pk=None))
+    quiet.write_due()
     assert caplog.messages[-1].endswith("there is no such station (400 before it)")
     assert kept == []
 
@@ -185,8 +185,8 @@ def test_what_came_to_nothing_gives_way_to_what_was_carried_out(quiet, kept, mon
     monkeypatch.setattr(module, "_MOST", 3)
     rows = [halted(), *(halted(station=f"odd-{n}", status=CommandStatus.FAILED) for n in range(9))]
     for row in rows:
-        quiet.note(row)
-    quiet.write()
+        quiet.record(row)
+    quiet.write_due()
     assert [row.station.name for row in kept] == ["bench-1", "odd-7", "odd-8"]
     assert len(caplog.messages) == 1
 
@@ -194,8 +194,8 @@ def test_what_came_to_nothing_gives_way_to_what_was_carried_out(quiet, kept, mon
 def test_so_many_different_ones_wait_and_the_log_has_the_others(quiet, kept, monkeypatch, caplog):
     monkeypatch.setattr(module, "_MOST", 2)
     for name in ("ann", "bob", "cyd"):
-        quiet.note(halted(user=name))
-    quiet.write()
+        quiet.record(halted(user=name))
+    quiet.write_due()
     assert [row.user.username for row in kept] == ["bob", "cyd"]
     assert "is given up" in caplog.text
 

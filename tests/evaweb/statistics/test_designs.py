@@ -42,14 +42,14 @@ def test_a_fixed_number_is_tested_once_at_its_end_however_clear_it_is_before():
     found = made("none")
     assert told(found, [BETTER] * 19) == Conclusion(19, None, None, None, 20)
     ended = told(found, [BETTER] * 20)
-    assert (ended.at, ended.winner, ended.ended) == (
+    assert (ended.ended_at_pair, ended.winner, ended.ended) == (
         20,
         "first",
         "full",
     )  # which tells nothing of what was found
     assert ended.p < 1e-6
     equal = told(found, [SAME] * 20)
-    assert (equal.at, equal.winner, equal.ended, equal.p) == (20, None, "full", 1.0)
+    assert (equal.ended_at_pair, equal.winner, equal.ended, equal.p) == (20, None, "full", 1.0)
 
 
 @pytest.mark.parametrize("rule", ["evidence", "late", "early"])
@@ -57,12 +57,12 @@ def test_a_boundary_ends_it_early_for_the_one_that_is_better(rule):
     for pairs, winner in (([BETTER] * 20, "first"), ([WORSE] * 20, "second")):
         ended = told(made(rule), pairs)
         assert (ended.winner, ended.ended) == (winner, "boundary")
-        assert ended.at < 20
-        assert told(made(rule), pairs[: ended.at - 1]).ended == ""
+        assert ended.ended_at_pair < 20
+        assert told(made(rule), pairs[: ended.ended_at_pair - 1]).ended == ""
         # What was under way when it ended changes nothing.
-        assert told(made(rule), pairs[: ended.at] + [SAME] * 5).at == ended.at
+        assert told(made(rule), pairs[: ended.ended_at_pair] + [SAME] * 5).ended_at_pair == ended.ended_at_pair
     full = told(made(rule), [SAME] * 20)
-    assert (full.at, full.winner, full.ended) == (20, None, "full")
+    assert (full.ended_at_pair, full.winner, full.ended) == (20, None, "full")
 
 
 def test_scores_end_it_where_success_alone_would_not():
@@ -74,7 +74,7 @@ def test_scores_end_it_where_success_alone_would_not():
 def test_a_fixed_number_of_scores_is_tested_by_scores_not_by_whether_they_are_above_0():
     found = made("none", 20, outcome="score")
     ended = told(found, [(0.9, 0.2)] * 20)
-    assert (ended.at, ended.winner) == (20, "first")
+    assert (ended.ended_at_pair, ended.winner) == (20, "first")
     assert ended.p == pytest.approx(2 / 2**20)
     assert told(found, [(0.2, 0.9)] * 20).winner == "second"
     # Seldom above 0, but then far: success alone would call the second better.
@@ -93,14 +93,14 @@ def test_looks_that_are_named_are_the_only_ones():
     found = made("early", 30, looks=[10, 20])
     assert [look.first for look in found.boundary.looks] == [10, 20, 30]
     assert told(found, [BETTER] * 9).ended == ""
-    assert told(found, [BETTER] * 15).at == 10
+    assert told(found, [BETTER] * 15).ended_at_pair == 10
 
 
 @given(PAIRS, st.sampled_from(["none", "evidence", "late", "early"]))
 def test_mirrored_pairs_end_it_for_the_other_one_at_the_same_pair(pairs, rule):
     found = made(rule, 12)
     here, there = told(found, pairs), told(found, [(other, one) for one, other in pairs])
-    assert here.at == there.at
+    assert here.ended_at_pair == there.ended_at_pair
     assert {here.winner, there.winner} in ({None}, {"first", "second"})
 
 

@@ -41,7 +41,7 @@ def lab(tmp_path, monkeypatch, db):
     monkeypatch.setattr(doorbell, "notify_workers", lambda queue: True)
     made = Lab(builders.bench("bench"), Lockstep(stubbed(tmp_path, simulated=True)))
     for place in ("evaweb.stations.commands", "evaweb.stations.stops", "evaweb.trials.station_commands"):
-        monkeypatch.setattr(f"{place}.wire_to", lambda name: Direct(made.station))
+        monkeypatch.setattr(f"{place}.connection_to", lambda name: Direct(made.station))
     yield made
     made.station.close()  # its writer would go on into the tests that follow
 

@@ -38,7 +38,7 @@ def told(folder, user):
 
 def test_no_stage_of_a_trial_tells_a_blind_administrator_of_its_checkpoint(lab, alma, settings):
     lab.operator = alma  # an administrator who runs its trials is as blind as any operator
-    for stage in ("handed", "running", "failed", "scored"):
+    for stage in ("allocate", "running", "failed", "scored"):
         getattr(lab, stage)()
         text = told(settings.DATA_DIR, alma)
         assert [secret for secret in SECRETS if secret in text] == [], stage
@@ -46,7 +46,7 @@ def test_no_stage_of_a_trial_tells_a_blind_administrator_of_its_checkpoint(lab, 
 
 
 def test_who_has_looked_is_told(lab, settings):
-    lab.handed()
+    lab.allocate()
     lab.running()
     record_unblinding(lab.plan, lab.owner)
     text = told(settings.DATA_DIR, lab.owner)

@@ -86,7 +86,7 @@ def test_a_planned_comparison_whose_design_has_not_ended_is_described_and_nothin
     of_it = found.comparison_of("old", "new")
     assert of_it.standing is Standing.OPEN
     assert of_it.difference.interval.high < 0
-    for name in ("test", "corrected", "better", "paired", "scored", "anytime", "score_anytime", "sooner"):
+    for name in ("test", "corrected", "better", "paired", "scored", "anytime", "score_anytime", "time_test"):
         assert getattr(of_it, name) is None, name
     assert (of_it.evidence is None, of_it.score_evidence is None) == (
         evidence != "success",

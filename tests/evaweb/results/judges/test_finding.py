@@ -57,7 +57,7 @@ def test_the_bench_is_certain_of_what_it_reports_and_silent_about_the_rest():
 
 def test_a_judge_of_somebodys_own_joins_by_its_name(plug_in):
     verdict = CaseJudgement((MilestoneJudgement(True, 0.5), MilestoneJudgement(False, 0.5)))
-    assert plug_in(lambda self, case: verdict).asked(CASE) == verdict
+    assert plug_in(lambda self, case: verdict).judge_case(CASE) == verdict
 
 
 def test_one_that_fails_is_named(plug_in):
@@ -65,9 +65,9 @@ def test_one_that_fails_is_named(plug_in):
         raise KeyError("weights")
 
     with pytest.raises(EvaError, match=r"^judge mine: KeyError: 'weights'$"):
-        plug_in(fails).asked(CASE)
+        plug_in(fails).judge_case(CASE)
     with pytest.raises(EvaError, match=r"^judge mine: 1 verdicts on 2 milestones$"):
-        plug_in(lambda self, case: CaseJudgement((MilestoneJudgement(),))).asked(CASE)
+        plug_in(lambda self, case: CaseJudgement((MilestoneJudgement(),))).judge_case(CASE)
 
 
 def test_one_that_cannot_be_loaded_is_named_with_its_file(monkeypatch):
