@@ -18,7 +18,7 @@ from django.db.models.signals import post_migrate
 
 @dataclass(frozen=True, slots=True)
 class AppendOnly:
-    """What of a model's rows is never changed: all columns `except_columns` some, or `columns` alone; nor is a row removed.
+    """What of a model's rows is never changed: all but `except_columns`, or `columns` alone; nor is a row removed.
 
     `message` is what whoever tries is told. `only`: SQL about OLD, which rows that holds for; all where it is empty.
     `moves`: of these columns, what may follow each value; from one that is not named everything may. `never`: SQL about

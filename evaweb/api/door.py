@@ -1,7 +1,8 @@
 """Stops of a robot over REST, answered before Django is asked for anything: no database, no thread of a page.
 
 E-stop, stop and halt of a station, and whether this way to them stands. Everything else goes on to the application;
-evaweb.api.stations describes all of it. It stands before the web, and alone in the process for stops (`stop_application`).
+evaweb.api.stations describes all of it. It stands before the web, and alone in the process for stops
+(`stop_application`).
 """
 
 from __future__ import annotations

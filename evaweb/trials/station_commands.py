@@ -106,7 +106,10 @@ def trial_command(
 def checkpoint_command(
     *, user: User, checkpoint: Checkpoint, kind: str, args: Mapping[str, Any] | None = None, **given: Any
 ) -> Command:
-    """Set a station up for a checkpoint, for no trial; `given` as in `issue_command`. Raises EvaError for other commands."""
+    """Set a station up for a checkpoint, for no trial; `given` as in `issue_command`.
+
+    Raises EvaError for other commands.
+    """
     require_role(user, Role.OPERATOR)
     if kind != "setup":
         raise EvaError(_CHECKPOINT_OF_SETUP_ALONE(kind=kind))

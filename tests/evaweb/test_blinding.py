@@ -146,7 +146,7 @@ def lose(plan):
 
 @pytest.mark.exhaustive
 def test_who_has_looked_is_told_everything(lab):
-    lab.handed()
+    lab.allocate()
     lab.running()
     client = Client()
     client.force_login(lab.owner)

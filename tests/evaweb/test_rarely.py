@@ -18,7 +18,12 @@ def rarely(now):
 
 
 def test_each_name_is_due_once_in_its_time_with_how_often_it_came_since(rarely, now):
-    assert [rarely.suffix_if_due("a"), rarely.suffix_if_due("a"), rarely.suffix_if_due("a", 5), rarely.suffix_if_due("b")] == ["", None, None, ""]
+    assert [
+        rarely.suffix_if_due("a"),
+        rarely.suffix_if_due("a"),
+        rarely.suffix_if_due("a", 5),
+        rarely.suffix_if_due("b"),
+    ] == ["", None, None, ""]
     now[0] += 10.0
     assert rarely.suffix_if_due("a") == " (6 before it)"
     now[0] += 10.0

@@ -60,7 +60,9 @@ def test_a_boundary_ends_it_early_for_the_one_that_is_better(rule):
         assert ended.ended_at_pair < 20
         assert told(made(rule), pairs[: ended.ended_at_pair - 1]).ended == ""
         # What was under way when it ended changes nothing.
-        assert told(made(rule), pairs[: ended.ended_at_pair] + [SAME] * 5).ended_at_pair == ended.ended_at_pair
+        assert (
+            told(made(rule), pairs[: ended.ended_at_pair] + [SAME] * 5).ended_at_pair == ended.ended_at_pair
+        )
     full = told(made(rule), [SAME] * 20)
     assert (full.ended_at_pair, full.winner, full.ended) == (20, None, "full")
 

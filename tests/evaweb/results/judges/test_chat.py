@@ -74,7 +74,7 @@ def test_what_is_sent_is_the_question_and_the_pictures(monkeypatch):
     sent = json.loads(body)
     assert set(sent) == {"model", "temperature", "response_format", "messages"}
     system, user = sent["messages"]
-    assert build(Setup("https://h.example", "seer")).words(CASE) == json.dumps(
+    assert build(Setup("https://h.example", "seer")).prompt_text(CASE) == json.dumps(
         [system["content"], user["content"][0]["text"]], ensure_ascii=False
     )
     assert user["content"][0]["text"] == (
