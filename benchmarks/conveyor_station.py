@@ -51,7 +51,7 @@ def _places(robot: str) -> PlaceMap:
 
 
 class DeferredPicturesEnvironment(Environment):
-    """The conveyor, with a stamp for each picture: the number of its frame, of which `develop` draws the picture."""
+    """The conveyor, with a stamp for each picture: the number of its frame, of which `render` draws the picture."""
 
     def __init__(self, robot: Robot, conveyor: Conveyor) -> None:
         self.conveyor = conveyor
