@@ -146,7 +146,7 @@ class FakeConnection:
             self.snapshot = {**self.snapshot, "checkpoint": command.args.get("checkpoint")}
         return Ack(command.uuid, self.status_word, self.reason, ["stop"], BOOT, 7, data)
 
-    def urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
+    def request_urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
         """The same, over a connection of its own."""
         return self.request(command)
 

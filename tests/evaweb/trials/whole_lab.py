@@ -22,7 +22,7 @@ class Direct:
     def __init__(self, station):
         self._station = station
 
-    def urgent(self, command, process, key, timeout):
+    def request_urgent(self, command, process, key, timeout):
         return self.request(command)
 
     def status(self):
