@@ -1,4 +1,4 @@
-"""The application that daphne serves: pages and REST over HTTP, live stations over websockets."""
+"""ASGI application that daphne serves: pages and REST over HTTP, live stations over websockets."""
 
 from __future__ import annotations
 
