@@ -115,7 +115,7 @@ class Beside:
 
 
 class Questions:
-    """Questions that `run` answers, one after the other, the persons in turn; from any thread."""
+    """Queue of computations that `run` executes one at a time, users in turn, with cached results. Thread-safe."""
 
     def __init__(
         self,

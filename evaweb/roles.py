@@ -19,7 +19,7 @@ _NEEDS_ROLE = Pattern(
 
 
 class Role(StrEnum):
-    """Groups of users; a user in none of them is a viewer."""
+    """The groups; a user without any is a viewer."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"
