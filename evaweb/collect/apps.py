@@ -1,16 +1,16 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 
 
 class CollectConfig(AppConfig):
-    """Collecting sessions and their demonstrations."""
+    """Collection sessions and their demonstrations."""
 
     name = "evaweb.collect"
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
         from evaweb.append_only import protect
-        from evaweb.collect import restoring  # noqa: F401  it declares itself to those that reconcile
+        from evaweb.collect import restoring  # noqa: F401  registers itself as a restorer
 
         protect(self)
