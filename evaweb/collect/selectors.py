@@ -29,7 +29,7 @@ PUBLISHED_RESULTS = (Result.SUCCESS.value, Result.PARTIAL.value)
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Numbers of a session's episodes: `saved` are complete and not discarded, counted by result; `cut` are incomplete."""
+    """Numbers of a session's episodes: `saved` (complete, not discarded) in all and by result; `cut` are incomplete."""
 
     saved: int
     success: int

@@ -37,7 +37,8 @@ _LEAST_RATE = 0.95 * 2 * CUT_OFF  # least rate of observations [1/s]; tolerates 
 class Smoothness:
     """Smoothness of a run: mean over its arms weighted by path length; None, with `why`, if unknown.
 
-    `arms`: name -> {"measured", "commanded": SPARC or None, "measured_m", "commanded_m": path length [m]}, if moved.
+    `arms` of those that moved: name -> {"measured", "commanded": SPARC or None, "measured_m", "commanded_m": path
+    length [m]}.
     """
 
     measured: float | None
