@@ -103,7 +103,10 @@ def install(connection: Any, guards: Iterable[TriggerSpec]) -> None:
 
 
 def triggers_suspended(apps: Any, editor: Any) -> None:
-    """For a migration: SQLite rebuilds no table that a trigger of another one names. They come back once it is done."""
+    """Drop all triggers during a migration on SQLite, which cannot rebuild a table that another's trigger names.
+
+    They are installed again after the migration.
+    """
     if editor.connection.vendor != "sqlite":
         return
     with editor.connection.cursor() as cursor:

@@ -8,7 +8,7 @@ os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
 
 from django.core.asgi import get_asgi_application
 
-http = get_asgi_application()  # before anything that imports models
+http = get_asgi_application()  # sets up the apps, so it precedes all imports of models
 
 from channels.routing import ProtocolTypeRouter, URLRouter
 from channels.security.websocket import AllowedHostsOriginValidator

@@ -181,7 +181,7 @@ class Questions:
             wait = ceil((spent - AT_ONCE_S) / REFILLED) + 1
             raise Busy(_SPENT(spent=spent, at_once=AT_ONCE_S, seconds=wait), wait)
         coming: Future[Any] = self._turns.submit(person, partial(self._answered, person, question))
-        if not coming.done():  # else there was no room for it
+        if not coming.done():  # otherwise it was refused for lack of room
             self._asked[question] = (person, coming)
             coming.add_done_callback(lambda _: self._asked.pop(question, None))
         return coming

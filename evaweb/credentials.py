@@ -59,7 +59,7 @@ _NO_TURN = Pattern("credentials.no_turn", "the database has not come to this log
 
 
 class Unverifiable(Exception):
-    """The database did not report whose credential this is."""
+    """The database did not report the user of a credential."""
 
 
 class LookupOverload(Exception):

@@ -237,7 +237,7 @@ def folders() -> list[str]:
 
 
 def parse_model(model: type[AnyLine], content: Mapping[str, Any], what: str) -> AnyLine:
-    """Validate `content`. Raises: EvaError with `what` and the first problem."""
+    """Return `content` as an instance of `model`. Raises: EvaError with `what` and the first problem."""
     try:
         return model.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -280,7 +280,9 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
 def _written(file: FileIO, payload: bytes) -> None:
     new = file.tell() == 0
     if not new:
-        file.seek(-1, os.SEEK_END)
+        file.seek(
+            -1, os.SEEK_END
+        )  # a crash may have torn the last line: end it, so that only that one is lost
         payload = payload if file.read(1) == b"\n" else b"\n" + payload
     while payload:
         payload = payload[file.write(payload) :]
@@ -292,7 +294,7 @@ def _written(file: FileIO, payload: bytes) -> None:
 
 
 def _truncate_back(file: FileIO, before: int) -> str:
-    """Restore the file's length; return what became of the line."""
+    """Restore the file's length; return the fate of the line as text for the error message."""
     try:
         file.truncate(before)
         os.fsync(file.fileno())

@@ -77,7 +77,7 @@ class FairLookupPool(Generic[T]):
             share, waiting = self._shares.popitem(last=False)
             work, answer = waiting.popleft()
             if waiting:
-                self._shares[share] = waiting  # behind all others
+                self._shares[share] = waiting  # at the end of the rotation
             self._waiting -= 1
         try:
             found = work()

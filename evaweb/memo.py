@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable
 from threading import Lock
 from typing import Generic, TypeVar
 
-_MOST = 256  # analyses of 500 trials each: some 100 MB
+_MOST = 256  # values; with analyses of 500 trials about 100 MB
 T = TypeVar("T")
 
 

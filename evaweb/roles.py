@@ -1,4 +1,4 @@
-"""Roles and their rights: three groups, each with the rights of the one before it."""
+"""Roles of users as three groups, each with all rights of the previous one."""
 
 from __future__ import annotations
 

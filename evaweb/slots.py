@@ -62,6 +62,7 @@ class RequestLimiter:
     ) -> None:
         exports = (self._exports,) if _is_export(scope) else ()
         async with AsyncExitStack() as stack:
+            # From the narrowest share to the global one: a request that waits for its own share holds no global slot.
             for turns in (own, *exports, of_all, self._turns):
                 await client.unless_gone(turns.acquire())
                 stack.callback(turns.release)

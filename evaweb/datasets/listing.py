@@ -36,7 +36,7 @@ class DatasetRow:
 
     @property
     def verdict(self) -> str:
-        """ "pass", "fail", or "" if undecided."""
+        """Verdict of its review: "pass", "fail", or "" if undecided."""
         review = getattr(getattr(self.recording, "standing", None), "review", None)
         return str(review.verdict) if review else ""
 

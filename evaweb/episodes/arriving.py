@@ -38,7 +38,7 @@ def owner_of(uuid: str) -> str:
 
 
 def whereabouts(episode: Episode) -> str:
-    """Return where an episode that has not arrived is, and the transferred part, as a message."""
+    """Return the location of an episode in transfer, and the transferred part, as a message."""
     name = episode.station.name
     found = progress_of(data_dir(), name, str(episode.uuid))
     if found is None:

@@ -43,7 +43,9 @@ def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> in
             draft = Path(folder) / "new"
             draft.mkdir()
             _fill(episode, draft, tell)
-            if target.is_dir():
+            if (
+                target.is_dir()
+            ):  # a folder cannot replace one that is not empty, so move the old one away first
                 os.replace(target, draft.with_name("old"))
             os.replace(draft, target)
         sync_folder(target.parent)

@@ -46,7 +46,7 @@ def _operators(args: Args) -> Role:
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """Declaration of a kind: its function, who may request it, and what a worker needs."""
+    """Declaration of a kind: its function, the role that may request it, and the requirements for a worker."""
 
     does: Kind
     least: Least = _operators

@@ -50,7 +50,7 @@ MOST_DEATHS = 8  # workers that may die over one job, mostly not through its fau
 _LAPSES = 0.75  # fraction of EVA_JOB_STALE_S without a heartbeat after which a worker exits
 _HOLD_AGAIN_S = 0.5
 _AGAIN_S = 5.0  # delay before a job is retried that another process still holds
-OWNER = uuid4()  # this process
+OWNER = uuid4()  # identity of this process
 
 _busy = threading.Lock()
 _ending = threading.Event()
@@ -199,7 +199,7 @@ def hold(job: Job, names: Collection[str]) -> None:
 def _held_by_another(job: Job, names: Sequence[str]) -> str | None:
     """Hold the names if they are free and return None; else return the key of the job that holds one."""
     at_work = Hold.objects.filter(job__status=JobStatus.RUNNING, job__owner=F("owner"))
-    Hold.objects.filter(job=job).delete()  # also where it has to wait
+    Hold.objects.filter(job=job).delete()  # released even if it has to wait, so that jobs cannot deadlock
     try:
         with transaction.atomic():
             Hold.objects.filter(what__in=names).exclude(pk__in=at_work.values("pk")).delete()

@@ -103,7 +103,7 @@ register_visibility_rule(visibility_for)
 
 
 def _lost_plans() -> QuerySet[Evaluation]:
-    """Return the evaluations of plans missing from the database; they count as blind, as nobody can unblind them."""
+    """Return the evaluations of plans missing from the database; they count as blind, as nothing can unblind them."""
     return Evaluation.objects.filter(kind=Evaluation.Kind.PLAN, plan=None).exclude(trials=None).order_by("pk")
 
 

@@ -65,7 +65,7 @@ _REFERENCE_POSITION_SCENE_DOES_NOT = Pattern(
 LARGEST_TEXT = 2_000_000  # size of the TOML [bytes]
 LARGEST_PICTURE = 10_000_000
 LARGEST = 400_000_000  # size of an imported file, and of its unpacked content [bytes]
-_MOST = 20_000  # pictures
+_MOST = 20_000  # pictures in an archive
 _PICTURE = re.compile(r"pictures/([0-9a-f]{64})\.jpg")
 
 

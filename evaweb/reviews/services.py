@@ -55,7 +55,7 @@ _EPISODE_STILL_BEING_RECORDED_REVIEW = Pattern(
     "episode {uuid} is still being recorded: review it when it is closed",
 )
 
-LONGEST_NOTE = 8000  # characters
+LONGEST_NOTE = 8000  # longest note [characters]
 LONGEST_LABEL = 120
 LONGEST_MILESTONE = 200
 MOST_TAGS = 30  # tags per episode

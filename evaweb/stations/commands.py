@@ -247,6 +247,7 @@ def _send(row: Command, command: messages.Command) -> Command:
         return first
     except Error as error:
         raise NotSent(_NOT_WRITTEN_DOWN(kind=row.kind, error=error)) from error
+    # A row that took long to write delays the command; it is then reported as failed instead of moving a robot late.
     _put(row, _send_and_wait(row, command, waited=time.monotonic() - pressed))
     _update(row)
     return row

@@ -93,7 +93,7 @@ class Keys:
 def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
     """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; print the address as JSON.
 
-    `owner` returns whose episode it is that a station offers. Raises: GateError.
+    `owner` returns the name of the station that owns an offered episode. Raises: GateError.
     """
     try:
         with _only_one(key_files.folder(settings.DATA_DIR) / "gate.lock"):

@@ -1,4 +1,4 @@
-"""Journal of a process: what it intends to write to the database, recovered by others if it dies."""
+"""Journal of a process: intended database writes, recovered by another process if it dies."""
 
 from __future__ import annotations
 

@@ -160,6 +160,7 @@ class UnwrittenCommands:
             log.error("a command is not in the database: %r; it was %.9999r", refused, content)
             if _path(name).exists():
                 _path(name).replace(_folder() / f"{name}.refused")
+        # Removed only after the write: a crash in between repeats it, and `write` merges rows with the same uuid.
         _path(name).unlink(missing_ok=True)
         self._kept.pop(name, None)
 

@@ -372,7 +372,7 @@ def _since(given: str) -> datetime:
     try:
         moment = parse_datetime(given)
         day = parse_date(given) if moment is None else None
-    except ValueError:  # well formed, but no such day
+    except ValueError:  # well-formed, but not a valid date
         moment = day = None
     if day is not None:
         moment = datetime.combine(day, time.min)
@@ -381,5 +381,5 @@ def _since(given: str) -> datetime:
     try:
         moment = moment if timezone.is_aware(moment) else timezone.make_aware(moment)
         return moment.astimezone(UTC)
-    except OverflowError:  # at an end of the calendar: no time in another zone
+    except OverflowError:  # at the end of the calendar, where conversion between zones overflows
         raise EvaError(_SINCE_THERE_NO_SUCH_TIME(given=given)) from None

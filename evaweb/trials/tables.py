@@ -67,7 +67,7 @@ def check_term(given: str) -> None:
 
 
 def check_milestones(texts: Sequence[str]) -> None:
-    """Raise ValidationError if two milestones of a scene have the same text: results could not tell them apart."""
+    """Raise ValidationError if two milestones of a scene have the same text: results could not distinguish them."""
     twice = next((text for text in texts if texts.count(text) > 1), None)
     if twice is not None:
         raise ValidationError(
