@@ -311,7 +311,7 @@ def _merged(row: Command) -> Command:
     if better:
         row.save(
             update_fields=better, force_update=True
-        )  # `row` was not loaded: without it save() would insert
+        )  # force_update: `row` was not loaded, so a plain save() would insert it
     return _find_first(row) or row
 
 

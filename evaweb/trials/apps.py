@@ -11,6 +11,6 @@ class TrialsConfig(AppConfig):
 
     def ready(self) -> None:
         from evaweb.append_only import protect
-        from evaweb.trials import restoring  # noqa: F401  registers itself as a restorer
+        from evaweb.trials import restoring  # noqa: F401  it declares itself to those that reconcile
 
         protect(self)
