@@ -1,1 +1,1 @@
-"""Everything persistent or visible: pages, live console, trials, episodes, jobs, REST."""
+"""Web application with the database: pages, live console, trials, episodes, jobs, REST."""

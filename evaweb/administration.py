@@ -1,4 +1,4 @@
-"""The admin pages: for users with the role of an admin, with all rights there."""
+"""Django admin site for users with the admin role, who have all permissions there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evaweb.blinding import visibility_for_user
 from evaweb.errors import NotAllowed
 from evaweb.roles import Role, role_of
 
-# Pages that say which checkpoint a trial, a recording, a command or a job is about.
+# Prefixes of pages that reveal the checkpoint of a trial, a recording, a command or a job.
 _REVEALING_PAGES = (
     "trials_trial_",
     "trials_score_",
@@ -28,22 +28,22 @@ _REVEALING_PAGES = (
 
 
 class LabAdminSite(AdminSite):
-    """Django's admin site, opened by the role instead of a flag."""
+    """Admin site that is opened by the user's role instead of `is_staff`."""
 
     site_header = site_title = "EVA administration"
     index_title = "The lab"
     login_form = AuthenticationForm  # the role decides, not is_staff
 
     def has_permission(self, request: HttpRequest) -> bool:
-        """True if this user is an admin."""
+        """Return True if this user is an admin."""
         return bool(request.user.is_active and is_admin(request.user))
 
     def password_change(self, request: HttpRequest, extra_context: Any = None) -> HttpResponseRedirect:
-        """The lab's page for it, where guesses of the old password are counted."""
+        """Redirect to the lab's own page, which counts wrong guesses of the old password."""
         return redirect("password")
 
     def admin_view(self, view: Callable[..., Any], cacheable: bool = False) -> Callable[..., Any]:
-        """With pages that would tell what is hidden from this administrator closed to them."""
+        """Wrap a view to refuse pages that would reveal data hidden from this administrator."""
         inner = super().admin_view(view, cacheable)
 
         @wraps(inner)
@@ -60,10 +60,10 @@ class LabAdminSite(AdminSite):
 
 
 class LabelledRows:
-    """Of a ModelAdmin whose list is edited in place: the head of a column is no label to a reader of screens."""
+    """Mixin of a ModelAdmin with an editable list: screen readers get a label per field, as column heads are none."""
 
     def get_changelist_form(self, request: HttpRequest, **named: Any) -> Any:
-        """Each field says what it is of its row."""
+        """Return the form with an aria-label per field, which names field and row."""
         form = super().get_changelist_form(request, **named)  # type: ignore[misc]
         wanted = getattr(self, "list_editable", ())
 
@@ -78,19 +78,19 @@ class LabelledRows:
 
 
 class RoleBackend(BaseBackend):
-    """Gives admins every permission; logging in is another backend's business."""
+    """Authentication backend that grants admins every permission; logins are handled by other backends."""
 
     def has_perm(self, user_obj: Any, perm: str, obj: Any = None) -> bool:
-        """True if this user is an admin."""
+        """Return True if this user is an admin."""
         return bool(user_obj.is_active and is_admin(user_obj))
 
     def has_module_perms(self, user_obj: Any, app_label: str) -> bool:
-        """The same for a whole app."""
+        """Return True if this user is an admin."""
         return self.has_perm(user_obj, app_label)
 
 
 def is_admin(user: Any) -> bool:
-    """True if the role is admin; looked up once per request, the lifetime of `user`."""
+    """Return True if the role is admin; looked up once per `user` object, that is per request."""
     if not hasattr(user, "_eva_is_admin"):
         user._eva_is_admin = role_of(user) is Role.ADMIN
     return bool(user._eva_is_admin)

@@ -1,7 +1,7 @@
-"""Rows that the database itself refuses to change or remove, whatever program asks it to.
+"""Rows that the database refuses to change or delete, whichever program tries.
 
-A model says so by `append_only = AppendOnly(...)`. Triggers are installed after every migration, because SQLite loses a
-table's when a migration rebuilds it.
+A model declares this by `append_only = AppendOnly(...)`. Triggers are installed after every migration, because SQLite
+drops the triggers of a table that a migration rebuilds.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from django.db.models.signals import post_migrate
 
 @dataclass(frozen=True, slots=True)
 class AppendOnly:
-    """What of a model's rows is never changed: all but `except_columns`, or `columns` alone; nor is a row removed.
+    """Declaration of the immutable part of a model's rows; a row is never deleted either.
 
-    `message` is what whoever tries is told. `only`: SQL about OLD, which rows that holds for; all where it is empty.
-    `moves`: of these columns, what may follow each value; from one that is not named everything may. `never`: SQL about
-    OLD and NEW that no change of any row makes true. `late`: SQL about NEW, which rows are never added.
+    Protected are all columns except `except_columns`, or only `columns`. `message` is the text of the database error.
+    `condition`: SQL about OLD that selects the protected rows, all if empty. `allowed_changes`: by column, the values
+    that may follow each value; a value that is not listed may change to any. `never`: SQL about OLD and NEW; an update
+    for which one of them is true is refused. `forbidden_inserts`: SQL about NEW that selects rows that are refused.
     """
 
     message: str
@@ -34,9 +35,9 @@ class AppendOnly:
     forbidden_inserts: str = ""
 
     def guard(self, model: type[Model]) -> TriggerSpec:
-        """The same as the database knows it."""
+        """Return the triggers of `model` in terms of tables and columns. Raises: FieldDoesNotExist."""
         for name in (*self.columns, *self.except_columns, *self.allowed_changes):
-            model._meta.get_field(name)  # or FieldDoesNotExist
+            model._meta.get_field(name)  # raises FieldDoesNotExist for a misspelt declaration
         columns = tuple(
             field.column
             for field in model._meta.concrete_fields
@@ -56,18 +57,18 @@ class AppendOnly:
 
 @dataclass(frozen=True, slots=True)
 class TriggerSpec:
-    """What of `table` stays: the values of `columns`, and the row. `message` is what whoever tries is told."""
+    """Append-only triggers of `table`: they protect rows and the values of `columns`; `message` is the error text."""
 
     table: str
     columns: tuple[str, ...]
     message: str
-    only: str = ""  # SQL about OLD: which rows are kept; all where it is empty
-    never: tuple[str, ...] = ()  # SQL about OLD and NEW: what no change may be
-    late: str = ""  # SQL about NEW: which rows are not added
+    only: str = ""  # SQL about OLD: protected rows; all if empty
+    never: tuple[str, ...] = ()  # SQL about OLD and NEW: forbidden updates
+    late: str = ""  # SQL about NEW: forbidden inserts
 
     @property
     def names(self) -> Mapping[str, str]:
-        """Its triggers, by what they are against."""
+        """Trigger names by event."""
         names = {
             "UPDATE": "kept",
             "DELETE": "never_removed",
@@ -77,7 +78,11 @@ class TriggerSpec:
         return {event: f"{self.table}_{name}" for event, name in names.items()}
 
     def refused(self, different: str) -> Mapping[str, str]:
-        """SQL about OLD and NEW, by event: what is refused. `different`: the operator that also compares NULL."""
+        """Return by event the SQL condition about OLD and NEW under which it is refused.
+
+        Args:
+            different: The NULL-safe inequality operator of the database.
+        """
         changed = " OR ".join(f'OLD."{column}" {different} NEW."{column}"' for column in self.columns)
         kept = f"({self.only or 'TRUE'}) AND ({changed})"
         update = " OR ".join(f"({each})" for each in (kept, *self.never))
@@ -87,7 +92,7 @@ class TriggerSpec:
 
 
 def install(connection: Any, guards: Iterable[TriggerSpec]) -> None:
-    """Make the triggers anew, as they are declared now; other databases than SQLite and PostgreSQL are refused."""
+    """Drop and create the triggers as currently declared. Raises: NotImplementedError unless SQLite or PostgreSQL."""
     make = {"sqlite": _sqlite, "postgresql": _postgresql}.get(connection.vendor)
     if make is None:
         raise NotImplementedError(f"a database of {connection.vendor}; allowed: sqlite, postgresql")
@@ -98,7 +103,10 @@ def install(connection: Any, guards: Iterable[TriggerSpec]) -> None:
 
 
 def triggers_suspended(apps: Any, editor: Any) -> None:
-    """For a migration: SQLite rebuilds no table that a trigger of another one names. They come back once it is done."""
+    """Drop all triggers during a migration on SQLite, which cannot rebuild a table that another's trigger names.
+
+    They are installed again after the migration.
+    """
     if editor.connection.vendor != "sqlite":
         return
     with editor.connection.cursor() as cursor:
@@ -108,7 +116,7 @@ def triggers_suspended(apps: Any, editor: Any) -> None:
 
 
 def protect(app: AppConfig) -> None:
-    """Have what the models of `app` declare installed whenever its tables were migrated."""
+    """Install the triggers that the models of `app` declare, after each migration of its tables."""
 
     def install_guards(sender: AppConfig, using: str, **named: Any) -> None:
         install(connections[using], guards(app))
@@ -117,20 +125,23 @@ def protect(app: AppConfig) -> None:
 
 
 def guards(app: AppConfig) -> tuple[TriggerSpec, ...]:
-    """What the models of `app` declare."""
+    """Return the triggers that the models of `app` declare."""
     return tuple(
         model.append_only.guard(model) for model in app.get_models() if hasattr(model, "append_only")
     )
 
 
 def removal(connection: Any, guard: TriggerSpec) -> list[str]:
-    """What takes the triggers of a guard away."""
+    """Return the SQL statements that drop the triggers of a guard."""
     of = f" ON {guard.table}" if connection.vendor == "postgresql" else ""
     return [f"DROP TRIGGER IF EXISTS {name}{of}" for name in guard.names.values()]
 
 
 def _sqlite(guard: TriggerSpec) -> list[str]:
-    """REPLACE removes a row too: settings has recursive_triggers, with which that is refused."""
+    """Return the CREATE statements for SQLite.
+
+    REPLACE deletes rows without DELETE triggers unless PRAGMA recursive_triggers is on, which evaweb.settings does.
+    """
     return [
         f"CREATE TRIGGER {guard.names[event]} BEFORE {event} ON {guard.table} WHEN {refused} "
         f"BEGIN SELECT RAISE(ABORT, '{guard.message}'); END"
@@ -139,7 +150,10 @@ def _sqlite(guard: TriggerSpec) -> list[str]:
 
 
 def _postgresql(guard: TriggerSpec) -> list[str]:
-    """A function for each trigger: the conditions of triggers themselves know no other rows."""
+    """Return the CREATE statements for PostgreSQL, with one function per trigger.
+
+    A function is needed because a trigger's WHEN condition may not query other rows.
+    """
     refused = {**guard.refused("IS DISTINCT FROM"), "TRUNCATE": "TRUE"}
     return [
         statement

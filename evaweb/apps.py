@@ -1,4 +1,4 @@
-"""Registers the admin pages."""
+"""Django configuration of the admin site."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from django.contrib.admin.apps import AdminConfig
 
 
 class LabAdminConfig(AdminConfig):
-    """Django's admin, with our site as the default one."""
+    """Django's admin app with the lab's site as the default."""
 
     default_site = "evaweb.administration.LabAdminSite"
 
     def ready(self) -> None:
-        """Listen to logins, and look at the data folder."""
+        """Register the login receivers and the system checks of the data folder."""
         super().ready()
         from evaweb import audit, private  # noqa: F401  receivers and checks

@@ -1,4 +1,4 @@
-"""The application that daphne serves: pages and REST over HTTP, live stations over websockets."""
+"""ASGI application that daphne serves: pages and REST over HTTP, live stations over websockets."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
 
 from django.core.asgi import get_asgi_application
 
-http = get_asgi_application()  # before anything that imports models
+http = get_asgi_application()  # sets up the apps, so it precedes all imports of models
 
 from channels.routing import ProtocolTypeRouter, URLRouter
 from channels.security.websocket import AllowedHostsOriginValidator

@@ -1,7 +1,7 @@
-"""Logins, logouts and refusals, a line each in the log.
+"""Log lines of logins, logouts and refusals.
 
-Names are logged as Python writes them, so that no control character reaches a terminal. An unknown name is not
-logged: it may be a password in the wrong field.
+Names are logged with `ascii()`, so that no control character reaches a terminal. An unknown name is not logged: it may
+be a password typed into the wrong field.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from evaweb.callers import client_address
 from evaweb.rarely import LogThrottle
 
 log = logging.getLogger(__name__)
-_MOST = 1000  # addresses that are remembered
+_MOST = 1000  # addresses with a rate limit of their own
 _EVERY_S = 60.0
 _refused = LogThrottle(_EVERY_S, _MOST)
-_unverified = LogThrottle(10.0, 16)  # a crowd presses more often than a disk writes
+_unverified = LogThrottle(10.0, 16)  # presses can arrive faster than the disk writes
 
 
 @receiver(user_logged_in)
@@ -58,7 +58,7 @@ def _on_lockout(
 
 
 def log_token_refused(address: str | None, why: str) -> None:
-    """A token did not open anything; once a minute per address, with how many there were."""
+    """Log a refused token, at most once a minute per address, with the number of suppressed lines."""
     where = address or "nowhere"
     before = _refused.suffix_if_due(where)
     if before is not None:
@@ -66,7 +66,7 @@ def log_token_refused(address: str | None, why: str) -> None:
 
 
 def estop_unverified(station: str, why: Exception) -> None:
-    """An e-stop was obeyed of nobody knows whom; once in 10 s per station, with how many there were."""
+    """Log an e-stop that was executed without a verified user, at most once in 10 s per station."""
     before = _unverified.suffix_if_due(station)
     if before is not None:
         log.error("an e-stop of %a is obeyed, of nobody knows whom: %s%s", station[:80], why, before)

@@ -1,8 +1,8 @@
-"""The binary message that carries numbers and pictures to a page: a JSON header, then the raw values.
+"""Binary message that carries numbers and images to a page: a JSON header, then the raw values.
 
-Layout: length of the header (uint32), header (UTF-8 JSON), and from the next multiple of 8 on the body, in
-which every value starts at a multiple of 8. All numbers are little-endian. An `offset` in the header counts
-bytes from the start of the body. A page reads values in place: `new Float32Array(buffer, body + offset, n)`.
+Layout: length of the header (uint32), header (UTF-8 JSON), and from the next multiple of 8 the body, in which every
+value starts at a multiple of 8. All numbers are little-endian. An `offset` in the header counts bytes from the start of
+the body. A page reads values in place: `new Float32Array(buffer, body + offset, n)`.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from evaweb.errors import EvaError
 
 _ALIGNMENT = 8
 _LENGTH = struct.Struct("<I")
-DTYPES = ("f4", "f8", "i4", "u1")  # those that have a typed array in a browser
+DTYPES = ("f4", "f8", "i4", "u1")  # types with a typed array in browsers
 
 
 class FrameError(EvaError):
-    """A message does not follow the layout, or a value has no place in it."""
+    """A message violates the layout, or a value cannot be encoded in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
     """One entry of the header's `streams`.
 
-    `json` are small facts, `arrays` named arrays beside them; `body` is the stream itself where it is one
-    array or one file, and `facts` (mime, age, ...) stand beside its offset.
+    `json` holds small values and `arrays` named arrays; `body` is the stream itself if it is one array or one file, and
+    `facts` (mime, age, ...) are stored next to its offset.
     """
 
     json: Mapping[str, Any] | None = None
@@ -43,10 +43,10 @@ class Stream:
 
 
 def encode(streams: Mapping[str, Stream], **header: Any) -> bytes:
-    """The message with these streams; `header` are further keys of the header, such as frame and t.
+    """Return the message with these streams; `header` are further keys of the header, such as frame and t.
 
-    Numbers that are not finite become null in the header and stay as they are in arrays. FrameError where
-    an array has a type that a browser cannot read in place.
+    Non-finite numbers become null in the header and are unchanged in arrays.
+    Raises: FrameError if an array has a type that a browser cannot read in place.
     """
     body = _Body()
     entries = {name: _entry(name, stream, body) for name, stream in streams.items()}
@@ -79,7 +79,7 @@ def _array(name: str, value: NDArray[Any], body: _Body) -> dict[str, Any]:
 
 
 class _Body:
-    """The values one after the other, each at a multiple of 8."""
+    """Concatenated values, each padded to a multiple of 8 bytes."""
 
     def __init__(self) -> None:
         self.pieces: list[bytes] = []
@@ -94,7 +94,7 @@ class _Body:
 
 
 def to_json_value(value: Any) -> Any:
-    """`value` for JSON: mappings and sequences as they are, numbers that are not finite as None."""
+    """Return `value` as JSON-compatible objects; non-finite numbers become None."""
     if isinstance(value, Mapping):
         return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -108,13 +108,13 @@ def to_json_value(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """A message as it was read: its header, and the bytes that the offsets point into."""
+    """A decoded message: its header, and the bytes that the offsets refer to."""
 
     header: Mapping[str, Any]
     body: memoryview
 
     def array(self, name: str, key: str | None = None) -> NDArray[Any]:
-        """The array that stream `name` is, or the one called `key` beside its facts; read-only."""
+        """Return the array of stream `name`, or its named array `key`; read-only."""
         entry = self.header["streams"][name]
         where = entry if key is None else entry["arrays"][key]
         shape = tuple(where["shape"])
@@ -122,13 +122,13 @@ class Frame:
         return found.reshape(shape)
 
     def data(self, name: str) -> bytes:
-        """The file that stream `name` is."""
+        """Return the bytes of the file in stream `name`."""
         entry = self.header["streams"][name]
         return bytes(self.body[entry["offset"] : entry["offset"] + entry["length"]])
 
 
 def decode(message: bytes) -> Frame:
-    """Read a message, for clients in Python; FrameError where it is cut off or no message at all."""
+    """Decode a message, for clients in Python. Raises: FrameError if it is truncated or malformed."""
     if len(message) < _LENGTH.size:
         raise FrameError(
             f"a message of {len(message)} bytes has no header; at least {_LENGTH.size} are wanted"

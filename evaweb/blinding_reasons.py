@@ -1,15 +1,15 @@
-"""Reasons of a station as they are said to somebody from whom a checkpoint is hidden: what they need to act, no more.
+"""Redaction of a station's messages for users from whom a checkpoint is hidden: what they need to act, not more.
 
-A sentence is shown whose id is listed here, with all that it is made of: names and numbers of the robot, of cameras and
-of people, and sentences that are shown themselves. What safety refused is said by the limit, without what the policy
-wanted. Everything else is covered, also words of somebody else within a sentence: a fault may name a server.
+A message is shown if its id is listed here, with all arguments that are names and numbers of robot, cameras or
+people, or messages that are shown themselves. A refusal by safety is reduced to the limit, without the policy's values.
+Everything else is hidden, also foreign text within a message: a fault may name a server.
 """
 
 from __future__ import annotations
 
 from runtime.core.sentences import Pattern, Sentence, fixed, plain
 
-# What robot, cameras, leader and node say, in whatever words: no policy has a part in it.
+# Messages of robot, cameras, leader and node, shown with any text: none depends on the policy.
 _OF_THE_ROBOT = (
     *(
         "bench",
@@ -25,7 +25,7 @@ _OF_THE_ROBOT = (
     ),
     *("shared", "state", "timing"),
 )
-# Of these all but what follows, as far as their words are names, and not a fault that somebody else put in words.
+# Messages shown except those of _NOT, if their text arguments are names and not the text of a foreign error.
 _OF_THE_STATION = (
     "bus",
     "collect",
@@ -99,11 +99,11 @@ _NAMES = frozenset(
         *("stream", "who", "word"),
     }
 )
-"""Arguments that are words of ours; any other one is somebody's, unless it is a sentence."""
+"""Arguments with names from this program; any other text is foreign, unless it is a Sentence."""
 
-_BY_A_PERSON = "health.pressed_by"  # who pressed an e-stop, and why in their words
+_BY_A_PERSON = "health.pressed_by"  # user who pressed the e-stop, and the typed reason
 
-# What safety said, by the limit that it is about: the numbers are the policy's.
+# Replacements for refusals by safety: they name the limit, because the numbers are the policy's.
 _LIMITS = {
     "safety.jumps": fixed("blinding.jumps", "an action would have jumped farther than allowed (safety.jump)"),
     "safety.away_from_measured": fixed(
@@ -125,7 +125,7 @@ _SAFE = fixed("blinding.by_safety", "safety held the robot")
 
 
 def uncovered(text: str) -> str | None:
-    """The reason as it may be said; None where all of it is covered."""
+    """Return the message as it may be shown; None if it must be hidden entirely."""
     if not isinstance(text, Sentence):
         return None
     if text.id in _LIMITS:
@@ -147,13 +147,13 @@ def uncovered(text: str) -> str | None:
 
 
 def _whole(text: Sentence) -> str | None:
-    """It, unless a sentence within it is none that may be said."""
+    """Return the message, or None if a message within it may not be shown unchanged."""
     parts = [of for of in text.arguments.values() if isinstance(of, Sentence)]
     return text if all(uncovered(of) == of for of in parts) else None
 
 
 def _with_parts(text: Sentence) -> str | None:
-    """It, with those within it as they may be said; None where one is covered, or is somebody else's words."""
+    """Return the message with its nested messages redacted; None if one is hidden or contains foreign text."""
     said, whole = plain(text), True
     for name, of in text.arguments.items():
         if isinstance(of, Sentence):

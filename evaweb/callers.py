@@ -1,4 +1,4 @@
-"""Address of a caller: the other end of the connection, or what a declared proxy says it forwards."""
+"""Address of a client: the peer of the connection, or the one that a declared proxy forwards."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from django.conf import settings
 from django.http import HttpRequest
 
 Address = IPv4Address | IPv6Address
-SHARE = ContextVar("SHARE", default="nowhere")  # `share_of` the request that is worked on
-_ONE_SUBSCRIBER = 64  # bits of an address of IPv6: whoever has one has all that begin with them
+SHARE = ContextVar("SHARE", default="nowhere")  # `client_key` of the current request
+_ONE_SUBSCRIBER = 64  # prefix of IPv6 addresses that belong to one subscriber [bits]
 
 
 def client_address(request: HttpRequest) -> str | None:
-    """The address of the caller, None where there is none, as over a socket of the file system."""
+    """Return the address of the client, None if there is none, as over a Unix socket."""
     named = request.META.get("HTTP_X_FORWARDED_FOR", "").split(",")
     found = _caller(request.META.get("REMOTE_ADDR"), named, settings.EVA_PROXIES)
     return None if found is None else str(found)
 
 
 def lockable_of(request: HttpRequest) -> str | None:
-    """The address at which names are locked: of IPv6 the first of the network, all of which is one subscriber's."""
+    """Return the address at which names are locked; for IPv6 the network address of the subscriber's /64."""
     found = _parsed(client_address(request))
     if isinstance(found, IPv6Address):
         return str(ip_network((found, _ONE_SUBSCRIBER), strict=False).network_address)
@@ -31,7 +31,7 @@ def lockable_of(request: HttpRequest) -> str | None:
 
 
 def client_key(scope: dict[str, Any]) -> str:
-    """From where who asks over ASGI comes, for what each of them has a share of: an address, or a network of IPv6."""
+    """Return the key by which ASGI clients share limits: an address, an IPv6 /64 network, or "nowhere"."""
     named = [value.decode("latin-1") for name, value in scope["headers"] if name == b"x-forwarded-for"]
     peer = (scope.get("client") or [None])[0]
     found = _caller(peer, ",".join(named).split(","), settings.EVA_PROXIES)
@@ -43,7 +43,7 @@ def client_key(scope: dict[str, Any]) -> str:
 def _caller(
     peer: str | None, named: list[str], proxies: Iterable[IPv4Network | IPv6Network]
 ) -> Address | None:
-    """The last of those named that a proxy of ours has seen itself; what stands before it any client can write."""
+    """Return the last named address that a trusted proxy has seen itself; any client can invent the ones before it."""
     here = _parsed(peer)
     while named and here is not None and any(here in network for network in proxies):
         before = _parsed(named.pop().strip())
@@ -60,4 +60,4 @@ def _parsed(text: str | None) -> Address | None:
         return None
     if isinstance(found, IPv4Address):
         return found
-    return found.ipv4_mapped or IPv6Address(int(found))  # without a zone, which no database takes
+    return found.ipv4_mapped or IPv6Address(int(found))  # without a zone id, which no database accepts

@@ -1,7 +1,7 @@
-"""One way to write a plan down, so that its digest is its name, and what two plans differ in.
+"""Canonical JSON of a plan, whose digest identifies the plan, and the differences between two plans.
 
-The canonical form is that of RFC 8785 for what a plan may hold: keys sorted by code point, no space, UTF-8, numbers as
-Python writes them, which for integers and for floats of everyday size is what ECMAScript writes.
+The form is that of RFC 8785 for the values that a plan may contain: keys sorted by code point, no spaces, UTF-8,
+numbers as Python writes them, which for integers and for floats of everyday size equals ECMAScript.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ _MISSING = object()
 
 
 def canonical(document: Mapping[str, Any]) -> bytes:
-    """`document` in its canonical form; EvaError names the value that has none."""
+    """Return the canonical JSON of `document`. Raises: EvaError that names a value without canonical form."""
     return json.dumps(
         _plain(document, ""), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     ).encode()
 
 
 def digest(document: Mapping[str, Any]) -> str:
-    """SHA-256 of the canonical form, in hexadecimal."""
+    """Return the SHA-256 of the canonical form, in hexadecimal."""
     return hashlib.sha256(canonical(document)).hexdigest()
 
 
 def difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Differences from `old` to `new`, a line each: where, what it was, what it is."""
+    """Return the changes from `old` to `new`, one line each: place, old value, new value."""
     return list(_differences(_plain(old, ""), _plain(new, ""), ""))
 
 

@@ -1,4 +1,4 @@
-"""The worker's application: a doorbell over the filesystem, or over Redis where there is one."""
+"""Celery application of the workers: a doorbell over the file system, or over Redis if configured."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ log = logging.getLogger(__name__)
 
 
 class Transport(filesystem.Transport):
-    """The doorbell over the filesystem: celery's loop asks for two seconds at a time, twice while it ends."""
+    """File-system transport with short polls: celery's loop polls for two seconds at a time, twice while it ends."""
 
     def drain_events(self, connection: Any, timeout: float | None = None) -> Any:
-        """Deliver what has come; socket.timeout where that is nothing for half a second at most."""
+        """Deliver pending messages; raise socket.timeout if none arrives within _LONGEST_S at most."""
         return super().drain_events(connection, timeout=min(timeout or _LONGEST_S, _LONGEST_S))
 
 
@@ -32,7 +32,7 @@ def _filesystem() -> dict[str, object]:
     for part in ("queue", "processed", "control"):
         try:
             (folder / part).mkdir(parents=True, exist_ok=True)
-        except OSError as error:  # no doorbell then; workers look for jobs all the same
+        except OSError as error:  # without a doorbell the workers still poll for jobs
             log.warning("%s cannot be made: %s", folder / part, error.strerror)
     return {
         "data_folder_in": str(folder / "queue"),

@@ -1,7 +1,7 @@
-"""What computes long for pages: in one process beside the web, by a budget for each person, with its answers kept.
+"""Long computations for pages: one child process, a CPU budget per user, cached results.
 
-Whoever asks waits in a thread of a request, of which the web has few: so few wait at once, and not long. Nothing that
-stops a robot, keeps a lease or shows a page waits for any of them.
+A caller waits in a request thread, of which the web has few: so few wait at a time, and not for long. Nothing that
+stops a robot, keeps a lease or shows a page waits for them.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from evaweb.lookups import FairLookupPool, LookupQueueFull
 from runtime.core.sentences import Pattern, fixed
 
 log = logging.getLogger(__name__)
-AT_ONCE_S = 30.0  # of computing that a person may have asked for; a question of the planner takes up to 10 s
-REFILLED = 0.1  # seconds of it that are given back each second
-_PATIENCE_S = 20.0  # for which a request waits; what it asked for goes on, and is known when it comes again
-_SOON_S = 1.0  # for which a page waits that asks again by itself
-_MOST_WAITING = 8  # requests; the web works on 32 at once
-_MOST_ASKED = 32  # questions that wait for the process, of all persons together
-_KEPT = 512  # answers
+AT_ONCE_S = 30.0  # CPU budget of a user; a computation of the planner takes up to 10 s
+REFILLED = 0.1  # budget regained per second [s/s]
+_PATIENCE_S = 20.0  # longest wait of a request; the computation continues, and a retry finds its result
+_SOON_S = 1.0  # longest wait of a page that retries by itself
+_MOST_WAITING = 8  # waiting requests; the web serves 32 at a time
+_MOST_ASKED = 32  # queued computations of all users
+_KEPT = 512  # cached results
 _AGAIN_S = 5
 _NICE = 19
 _ROOT = Path(__file__).parents[1]
@@ -57,7 +57,7 @@ _LOST = fixed(
 
 
 class Busy(EvaError):
-    """It is not computed yet, or not for this person now; `retry_after_s` says when to ask again."""
+    """The result is not ready, or the user may not compute now; `retry_after_s` is the delay before a retry [s]."""
 
     status = 503
 
@@ -67,18 +67,21 @@ class Busy(EvaError):
 
 
 class UnderWay(Busy):
-    """It is being computed."""
+    """The computation is running."""
 
 
 class Beside:
-    """The process that computes, started with its first question and again after it has ended; for one thread."""
+    """Child process that computes; started by the first call and after it has ended. For one thread."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
         self._wire: Connection[Any, Any] | None = None
 
     def run(self, work: Callable[..., Any], *given: Any) -> tuple[Any, float]:
-        """What `work`, a function of a module, makes of these, and its processor time [s]; Busy, its errors."""
+        """Return the result of `work`, a module-level function, and its CPU time [s].
+
+        Raises: Busy if the process was lost; any exception of `work`.
+        """
         try:
             if self._wire is None:
                 self._wire = self._start()
@@ -102,7 +105,7 @@ class Beside:
         return Connection(here.detach())
 
     def end(self) -> None:
-        """It ends now; the next question starts another one."""
+        """Kill the process; the next call starts a new one."""
         if self._wire is not None:
             self._wire.close()
         if self._process is not None:
@@ -112,7 +115,7 @@ class Beside:
 
 
 class Questions:
-    """Questions that `run` answers, one after the other, the persons in turn; from any thread."""
+    """Queue of computations that `run` executes one at a time, users in turn, with cached results. Thread-safe."""
 
     def __init__(
         self,
@@ -127,14 +130,21 @@ class Questions:
         self._kept: OrderedDict[Hashable, Any] = OrderedDict()
         self._asked: dict[
             Hashable, tuple[Hashable, Future[Any]]
-        ] = {}  # by question: who asked first, and what comes
-        self._spent: dict[Hashable, tuple[float, float]] = {}  # by person: seconds, and when that was so
+        ] = {}  # by computation: the first user, and the future
+        self._spent: dict[
+            Hashable, tuple[float, float]
+        ] = {}  # by user: CPU time spent [s], and when it was valid
         self._waiting = 0
 
     def ask(self, person: Hashable, work: Callable[..., Any], *given: Any, soon: bool = False) -> Any:
-        """What `work` makes of these; UnderWay where it is not known in time, or `soon`; its errors.
+        """Return the result of `work(*given)`, cached or computed.
 
-        Busy beyond the person's budget.
+        Args:
+            soon: Wait only briefly, for a page that asks again by itself.
+
+        Raises:
+            UnderWay: The result is not ready in time; it continues to be computed.
+            Busy: The user's budget is spent, another computation of theirs is running, or too many wait.
         """
         question = (work, given)
         with self._lock:
@@ -156,7 +166,10 @@ class Questions:
                 self._waiting -= 1
 
     def compute(self, share: Hashable, work: Callable[..., Any], *given: Any) -> Any:
-        """The same in the turn of `share`, however long it takes: for a thread that is no request's."""
+        """Return the result of `work(*given)` in the turn of `share`, however long it takes.
+
+        Not for request threads.
+        """
         found, _ = self._turns.submit(share, partial(self._run, work, *given)).result()
         return found
 
@@ -168,7 +181,7 @@ class Questions:
             wait = ceil((spent - AT_ONCE_S) / REFILLED) + 1
             raise Busy(_SPENT(spent=spent, at_once=AT_ONCE_S, seconds=wait), wait)
         coming: Future[Any] = self._turns.submit(person, partial(self._answered, person, question))
-        if not coming.done():  # else there was no room for it
+        if not coming.done():  # otherwise it was refused for lack of room
             self._asked[question] = (person, coming)
             coming.add_done_callback(lambda _: self._asked.pop(question, None))
         return coming
@@ -192,9 +205,9 @@ questions = Questions(Beside().run)
 
 
 def _main() -> None:
-    """Answer what comes over the socket that we were given, until whoever asks is gone."""
+    """Answer calls over the inherited socket until the parent is gone."""
     wire = Connection(int(sys.argv[1]))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the web ends us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal: the parent ends this process
     os.nice(_NICE)
     threading.Thread(target=_end_with, args=(wire.fileno(),), daemon=True).start()
     while True:
@@ -205,13 +218,13 @@ def _main() -> None:
         began = time.process_time()
         try:
             done, found = True, work(*given)
-        except Exception as fault:  # it is raised where it was asked
+        except Exception as fault:  # raised again in the parent
             done, found = False, fault
         wire.send((done, found, time.process_time() - began))
 
 
 def _end_with(descriptor: int) -> None:
-    """Whoever asks is gone: nobody waits for what is being computed."""
+    """Exit when the parent closes the socket: its result is not needed any more."""
     gone = select.poll()
     gone.register(descriptor, select.POLLRDHUP)
     gone.poll()

@@ -1,4 +1,4 @@
-"""Cookies by name: browsers send one for each path and domain that has it, and only one of them is good."""
+"""Values of cookies by name: browsers send one per matching path and domain, and only one of them is valid."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from django.utils.http import http_date
 
 from evaweb.credentials import EXPIRED_ALLOWED, SESSION, credentials
 
-_KEPT_S = 365 * 24 * 3600  # by a browser; the session itself ends after SESSION_COOKIE_AGE
-MOST = 8  # of one name that are looked into; a browser has one or two
+_KEPT_S = 365 * 24 * 3600  # life of the cookie in the browser; the session ends after SESSION_COOKIE_AGE
+MOST = 8  # session cookies that are examined; a browser has one or two
 
 
 def cookie_values(headers: Iterable[str], name: str) -> list[str]:
-    """Values of all cookies of that name, in the order of the headers."""
+    """Return the distinct values of all cookies called `name`, in the order of the headers."""
     parts = (part for header in headers for part in header.split(";") if name in part)
     values = (parse_cookie(part).get(name) for part in parts)
     return list(dict.fromkeys(filter(None, values)))
 
 
 def session_keys(headers: Iterable[str]) -> list[str]:
-    """The keys of the sessions that a browser says it has; of very many those that are remembered, and a few more."""
+    """Return the session keys that a browser sent, at most MOST of them with known ones first if there are more."""
     keys = cookie_values(headers, settings.SESSION_COOKIE_NAME)
     return keys if len(keys) <= MOST else sorted(keys, key=_is_strange)[:MOST]
 
@@ -35,7 +35,10 @@ def _is_strange(key: str) -> bool:
 
 
 class AnySessionMiddleware(SessionMiddleware):
-    """Django's own, which knows the last of several cookies alone: of these the first that is a session's counts."""
+    """Session middleware for several session cookies: the first that names an existing session counts.
+
+    Django's own uses only the last cookie.
+    """
 
     def process_request(self, request: HttpRequest) -> None:
         keys = session_keys([request.META.get("HTTP_COOKIE", "")])
@@ -45,13 +48,13 @@ class AnySessionMiddleware(SessionMiddleware):
         super().process_request(request)
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Only a session that was ended on purpose takes its cookie along: one whose time is over still presses."""
+        """Delete the cookie only if the session was ended on purpose: an expired session still presses e-stops."""
         answer = super().process_response(request, response)
         cookie = answer.cookies.get(settings.SESSION_COOKIE_NAME)
         if cookie is None:
             return answer
         if cookie.value:
             cookie["max-age"], cookie["expires"] = _KEPT_S, http_date(time.time() + _KEPT_S)
-        elif not request.session.modified:  # flush() says that it is
+        elif not request.session.modified:  # flush() on logout sets `modified`; mere expiry does not
             del answer.cookies[settings.SESSION_COOKIE_NAME]
         return answer

@@ -1,8 +1,8 @@
-"""Users of sessions and tokens: asked of the database, remembered for when it does not answer.
+"""Users of sessions and tokens: looked up in the database, cached for when it does not respond.
 
-What is remembered never expires by itself: stopping works with it as long as this process lives. It is forgotten when
-the database says otherwise, which is asked again whenever it is used and older than a few seconds. One that is not
-remembered is asked about in the share of its origin: a crowd of made-up ones keeps no other client waiting.
+A cached login never expires: stopping works with it as long as this process lives. It is dropped when the database
+disagrees; whenever a cached login is used and older than a few seconds, the database is asked again. Unknown
+credentials are looked up in the share of their client: a flood of invented ones does not delay other clients.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ _faults = LogThrottle(10.0, 8)
 SESSION, TOKEN = "session", "token"
 EXPIRED_ALLOWED = {
     kind: f"{kind} of any age" for kind in (SESSION, TOKEN)
-}  # also where its time is over: for an e-stop
-UNVERIFIED = "unverified"  # the name of who presses while the database does not say who they are
-_MOST = 4096  # remembered, and as many that are nobody's
-_THREADS = 4  # for whoever is not remembered
+}  # expired credentials are accepted for an e-stop
+UNVERIFIED = "unverified"  # user name of an e-stop while the database does not respond
+_MOST = 4096  # cached logins, and as many credentials known to be invalid
+_THREADS = 4  # for lookups of uncached credentials
 _THREADS_OF_REMEMBERED = 2
-_FRESH_S = 5.0  # for which an answer of the database is taken without asking again
-COUNTS_S = 60.0  # for which it counts for what is no stop and needs no row, where the database says nothing
-_PATIENCE_S = 0.5  # without any answer of the database, after which it is as good as gone
-_TURN_S = 1.0  # for which who is not remembered waits for a turn, as long as the database answers others
-_RECHECK_S = 0.25  # for which a stop of somebody who is remembered waits for it; an e-stop never does
+_FRESH_S = 5.0  # validity of a database answer before it is asked again
+COUNTS_S = 60.0  # its validity for requests other than stops that need no row, while the database is silent
+_PATIENCE_S = 0.5  # silence after which the database counts as gone
+_TURN_S = 1.0  # longest wait of an uncached credential for its turn while the database answers others
+_RECHECK_S = 0.25  # longest wait of a stop with a cached login for the database; an e-stop does not wait
 RETRY_AFTER_S = 1
 Credential = tuple[str, str]  # its kind, and the secret
 _Key = tuple[str, str]  # a kind, and the digest of a secret
@@ -59,16 +59,16 @@ _NO_TURN = Pattern("credentials.no_turn", "the database has not come to this log
 
 
 class Unverifiable(Exception):
-    """The database did not say whose credential this is."""
+    """The database did not report the user of a credential."""
 
 
 class LookupOverload(Exception):
-    """The database answers, and there are so many to ask about from one address that this one had no turn."""
+    """The database responds, but too many lookups from this address are queued."""
 
 
 @dataclass(frozen=True, slots=True)
 class Login:
-    """A user as the database last had them; `checked` is on this process's monotonic clock [s]."""
+    """User as the database last reported them; `checked` is on this process's monotonic clock [s]."""
 
     pk: int
     username: str
@@ -77,7 +77,7 @@ class Login:
 
     @property
     def account(self) -> Any:
-        """As rows refer to it, without asking the database."""
+        """Unsaved model instance for foreign keys, without a query."""
         return get_user_model()(pk=self.pk, username=self.username)
 
 
@@ -85,7 +85,7 @@ _Said = Login | Unverifiable | LookupOverload | None
 
 
 class CredentialCache:
-    """Logins that this process has verified; from any thread. `wait` is asyncio's; a test has its own."""
+    """Logins that this process has verified; thread-safe. `wait` is asyncio.wait, replaced in tests."""
 
     def __init__(
         self,
@@ -93,9 +93,11 @@ class CredentialCache:
         wait: Callable[..., Awaitable[object]] = asyncio.wait,
     ) -> None:
         self._clock, self._wait = clock, wait
-        self._lock = threading.RLock()  # one that gives way to another is told while that one is asked about
+        self._lock = (
+            threading.RLock()
+        )  # reentrant: submitting a lookup can complete another one, whose callback takes the lock
         self._known: OrderedDict[_Key, Login] = OrderedDict()
-        self._nobodys: OrderedDict[_Key, float] = OrderedDict()  # until when that is believed
+        self._nobodys: OrderedDict[_Key, float] = OrderedDict()  # invalid credentials and when to ask again
         self._answered_at = -float("inf")
         self._asked: dict[tuple[_Key, str | None], Future[Login | None]] = {}
         self._strangers: FairLookupPool[Login | None] = FairLookupPool(_THREADS)
@@ -106,23 +108,28 @@ class CredentialCache:
         }
 
     def register_kind(self, kind: str, owner: Callable[[str], Any]) -> None:
-        """Register how the user of a credential of that kind is looked up, None where there is none."""
+        """Register the function that looks up the user of a credential of `kind`, None if there is none."""
         self._owners[kind] = owner
 
     def look_up(self, kind: str, secret: str) -> Any:
-        """The user as the database has them now, None where there is none; in the caller's thread. Raises its Error."""
+        """Return the user from the database, None if there is none, and update the cache.
+
+        Runs in the caller's thread. Raises: the database's Error.
+        """
         with connection.execute_wrapper(self._heard):
             user = self._owners[kind](secret)
         if user is None:
             if kind in EXPIRED_ALLOWED and self.recall(kind, secret) is not None:
-                self.look_up(EXPIRED_ALLOWED[kind], secret)  # whose time is over presses as before: at once
+                self.look_up(
+                    EXPIRED_ALLOWED[kind], secret
+                )  # cache the expired credential, so that an e-stop with it needs no lookup
             self._is_nobodys((kind, digest(secret)))
         else:
             self.remember(kind, secret, user)
         return user
 
     def record_answer(self) -> None:
-        """The database has just answered something."""
+        """Record that the database has just responded."""
         self._answered_at = self._clock()
 
     def _heard(self, execute: Callable[..., Any], *asked: Any) -> Any:
@@ -139,7 +146,7 @@ class CredentialCache:
                 self._nobodys.popitem(last=False)
 
     def remember(self, kind: str, secret: str, user: Any) -> None:
-        """The database has just said that it is this user's."""
+        """Cache the user that the database has just reported for this credential."""
         login = Login(user.pk, user.get_username(), role_of(user), self._clock())
         key = (kind, digest(secret))
         with self._lock:
@@ -150,25 +157,28 @@ class CredentialCache:
                 self._known.popitem(last=False)
 
     def recall(self, kind: str, secret: str) -> Login | None:
-        """Login it stood for when the database was last asked; without asking."""
+        """Return the cached login of this credential, however old; None if unknown. Makes no query."""
         with self._lock:
             return self._known.get((kind, digest(secret)))
 
     def recall_recent(self, kind: str, secret: str) -> Login | None:
-        """Login it stands for as the database said within the last minute; without asking."""
+        """Return the cached login if it was verified within COUNTS_S, else None. Makes no query."""
         known = self.recall(kind, secret)
         return known if known is not None and self._clock() - known.checked < COUNTS_S else None
 
     def forget(self, kind: str, digested: str) -> None:
-        """Drop a credential that stands for no user any more."""
+        """Drop a credential that belongs to no user any more."""
         with self._lock:
             self._known.pop((kind, digested), None)
 
     async def resolve_presser(self, found: Sequence[Credential], share: str) -> Login | None:
-        """The user of an e-stop, by any of these credentials: at once where one is remembered, else by the database.
+        """Return the user who presses the e-stop, from the cache or else the database; None if it knows none of them.
 
-        No press is lost for a date: a credential whose time is over is one here. None: the database says that they
-        are unknown. Raises Unverifiable where it says nothing, Busy where `share` has no turn though it answers.
+        An expired session or token is accepted, so that no press is lost to a date.
+
+        Raises:
+            Unverifiable: The database does not respond.
+            LookupOverload: The database responds, but the share of this client is used up.
         """
         for kind, secret in found:
             for remembered in (kind, _of_any_age(kind)):
@@ -188,9 +198,10 @@ class CredentialCache:
                 one.cancel()
 
     async def resolve_stopper(self, found: Sequence[Credential], share: str) -> tuple[str, Login] | None:
-        """The user of a stop or halt, and the kind of credential: one that is remembered, else any other.
+        """Return kind of credential and user of a stop or halt, cached credentials first; None if all are unknown.
 
-        As the database says, or as it said last where it does not answer. None: unknown. Raises Unverifiable, Busy.
+        A cached login is used if the database does not confirm or refute it in time.
+        Raises: Unverifiable, LookupOverload (as `resolve_presser`).
         """
         fault: LookupOverload | None = None
         for kind, secret in sorted(found, key=lambda one: self.recall(*one) is None):
@@ -212,7 +223,7 @@ class CredentialCache:
         return self._clock() - known.checked < _FRESH_S
 
     async def _checked(self, kind: str, secret: str, known: Login) -> Login | None:
-        """The database's answer on a remembered login, or that login, where the database takes its time."""
+        """Return the database's answer on a cached login, or that login if the answer takes over _RECHECK_S."""
         answer = asyncio.wrap_future(self._check(kind, secret))
         await self._wait({answer}, timeout=_RECHECK_S)
         if answer.done() and answer.exception() is None:
@@ -221,7 +232,7 @@ class CredentialCache:
         return known
 
     def _resolve_unknown(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
-        """Whose credential it is that is not remembered, or why that is not known; asked about from now on."""
+        """Start looking up an uncached credential; the coroutine returns its user or why it is unknown."""
         if self._is_known_as_nobodys((kind, digest(secret))):
             return self._said_of(None)
         return self._said_of(self._check(kind, secret, share))
@@ -233,7 +244,7 @@ class CredentialCache:
         answer = asyncio.wrap_future(asked)
         answer.add_done_callback(_read)
         try:
-            while not asked.done():  # which the loop may not have noticed yet
+            while not asked.done():  # the future of the thread may be done before the event loop notices
                 await self._wait({answer}, timeout=remaining_wait(came, self._answered_at, self._clock()))
         except (Unverifiable, LookupOverload) as fault:
             return fault
@@ -247,9 +258,9 @@ class CredentialCache:
             return self._nobodys.get(key, -float("inf")) > self._clock()
 
     def _check(self, kind: str, secret: str, share: str | None = None) -> Future[Login | None]:
-        """Ask the database, once for all callers with the same question; it does not wait.
+        """Start a lookup without waiting; callers with the same question share it.
 
-        Without a `share`, who is remembered: those stand before nobody and behind nobody else.
+        With `share` None the login is cached: such lookups have their own threads and do not wait behind unknown ones.
         """
         key = ((kind, digest(secret)), share)
         with self._lock:
@@ -267,13 +278,13 @@ class CredentialCache:
             self._asked.pop(key, None)
 
     def _ask(self, kind: str, secret: str) -> Login | None:
-        """A credential of any age is one that is good now, or one whose time is over."""
+        """Look up a credential; kinds "of any age" try the valid credential first, then the expired one."""
         try:
             with short_lock_wait():
                 for one in (*(now for now, ever in EXPIRED_ALLOWED.items() if ever == kind), kind):
                     if self.look_up(one, secret) is not None:
                         return self.recall(one, secret)
-        except Exception as fault:  # whatever it is: the database has not said who this is
+        except Exception as fault:  # any error means that the credential is unverified
             before = _faults.suffix_if_due(kind)
             if before is not None:
                 log.warning("a %s was not verified: %s%s", kind, fault, before)
@@ -284,9 +295,11 @@ class CredentialCache:
 
 
 def remaining_wait(came: float, answered: float, now: float) -> float:
-    """Time that a caller since `came` still waits [s]; the database last answered at `answered` [s].
+    """Return how long a caller that arrived at `came` still waits [s]; the database last responded at `answered` [s].
 
-    Raises Unverifiable where it has answered no look-up for half a second, Busy where others were before it longer.
+    Raises:
+        Unverifiable: The database has answered no lookup for _PATIENCE_S.
+        LookupOverload: It answers, but other lookups came first for _TURN_S.
     """
     silent = max(came, answered) + _PATIENCE_S - now
     if silent <= 0:
@@ -297,7 +310,7 @@ def remaining_wait(came: float, answered: float, now: float) -> float:
 
 
 async def _first_known(asking: Sequence[asyncio.Task[_Said]]) -> Login | None:
-    """The first known user; raises Unverifiable at once, and Busy where nothing else is known."""
+    """Return the first known user. Raises: Unverifiable at once; LookupOverload if no lookup finds a user."""
     busy: LookupOverload | None = None
     for one in asyncio.as_completed(asking):
         answer = await one
@@ -316,26 +329,26 @@ def _of_any_age(kind: str) -> str:
 
 
 def digest(secret: str) -> str:
-    """Not salted and not slow: a secret of more than 128 random bits cannot be guessed."""
+    """Return the SHA-256 of a secret; salt and slowness are unnecessary for secrets of more than 128 random bits."""
     return hashlib.sha256(secret.encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def session_user(session_key: str) -> Any:
-    """The user of that session, as the database has them now; reads only."""
-    if not (session_key.isascii() and session_key.isalnum()):  # one that some databases cannot even look for
+    """Return the user of a valid session from the database, None if there is none; read-only."""
+    if not (session_key.isascii() and session_key.isalnum()):  # some databases cannot even query such a key
         return None
     return _logged_in(import_module(settings.SESSION_ENGINE).SessionStore(session_key))
 
 
 def ended_session_user(session_key: str) -> Any:
-    """The same, whenever that session ends or has ended: not of one that was logged out, or lost its password."""
+    """Return the user of a session, also after its expiry; None after a logout or change of password."""
     if not (session_key.isascii() and session_key.isalnum()):
         return None
     row = Session.objects.filter(session_key=session_key).first()
     if row is None:
         return None
     session = import_module(settings.SESSION_ENGINE).SessionStore(session_key)
-    session._session_cache = row.get_decoded()  # which is otherwise read only where it has not ended
+    session._session_cache = row.get_decoded()  # the store itself loads only unexpired sessions
     return _logged_in(session)
 
 
@@ -346,7 +359,7 @@ def _logged_in(session: Any) -> Any:
 
 
 def _read(answer: asyncio.Future[Login | None]) -> None:
-    """No caller may wait for it any more: its error was logged where it arose."""
+    """Retrieve the exception of an abandoned lookup, so that asyncio does not log it again."""
     if not answer.cancelled():
         answer.exception()
 

@@ -1,4 +1,4 @@
-"""What is made piece by piece, as a file that a browser keeps."""
+"""Downloads that are generated piece by piece."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Piece = TypeVar("Piece", str, bytes)
 def download(
     request: HttpRequest, pieces: Iterator[Piece], name: str, content_type: str
 ) -> StreamingHttpResponse:
-    """A file of that name, sent as its pieces are made."""
+    """Return a streaming response that a browser saves as `name`."""
     content = _stepwise(pieces) if isinstance(request, ASGIRequest) else pieces
     return StreamingHttpResponse(
         content,
@@ -27,7 +27,7 @@ def download(
 
 
 async def _stepwise(pieces: Iterator[Piece]) -> AsyncIterator[Piece]:
-    """The pieces without blocking the event loop, and without collecting them first."""
+    """Yield the pieces without blocking the event loop and without collecting them first."""
     step = sync_to_async(next)
     while (piece := await step(pieces, None)) is not None:
         yield piece

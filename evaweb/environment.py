@@ -1,4 +1,4 @@
-"""Reads settings from the environment; a value that cannot be used ends the start with a sentence."""
+"""Readers of settings from environment variables; an invalid value raises ImproperlyConfigured at start-up."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 @dataclass(frozen=True, slots=True)
 class Bucket:
-    """A bucket of an S3-compatible store: `endpoint` of a server that is not Amazon's, else "", and the key."""
+    """Bucket of an S3-compatible store, with its credentials; `endpoint` is "" for Amazon's own servers."""
 
     name: str
     prefix: str
@@ -36,7 +36,7 @@ class Bucket:
 
     @property
     def origin(self) -> str:
-        """From where browsers get signed addresses, for the policy of pages."""
+        """Origin of signed URLs, for the content security policy."""
         return self.endpoint or f"https://s3.{self.region}.amazonaws.com"
 
     def __str__(self) -> str:
@@ -44,7 +44,7 @@ class Bucket:
 
 
 def read_flag(name: str, default: bool) -> bool:
-    """A yes or no."""
+    """Return a boolean setting."""
     given = os.environ.get(name)
     if given is None:
         return default
@@ -55,7 +55,7 @@ def read_flag(name: str, default: bool) -> bool:
 
 
 def read_list(name: str, default: tuple[str, ...] = ()) -> list[str]:
-    """A list separated by commas."""
+    """Return the items of a comma-separated setting."""
     given = os.environ.get(name)
     return list(default) if given is None else [word.strip() for word in given.split(",") if word.strip()]
 
@@ -74,22 +74,22 @@ def _number(name: str, default: float, least: float, most: float, allowed: str) 
 
 
 def read_seconds(name: str, default: float) -> float:
-    """A time above zero [s]."""
+    """Return a duration above zero [s]."""
     return _number(name, default, sys.float_info.min, sys.float_info.max, "seconds above zero")
 
 
 def mebibytes(name: str, default: float) -> float:
-    """A size from one [MiB]."""
+    """Return a size of at least 1 [MiB]."""
     return _number(name, default, 1.0, 1e6, "mebibytes from 1 to 1000000")
 
 
 def gigabytes(name: str, default: float) -> float:
-    """A size from zero [GB]."""
+    """Return a size of at least 0 [GB]."""
     return _number(name, default, 0.0, 1e6, "gigabytes from 0 to 1000000")
 
 
 def niceness(name: str, default: int) -> int:
-    """How much a process gives way to others, from 0 (not at all) to 19."""
+    """Return a process niceness from 0 (normal priority) to 19 (lowest)."""
     given = os.environ.get(name)
     if given is None:
         return default
@@ -99,7 +99,7 @@ def niceness(name: str, default: int) -> int:
 
 
 def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
-    """Addresses and networks, separated by commas; none where it is not given."""
+    """Return the addresses and networks of a comma-separated setting; [] if it is not set."""
     try:
         return [ip_network(word) for word in read_list(name)]
     except ValueError as error:
@@ -110,7 +110,7 @@ def read_networks(name: str) -> list[IPv4Network | IPv6Network]:
 
 
 def address(name: str) -> tuple[str, int] | None:
-    """A host and a port, HOST:PORT; None where it is not given."""
+    """Return host and port of a setting HOST:PORT; None if it is not set."""
     given = os.environ.get(name, "").strip()
     if not given:
         return None
@@ -123,7 +123,7 @@ def address(name: str) -> tuple[str, int] | None:
 
 
 def log_level(name: str, default: str) -> str:
-    """From which level on something is logged."""
+    """Return the name of the lowest logged level."""
     given = os.environ.get(name) or default
     if given not in _LEVELS:
         raise ImproperlyConfigured(f"{name} = {given!r}; allowed: {', '.join(_LEVELS)}")
@@ -131,20 +131,20 @@ def log_level(name: str, default: str) -> str:
 
 
 def time_zone(name: str, default: str) -> str:
-    """In which time zone pages show times."""
+    """Return the name of the time zone in which pages show times."""
     given = os.environ.get(name)
     if not given:
         return default
     try:
         return ZoneInfo(given).key
-    except (ZoneInfoNotFoundError, ValueError, OSError):  # unknown, no name at all, a folder of names
+    except (ZoneInfoNotFoundError, ValueError, OSError):  # unknown name, malformed name, folder of names
         raise ImproperlyConfigured(
             f"{name} = {given!r}; allowed: names such as UTC, Europe/Berlin, Asia/Shanghai"
         ) from None
 
 
 def store() -> Path | Bucket | None:
-    """Where large files lie that never change: a folder or a bucket of EVA_STORE; None where it is not given."""
+    """Return the folder or bucket of EVA_STORE for large immutable files; None if it is not set."""
     given = os.environ.get("EVA_STORE", "").strip()
     if not given:
         return None
@@ -172,7 +172,7 @@ def store() -> Path | Bucket | None:
 
 
 def _endpoint(name: str) -> str:
-    """An origin, which goes into the policy of pages as it is; "" where it is not given."""
+    """Return the origin in a setting, "" if it is not set; it is inserted unescaped into the security policy."""
     given = os.environ.get(name, "").strip().rstrip("/")
     parts = urlsplit(given)
     whole = f"{parts.scheme}://{parts.netloc}"
@@ -184,7 +184,7 @@ def _endpoint(name: str) -> str:
 
 
 def require_driver(name: str, engine: str) -> None:
-    """The Python package that a database needs is there."""
+    """Raise ImproperlyConfigured if the Python driver of the database is not installed."""
     if engine.endswith("postgresql") and find_spec("psycopg") is None:
         raise ImproperlyConfigured(
             f"{name} names PostgreSQL, whose driver is absent: .venv/bin/python -m pip install -e '.[lab]'"
@@ -192,7 +192,7 @@ def require_driver(name: str, engine: str) -> None:
 
 
 def checkout(folder: Path) -> Path:
-    """The folder of the program, which pages and scripts are read from; ImproperlyConfigured where they are not."""
+    """Return `folder` if it contains templates and static files. Raises: ImproperlyConfigured if it does not."""
     absent = [name for name in ("templates", "static") if not (folder / name).is_dir()]
     if absent:
         raise ImproperlyConfigured(
@@ -203,7 +203,7 @@ def checkout(folder: Path) -> Path:
 
 
 def data_dir(default: Path) -> Path:
-    """The folder that holds everything of this lab; created for its user alone where it is absent."""
+    """Return the data folder of the lab (EVA_DATA_DIR); create it with mode 700 if it is absent."""
     folder = Path(os.environ.get("EVA_DATA_DIR") or default).expanduser().absolute()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -215,9 +215,9 @@ def data_dir(default: Path) -> Path:
 
 
 def private_file(path: Path) -> Path:
-    """`path`, made empty where it is absent: for its user alone, as is what SQLite puts beside it.
+    """Return `path` after creating the file if absent, with mode 600, as SQLite's files next to it.
 
-    One that was copied back from somewhere, readable by others, no longer is.
+    A restored copy that other accounts could read is made private again.
     """
     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
     for file in database_files(path):
@@ -226,31 +226,34 @@ def private_file(path: Path) -> Path:
 
 
 def database_files(database: Path) -> list[Path]:
-    """A file of SQLite with those of its journal, as far as they are there."""
+    """Return the existing files of an SQLite database: itself and its journals."""
     names = [database, *(database.with_name(database.name + end) for end in ("-wal", "-shm", "-journal"))]
     return [path for path in names if path.exists()]
 
 
 def readable_by_others(path: Path) -> bool:
-    """True if its mode lets others than its user read or write it."""
+    """Return True if accounts other than the owner may read or write the file."""
     return bool(path.stat().st_mode & 0o077)
 
 
 def _take_from_others(path: Path) -> None:
-    """Make the file its user's alone; one of another account stays, as evaweb.private says at every start."""
+    """Make the file private; a file of another account stays and evaweb.private warns at every start."""
     if readable_by_others(path):
         with suppress(PermissionError):
             path.chmod(0o600)
 
 
 def secret_key(folder: Path) -> str:
-    """EVA_SECRET_KEY, or one of the lab's own that is made once and readable by its user alone."""
+    """Return EVA_SECRET_KEY, else a key of the lab that is generated once and stored privately."""
     given = os.environ.get("EVA_SECRET_KEY")
     return given or _made_once(folder / "secret_key", partial(secrets.token_urlsafe, 50))
 
 
 def lab_id(folder: Path) -> str:
-    """Eight characters that no other lab has: its cookies are named after them, because cookies know no ports."""
+    """Return a random id of this lab, 8 characters unless edited.
+
+    Cookie names contain it, because cookies ignore ports: two labs on one host would overwrite each other's.
+    """
     path = folder / "lab_id"
     found = _made_once(path, partial(secrets.token_hex, 4))
     if not re.fullmatch("[0-9A-Za-z]{1,32}", found):
@@ -261,7 +264,7 @@ def lab_id(folder: Path) -> str:
 
 
 def _made_once(path: Path, make: Callable[[], str]) -> str:
-    """Contents of the file, which only its user reads; made where it is absent."""
+    """Return the content of a private file; create it from `make` if it is absent."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:

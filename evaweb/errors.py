@@ -1,4 +1,4 @@
-"""The one family of errors that a person may read; evaweb.api turns them into HTTP answers."""
+"""Exceptions with a message for users; evaweb.api and evaweb.refusals convert them to HTTP responses."""
 
 from __future__ import annotations
 
@@ -8,46 +8,46 @@ from runtime.core.sentences import Sentence, identity, plain
 
 
 class EvaError(Exception):
-    """Something asked for that cannot be done; the message says what, what was given and what is allowed.
+    """A request that cannot be fulfilled; the message names the offender, the given value and the allowed ones.
 
-    Where it is a `Sentence`, str() of the error is that one.
+    If the message is a `Sentence`, str() of the exception returns that Sentence.
     """
 
     status = 400
-    retry_after_s: int | None = None  # when to try again [s]
+    retry_after_s: int | None = None  # delay before a retry [s]
 
 
 class NotAllowed(EvaError):
-    """This user may not do this."""
+    """The user lacks the right to do this."""
 
     status = 403
 
 
 class NotFound(EvaError):
-    """The named thing does not exist."""
+    """The named object does not exist."""
 
     status = 404
 
 
 class Conflict(EvaError):
-    """It cannot be done in the present state."""
+    """The request is impossible in the present state."""
 
     status = 409
 
 
 class StationGone(EvaError):
-    """The station does not answer."""
+    """The station does not respond."""
 
     status = 503
 
 
 def refusal(sentence: str) -> dict[str, Any]:
-    """A refusal as JSON: the sentence, and where it has them its id and arguments, for pages in other languages."""
+    """Return an error as JSON: its text and, for a `Sentence`, id and arguments from which pages translate it."""
     return {"error": plain(sentence)} | _identity(sentence)
 
 
 def reasoned(reason: str) -> dict[str, Any]:
-    """A reason as JSON, told as a refusal is."""
+    """Return a reason as JSON, in the form of `refusal`."""
     return {"reason": plain(reason)} | _identity(reason)
 
 

@@ -1,7 +1,7 @@
-"""Passwords are hashed one after the other, behind everything else: however many log in at once, a stop is not later.
+"""Password hashing in one low-priority thread, so that many simultaneous logins do not delay a stop.
 
-A hash is half a second of a processor. Each address has its turn, so that a crowd waits behind itself; where too many
-wait, a login of the crowd is asked to try again.
+A hash takes half a second of CPU time. Addresses take turns; if too many logins wait, the address with the most is
+asked to try again.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class HashingOverload(EvaError):
 
 
 def _give_way() -> None:
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # on Linux this affects the thread only
 
 
 _turns: FairLookupPool[str] = FairLookupPool(1, _MOST_WAITING, "passwords", _give_way)
 
 
 class QueuedHasher(PBKDF2PasswordHasher):
-    """Django's own hashes, made in one thread of this process."""
+    """Django's PBKDF2 hashes, computed in one thread of this process."""
 
     def encode(self, password: str, salt: str, iterations: int | None = None) -> str:
-        """The hash; raises Busy."""
+        """Return the hash. Raises: HashingOverload if too many are waiting."""
         try:
             return _turns.submit(SHARE.get(), partial(super().encode, password, salt, iterations)).result()
         except LookupQueueFull:

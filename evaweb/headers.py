@@ -1,4 +1,4 @@
-"""Headers of every answer: from where its parts may come, and that it is not to be kept."""
+"""Default headers of all responses: content security policy and no caching."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from django.http import HttpRequest
 from django.http.response import HttpResponseBase
 from django.utils.deprecation import MiddlewareMixin
 
-# The style elements that the viewer's script makes when it is loaded: an empty one, which it fills by rules, and that
-# of its panel, which pages remove. tests/e2e/test_policy.py says what has changed where the script has.
+# Style elements that the viewer's script inserts when it is loaded: an empty one, filled by rules, and the one
+# of its panel, which pages remove. tests/e2e/test_policy.py names the difference if the script changes.
 _VIEWER_STYLES = (
     "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='",
     "'sha256-K7kXOYqP8pf16L5/PaLZ4u9Lt5q3nTyjCvyGtO/Af2k='",
 )
 
-DENY_ALL_POLICY = "default-src 'none'"  # the policy of what is no page and is answered without Django
+DENY_ALL_POLICY = "default-src 'none'"  # policy of responses other than pages, made without Django
 PLAIN_PAGE = (
     "default-src 'none'; style-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
-DEFAULT_HEADERS = [  # the headers of such an answer
+DEFAULT_HEADERS = [  # headers of such a response
     (b"cache-control", b"no-store"),
     (b"content-security-policy", DENY_ALL_POLICY.encode()),
     (b"x-content-type-options", b"nosniff"),
@@ -35,7 +35,7 @@ _POLICY: dict[str, Any] = {
         "script-src": [SELF],
         "style-src": [SELF, NONCE, *_VIEWER_STYLES],
         "img-src": [SELF, "data:"],
-        "connect-src": [SELF],  # its websockets as well
+        "connect-src": [SELF],  # includes websockets
         "worker-src": [SELF],  # static/console/commands/beat.js
         "frame-src": [NONE],
         "object-src": [NONE],
@@ -47,15 +47,15 @@ _POLICY: dict[str, Any] = {
 
 
 def content_security_policy(videos: str = "") -> dict[str, Any]:
-    """The policy of pages; `videos` is an origin from which they may play some, "" for none but ours."""
+    """Return the policy of pages; `videos` is a further origin of videos, "" for none."""
     directives = dict(_POLICY["DIRECTIVES"])
     return {"DIRECTIVES": directives | ({"media-src": [SELF, videos]} if videos else {})}
 
 
 class HeadersMiddleware(MiddlewareMixin):
-    """Outermost: whatever answers has the headers of BARE where it says nothing else, redirects and static files too.
+    """Outermost middleware: sets DEFAULT_HEADERS that a response lacks, also on redirects and static files.
 
-    What is behind the login stays in no browser's cache: the next person at it may not be allowed to read it.
+    Pages behind the login stay out of the browser's cache: its next user may not be allowed to read them.
     """
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:

@@ -1,7 +1,7 @@
-"""Records that are only ever added: a line on the disk before the row, from which the row can be made again.
+"""Append-only files with one line per record, written before the database row, from which the row can be restored.
 
-A `Line` declares what a record has: it is written from the row, checked when it is read, and gives back what the row
-is made of. A `Journal` is a folder of files of lines, a file for each episode, trial or session.
+A `Line` declares the fields of a record: it is written from a row, validated when read, and converted back to the
+values of a row. A `Journal` is a folder with one file of lines per episode, trial or session.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ _NOT_KEPT = Pattern("web.journal.not_kept", "not kept: {strerror} ({path}); {don
 
 
 class NotWritten(EvaError):
-    """The disk did not take it, and so the database was not told either."""
+    """The disk refused the line, and so the database was not changed either."""
 
     status = 507
 
 
 def clean_text(name: str, given: str, longest: int) -> str:
-    """A text as it was typed, without blanks at its ends; EvaError where it cannot be stored."""
+    """Return typed text without surrounding blanks. Raises: EvaError if it is too long or contains NUL."""
     if "\x00" in given:
         raise EvaError(_CONTAINS_CHARACTER_U_0000_WHICH(name=name))
     stripped = given.strip()
@@ -71,13 +71,13 @@ def clean_text(name: str, given: str, longest: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RowPath:
-    """Where a row has what a field of its line says, as queries name it: `rater__username`; "" under its own name."""
+    """Query path to the row attribute that a field of a line holds, such as `rater__username`; "" for its own name."""
 
     path: str
 
 
 def _moment(given: Any) -> datetime:
-    """A time as `plain` writes it: ISO 8601, with its zone, in years that every zone has."""
+    """Parse a time in ISO 8601 with a zone, in years that every time zone can represent."""
     found = datetime.fromisoformat(given) if isinstance(given, str) else None
     if found is None or found.tzinfo is None or not 1900 <= found.year <= 9998:
         raise ValueError("allowed: date and time of ISO 8601 with a time zone, in the years 1900 to 9998")
@@ -85,7 +85,7 @@ def _moment(given: Any) -> datetime:
 
 
 def _storable(value: Any) -> Any:
-    """The same, which both databases can keep; ValueError."""
+    """Return `value` if both databases can store it. Raises: ValueError."""
     if isinstance(value, str) and "\x00" in value:
         raise ValueError("it contains the character U+0000, which no database keeps")
     if isinstance(value, float) and not math.isfinite(value):
@@ -101,10 +101,10 @@ Moment = Annotated[datetime, PlainValidator(_moment)]
 
 
 class Line(BaseModel):
-    """A record in plain JSON, as this program wrote it. What came later has a default; what is unknown is left."""
+    """Record as plain JSON, as this program wrote it. Fields added later have a default; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
-    ELSEWHERE: ClassVar[frozenset[str]] = frozenset({"kind"})  # what is in no column of the row
+    ELSEWHERE: ClassVar[frozenset[str]] = frozenset({"kind"})  # fields without a column in the row
 
     @field_validator("*")
     @classmethod
@@ -113,18 +113,18 @@ class Line(BaseModel):
 
     @classmethod
     def path_of(cls, name: str) -> str:
-        """Where the row has it."""
+        """Return the query path of field `name` from the row."""
         found = (each.path for each in cls.model_fields[name].metadata if isinstance(each, RowPath))
         return next(found, "") or name
 
     @classmethod
     def names(cls) -> Iterable[str]:
-        """What is written, in this order."""
+        """Return the names of the written fields, in order."""
         return cls.model_fields
 
     @classmethod
     def written(cls, row: Any, **given: Any) -> dict[str, Any]:
-        """The line of a row that is about to be saved; `given` is what the row does not say."""
+        """Return the line of a row that is about to be saved; `given` are values that the row does not have."""
         return {
             name: given[name] if name in given else to_json_value(cls._value(row, name))
             for name in cls.names()
@@ -144,7 +144,7 @@ class Line(BaseModel):
         )
 
     def to_row_values(self) -> dict[str, Any]:
-        """What the row is made of: people as their accounts; what lies in other rows is left out."""
+        """Return the values of the row, with people as accounts; values stored in other rows are omitted."""
         found = {}
         for name in type(self).names():
             field, _, further = type(self).path_of(name).partition("__")
@@ -157,14 +157,14 @@ class Line(BaseModel):
 
 
 def resolve_path(row: Any, path: str) -> Any:
-    """What a path of a query leads to; None where it ends before."""
+    """Return the value at a query path from `row`; None if an object on the path is None or missing."""
     for name in path.split("__"):
         row = getattr(row, name, None) if row is not None else None
     return row
 
 
 def to_json_value(value: Any) -> Any:
-    """A value as JSON has it."""
+    """Return a time, enumeration or UUID as JSON value; others unchanged."""
     if isinstance(value, datetime):
         return value.isoformat()
     if isinstance(value, Enum):
@@ -176,7 +176,10 @@ AnyLine = TypeVar("AnyLine", bound=Line)
 
 
 def missing_rows(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list[AnyLine]:
-    """The lines whose rows are not there, of one that was given twice the last; EvaError for one of another owner."""
+    """Return the lines without a database row; of lines with the same uuid only the last.
+
+    Raises: EvaError if such a row belongs to another owner.
+    """
     ((belongs, whose),) = owner.items()
     last = {line.uuid: line for line in lines}  # type: ignore[attr-defined]
     rows = dict(model._default_manager.filter(uuid__in=last).values_list("uuid", belongs))
@@ -190,28 +193,28 @@ def missing_rows(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -
 
 # --- the files ---------------------------------------------------------------------------------------------
 
-_kinds: dict[str, tuple[type[Line], ...]] = {}  # of each folder; several journals may write into its files
+_kinds: dict[str, tuple[type[Line], ...]] = {}  # by folder; several journals may share its files
 
 
 class Journal(Generic[AnyLine]):
-    """DATA/`folder`/<uuid>.jsonl, and the kinds of lines that are written there."""
+    """Lines of the given kinds in the files DATA/`folder`/<uuid>.jsonl."""
 
     def __init__(self, folder: str, *kinds: type[AnyLine]) -> None:
         self.folder = folder
         _kinds[folder] = (*_kinds.get(folder, ()), *kinds)
 
     def path(self, uuid: UUID) -> Path:
-        """The file of one episode, trial or session."""
+        """Return the file of one episode, trial or session."""
         return Path(settings.DATA_DIR) / self.folder / f"{uuid}.jsonl"
 
     def append(self, uuid: UUID, line: Mapping[str, Any]) -> None:
-        """Add one line and wait until it is on the disk; the caller holds a row. Raises NotKept."""
+        """Append one line and wait until it is on the disk; hold a row lock. Raises: NotWritten."""
         append_line(self.path(uuid), line)
 
     def read(self, uuid: UUID, say: Callable[[str], None]) -> list[AnyLine]:
-        """What the file says, oldest first, also what other journals of the folder have written.
+        """Return all valid lines of the file, oldest first, including those of other journals in the folder.
 
-        A line that is not whole, or that is none of theirs, is left out: `say` is told file, line and field.
+        A truncated or invalid line is skipped: `say` is called with file, line number and field.
         """
         path, found, lines = self.path(uuid), [], _reader(_kinds[self.folder])
         for number, line in read_numbered_lines(path):
@@ -229,12 +232,12 @@ def _reader(kinds: tuple[type[Line], ...]) -> TypeAdapter[Any]:
 
 
 def folders() -> list[str]:
-    """The folders of all journals."""
+    """Return the folders of all journals."""
     return sorted(_kinds)
 
 
 def parse_model(model: type[AnyLine], content: Mapping[str, Any], what: str) -> AnyLine:
-    """`content` as that model; EvaError says after `what` the first thing that is wrong with it."""
+    """Return `content` as an instance of `model`. Raises: EvaError with `what` and the first problem."""
     try:
         return model.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -242,7 +245,7 @@ def parse_model(model: type[AnyLine], content: Mapping[str, Any], what: str) -> 
 
 
 def _wrong(error: ValidationError) -> str:
-    """The first thing that is wrong with a line, after its name."""
+    """Return the first problem of a line, to be appended to its name."""
     first = error.errors()[0]
     if first["type"] == "json_invalid":
         why, _, _ = first["ctx"]["error"].partition(" at line ")
@@ -252,12 +255,14 @@ def _wrong(error: ValidationError) -> str:
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Add one line and wait until it is on the disk; a line torn by a crash before it stays a line of its own.
+    """Append one line and sync it to the disk; a line torn by an earlier crash stays a separate line.
 
-    The caller holds a row of the database, so that there is one writer at a time. Raises NotKept, which says whether
-    the line was taken back.
+    The caller holds a database row, so that there is one writer at a time.
+    Raises: NotWritten, which states whether a partly written line was removed.
     """
-    text = json.dumps(line, allow_nan=False, separators=(",", ":"))  # ASCII: no character in it ends a line
+    text = json.dumps(
+        line, allow_nan=False, separators=(",", ":")
+    )  # ASCII output: line separators are escaped
     done = "nothing was changed"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -275,7 +280,9 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
 def _written(file: FileIO, payload: bytes) -> None:
     new = file.tell() == 0
     if not new:
-        file.seek(-1, os.SEEK_END)
+        file.seek(
+            -1, os.SEEK_END
+        )  # a crash may have torn the last line: end it, so that only that one is lost
         payload = payload if file.read(1) == b"\n" else b"\n" + payload
     while payload:
         payload = payload[file.write(payload) :]
@@ -287,7 +294,7 @@ def _written(file: FileIO, payload: bytes) -> None:
 
 
 def _truncate_back(file: FileIO, before: int) -> str:
-    """Give the file the length that it had; what became of the line, in words."""
+    """Restore the file's length; return the fate of the line as text for the error message."""
     try:
         file.truncate(before)
         os.fsync(file.fileno())
@@ -306,7 +313,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def read_numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """The lines of a file with their numbers, from 1; none of an absent one. RecordingError if it is unreadable."""
+    """Yield the non-empty lines with their numbers from 1; none if absent. Raises: RecordingError if unreadable."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Template tags for words: in the language that the browser has chosen."""
+"""Template tags for translated text, in the language that the browser has chosen."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ register = template.Library()
 
 @register.simple_tag(takes_context=True)
 def said(context: Any, sentence: object) -> str:
-    """The sentence, or that of an error, in the chosen language; English where that has no words for it."""
+    """Return a sentence, or that of an error, in the chosen language; English if it has no translation."""
     request = context.get("request")
     return languages.translated(str(sentence), languages.chosen(request) if request else None)
 
 
 @register.simple_tag(takes_context=True)
 def label(context: Any, text: object) -> str:
-    """The head of a column, the name of a filter, or what a choice is called, in the chosen language."""
+    """Return a column header, filter name or choice in the chosen language."""
     request = context.get("request")
     return languages.label(str(text), languages.chosen(request) if request else None)
 
 
 @register.simple_tag(takes_context=True)
 def language_choice(context: Any) -> dict[str, Any]:
-    """The languages that are offered, and the code of the one that is chosen; "" for English."""
+    """Return the offered languages and the code of the chosen one, "" for English."""
     spoken = languages.chosen(context["request"])
     return {"offered": languages.offered(), "chosen": spoken.code if spoken else ""}
 
 
 class TextNode(template.Node):
-    """Markup in English, which a language may replace by its own: `{% t "home.robots" n=count %}...{% endt %}`.
+    """English markup that a language may replace: `{% t "home.robots" n=count %}...{% endt %}`.
 
-    The words of a language are markup too, with `{n}` for each value that the tag names.
+    The translation is markup too, with `{n}` for each value that the tag names.
     """
 
     def __init__(self, id: str, values: dict[str, FilterExpression], english: NodeList) -> None:
         self.id, self.values, self.english = id, values, english
 
     def render(self, context: Any) -> SafeString:
-        """The words of the chosen language, else the English ones."""
+        """Return the markup of the chosen language, else the English one."""
         request = context.get("request")
         spoken = languages.chosen(request) if request is not None else None
         words = spoken.templates.get(self.id) if spoken is not None else None
@@ -64,7 +64,7 @@ class TextNode(template.Node):
 
 @register.tag("t")
 def text(parser: Parser, token: Token) -> TextNode:
-    """Compile `{% t "id" name=value ... %}English{% endt %}`; TemplateSyntaxError for anything else."""
+    """Compile `{% t "id" name=value ... %}English{% endt %}`. Raises: TemplateSyntaxError for any other form."""
     _, id, *rest = (*token.split_contents(), "")
     values = token_kwargs(bits := [bit for bit in rest if bit], parser)
     if bits or len(id) < 3 or id[0] != id[-1] or id[0] not in "'\"":

@@ -1,8 +1,7 @@
-"""Languages of the pages: a JSON file each, which gives the words of another language by id.
+"""Languages of the pages: one JSON file each, with translations by id.
 
-`sentences` are those of the station, the lab and the scripts, as patterns with named arguments; `templates` are what
-templates write between `{% t "id" %}` and `{% endt %}`. English is what all are written in, and what is shown where a
-language has no words.
+`sentences` are patterns with named arguments for messages of station, lab and scripts; `templates` replace the markup
+between `{% t "id" %}` and `{% endt %}`. The source language is English; it is shown if a translation is missing.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ log = logging.getLogger(__name__)
 COOKIE = "eva_language"
 _PART = re.compile(r"[a-z0-9]+")
 _CODE = re.compile(r"[a-z]{2,3}(-[A-Z][A-Za-z]{1,3})?")
-_LARGEST, _MOST = 4 << 20, 20_000  # bytes and values of a file
+_LARGEST, _MOST = 4 << 20, 20_000  # limits of a language file [bytes], [values]
 
 
 @dataclass(frozen=True, slots=True)
 class Language:
-    """A language: its code (`de`), its own name for itself, and its patterns by id."""
+    """A language: its code (`de`), its native name, and its patterns by id."""
 
     code: str
     name: str
@@ -39,19 +38,19 @@ class Language:
 
 
 def offered() -> list[Language]:
-    """The languages that are there, in the order of their codes; a file that cannot be used is none, and logged."""
+    """Return the installed languages, sorted by code; a file that cannot be read is logged and skipped."""
     files = sorted(Path(settings.LANGUAGES_DIR).glob("*.json"))
     read = (_read(path, path.stat().st_mtime_ns) for path in files if _CODE.fullmatch(path.stem))
     return [language for language in read if language is not None]
 
 
 def language(code: str) -> Language | None:
-    """The language of that code, None where it is not there."""
+    """Return the language with this code, None if it is not installed."""
     return next((one for one in offered() if one.code == code), None)
 
 
 def chosen(request: Any) -> Language | None:
-    """The language that this browser has chosen, None for English; looked up once per request."""
+    """Return the language that the browser has chosen, None for English; looked up once per request."""
     if not hasattr(request, "_eva_language"):
         code = request.COOKIES.get(COOKIE, "")
         request._eva_language = language(code) if _CODE.fullmatch(code) else None
@@ -60,7 +59,7 @@ def chosen(request: Any) -> Language | None:
 
 
 def parse(code: str, content: str) -> Language:
-    """The language that a file describes; ValueError where it is none."""
+    """Return the language that a file describes. Raises: ValueError if its content is invalid."""
     given = bounded.parse_json(content, "the language", _LARGEST, _MOST)
     match given:
         case {"name": str(name), "sentences": dict(patterns), **rest}:
@@ -78,7 +77,7 @@ def parse(code: str, content: str) -> Language:
 
 
 def translated(text: str, spoken: Language | None) -> str:
-    """The sentence in that language; its English where it has no id, or the language no words for it."""
+    """Return the sentence in that language; `text` itself if it has no id or no usable translation."""
     pattern = spoken.patterns.get(text.id) if spoken is not None and isinstance(text, Sentence) else None
     if pattern is None:
         return text
@@ -90,17 +89,17 @@ def translated(text: str, spoken: Language | None) -> str:
 
 
 def label(text: str, spoken: Language | None) -> str:
-    """A word of ours that stands in a table, a list or a choice, by an id that follows from it; else as it is."""
+    """Return the translation of a table header, list entry or choice by `label_id`; `text` itself if there is none."""
     return spoken.patterns.get(label_id(text), text) if spoken is not None else text
 
 
 def label_id(text: str) -> str:
-    """ "To be scored" is label.to_be_scored."""
+    """Return the id of a label: "To be scored" is label.to_be_scored."""
     return f"label.{'_'.join(_PART.findall(text.casefold()))[:60] or 'empty'}"
 
 
 def _filled(pattern: str, arguments: Mapping[str, Any], spoken: Language | None) -> str:
-    names_of(pattern)  # ValueError for what asks for more than names
+    names_of(pattern)  # ValueError if a field is more than a name
     return "".join(
         before + ("" if name is None else _shown(arguments[name], spec or "", conversion, spoken))
         for before, name, spec, conversion in Formatter().parse(pattern)

@@ -1,4 +1,4 @@
-"""Sockets that listen, opened by the serving process, or by a lab that keeps one open while its server restarts."""
+"""Listening sockets, opened by the server or by the lab, which keeps them open while the server restarts."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import socket
 
 from evaweb.errors import EvaError
 
-_BACKLOG = 4096  # a connection that finds no place tries again after a second
+_BACKLOG = 4096  # beyond it a client's connection attempt is repeated after a second
 
 
 class PortTaken(EvaError):
-    """Something else listens there already."""
+    """The address cannot be listened on, usually because the port is in use."""
 
 
 def open_listener(host: str, port: int) -> socket.socket:
-    """A listening socket; port 0 takes a free one. PortTaken says what to do."""
+    """Return a non-blocking listening TCP socket; port 0 picks a free port. Raises: PortTaken with advice."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -1,7 +1,7 @@
-"""Lists on pages: what one is narrowed to and sorted by stands in its address, and its file has the same rows.
+"""Lists on pages: filter and sort order are in the URL, and the CSV file has the same rows.
 
-A page says which columns and filters its list has; all of them are shown by templates/lists and static/site/lists.js.
-What a user may not see is no column by which they sort, and no choice of a filter.
+A page declares the columns and filters of its list; templates/lists and static/site/lists.js render them.
+Data hidden from a user must not be offered as a sort column or a filter choice.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ _WORDS_ALLOWED = Pattern(
 )
 
 SEARCH, CHOICE, DAY, UNSEEN = "search", "choice", "day", "unseen"
-LONGEST = 200  # characters of words that are looked for
-_MOST_WORDS = 16  # each is a condition of the query
-_AT_ONCE = 500  # rows of a file
+LONGEST = 200  # longest search text [characters]
+_MOST_WORDS = 16  # search words; each adds a condition to the query
+_AT_ONCE = 500  # rows read at a time for a file
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: sorted `by` fields of a query, or attributes, none where it is not; `cell` is its text in the file.
+    """Column of a list.
 
-    `down`: sorted from its largest value down first. `quiet`: its title is for those alone who do not see the page;
-    `hidden`: it is in the file alone.
+    `by`: fields of a query, or attributes, to sort by; () if not sortable. `cell` returns the value in the CSV file.
+    `down`: descending is the first sort order. `quiet`: the title is for screen readers only.
+    `hidden`: the column is in the file only.
     """
 
     name: str
@@ -58,10 +59,10 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """What a list is narrowed by: one of `choices`, pairs of value and words, or what is typed.
+    """Filter of a list: one of `choices` (pairs of value and label), or a typed text.
 
-    `any` stands for no choice. Not `strict`: the page itself says what it does not know. Of the kind UNSEEN it has no
-    field: links lead to it.
+    `any` labels the absence of a choice. If not `strict`, the page itself reports unknown values. A filter of kind
+    UNSEEN has no input field: links set it.
     """
 
     name: str
@@ -75,7 +76,7 @@ class Filter:
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """A column's head: the sort that it leads to, None for the list's own; `sorted`: as aria-sort has it."""
+    """Column header: `next` is the sort parameter that a click sets (None: the default); `sorted` is for aria-sort."""
 
     column: Column
     next: str | None
@@ -84,14 +85,14 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Chip:
-    """One thing that the list is narrowed to, in words; `without`: the query of the list without it."""
+    """An active filter as text; `without` is the query string without it."""
 
     words: str
     without: str
 
 
 def words_of(text: str, name: str = "words") -> list[str]:
-    """The words that are looked for, each once; EvaError where there are too many."""
+    """Return the distinct search words of `text`. Raises: EvaError if the text is too long or has too many."""
     if len(text) > LONGEST:
         raise EvaError(_CHARACTERS_ALLOWED(name=name, count=len(text), most=LONGEST))
     words = list(dict.fromkeys(text.split()))
@@ -101,7 +102,7 @@ def words_of(text: str, name: str = "words") -> list[str]:
 
 
 class Listing:
-    """A list as its address asks for it; where that asks for what there is not, `fault` says so and all is shown."""
+    """A list as its URL requests it; if the request is invalid, `fault` is the reason and everything is shown."""
 
     def __init__(self, given: QueryDict, columns: Sequence[Column], filters: Sequence[Filter] = ()) -> None:
         self.columns, self.filters, self.fault, self._given = columns, filters, "", given
@@ -114,7 +115,7 @@ class Listing:
             self.refuse(fault)
 
     def refuse(self, fault: EvaError) -> None:
-        """Show all, and why."""
+        """Reset filters and sort order, and record the reason."""
         self.fault, self.sort = str(fault), ""
         self.chosen = {one.name: "" for one in self.filters}
 
@@ -136,7 +137,7 @@ class Listing:
 
     @property
     def heads(self) -> list[Head]:
-        """Of all columns that are shown."""
+        """Headers of all visible columns."""
         return [self._head(column) for column in self.columns if not column.hidden]
 
     def _head(self, column: Column) -> Head:
@@ -147,7 +148,7 @@ class Listing:
 
     @property
     def chips(self) -> list[Chip]:
-        """What it is narrowed to."""
+        """Active filters."""
         return [
             Chip(f"{one.label}: {dict(one.choices).get(value, value)}", self._without(one.name))
             for one in self.filters
@@ -162,13 +163,13 @@ class Listing:
 
     @property
     def fields(self) -> list[tuple[Filter, str]]:
-        """Each filter with what is chosen."""
+        """Filters, each with its chosen value."""
         return [(one, self.chosen[one.name]) for one in self.filters]
 
     # --- its rows ----------------------------------------------------------------------------------------------
 
     def ordered(self, rows: QuerySet[Any]) -> QuerySet[Any]:
-        """As it is sorted; as they came where it is not. What is not known comes last."""
+        """Return `rows` in the chosen order with NULL last; in their own order if none is chosen."""
         if not self.sort:
             return rows
         down = self.sort.startswith("-")
@@ -179,14 +180,14 @@ class Listing:
         )
 
     def page(self, rows: QuerySet[Any], size: int) -> Page[Any]:
-        """One page of them: all are sorted by their keys alone, and only what is shown is read whole."""
+        """Return one page of `rows`: only keys are sorted, and only the rows of the page are read in full."""
         keys = self.ordered(rows).values_list("pk", flat=True)
         page: Page[Any] = Paginator(keys, size).get_page(self.number)
         page.object_list = _in_order(rows, list(page.object_list))
         return page
 
     def sorted(self, rows: Sequence[Any]) -> list[Any]:
-        """Rows by the attributes of their column, what is None last."""
+        """Return `rows` sorted by the attributes of the chosen column, None last."""
         if not self.sort:
             return list(rows)
         value = attrgetter(*self._by)
@@ -201,15 +202,16 @@ class Listing:
 
     @property
     def has_file(self) -> bool:
-        """True if its page can write it as a file."""
+        """Whether the list can be downloaded as a file."""
         return any(column.cell for column in self.columns)
 
     def file(
         self, request: HttpRequest, name: str, rows: QuerySet[Any] | Iterable[Any]
     ) -> StreamingHttpResponse:
-        """All of them as `name`.csv; those of a query in the order of the list, others as they come.
+        """Return all rows as `name`.csv: a queryset in the order of the list, other rows as they come.
 
-        EvaError where the page says `fault`: nothing in a file would say that it is not narrowed.
+        Raises:
+            EvaError: The request is invalid (`fault`); a file could not show that it is unfiltered.
         """
         if self.fault:
             raise EvaError(self.fault)
@@ -226,4 +228,4 @@ class Listing:
 
 def _in_order(rows: QuerySet[Any], keys: Sequence[Any]) -> list[Any]:
     found: Mapping[Any, Any] = rows.order_by().in_bulk(keys)
-    return [found[key] for key in keys if key in found]  # some may be gone meanwhile
+    return [found[key] for key in keys if key in found]  # rows may have been deleted meanwhile

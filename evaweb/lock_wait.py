@@ -1,4 +1,4 @@
-"""Longest waits of a database connection, where a row, a lock or a server that hangs must not keep it."""
+"""Limits on how long a database connection waits for a lock or for an unresponsive server."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Any
 from django.db import connection, connections
 from django.db.backends.signals import connection_created
 
-HURRY_S = 1.5  # what a request that commands or renews waits for the database
-_WEB_CONNECT_S = 2  # the least that PostgreSQL's library takes
+HURRY_S = 1.5  # longest lock wait of requests that send commands or renew leases
+_WEB_CONNECT_S = 2  # smallest connect timeout of libpq
 _hurry: ContextVar[float | None] = ContextVar("hurry", default=None)
 
 
 @contextmanager
 def short_lock_wait(seconds: float = HURRY_S) -> Iterator[None]:
-    """Connections that are opened within it wait no longer for a lock, nor for a statement of PostgreSQL's."""
+    """Limit lock waits, and statements on PostgreSQL, of connections opened in this context to `seconds` [s]."""
     token = _hurry.set(seconds)
     try:
         yield
@@ -27,9 +27,9 @@ def short_lock_wait(seconds: float = HURRY_S) -> Iterator[None]:
 
 @contextmanager
 def lock_wait(seconds: float) -> Iterator[None]:
-    """Within it a locked database is an OperationalError after `seconds`.
+    """Limit lock waits of the current connection to `seconds` [s]; then it raises OperationalError.
 
-    SQLite locks as a whole. PostgreSQL locks rows, and a new one waits for those that it refers to.
+    SQLite locks the whole database. PostgreSQL locks rows, and an insert waits for the rows that it references.
     """
     _wait_at_most(connection, seconds if connection.vendor == "sqlite" else max(seconds, 0.001))
     try:
@@ -39,9 +39,9 @@ def lock_wait(seconds: float) -> Iterator[None]:
 
 
 def limit_page_waits() -> None:
-    """This process serves people: it does not wait long for a PostgreSQL that does not answer.
+    """Shorten the PostgreSQL connect timeout of this process, because it serves users.
 
-    Other processes keep the time of the settings, and try again.
+    Other processes keep the timeout of the settings and retry.
     """
     options: dict[str, Any] = connections.settings["default"]["OPTIONS"]
     if "connect_timeout" in options:
@@ -57,7 +57,7 @@ def _usual(database: Any) -> float:
 
 
 def _limit(connection: Any, **named: Any) -> None:
-    """A connection that has just been opened."""
+    """Apply the limit of `short_lock_wait` to a newly opened connection."""
     hurry = _hurry.get()
     if hurry is None:
         return

@@ -1,4 +1,4 @@
-"""Logins that are locked: a name at its address, and an address from which many names are guessed."""
+"""Locking of logins: a user name at one address, and an address from which many names are guessed."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ _MANY_NAMES = Pattern(
     "The password was wrong for {names} names from this computer. Try again in {minutes} min. "
     "Anyone who is already logged in stays logged in.",
 )
-MOST_NAMES = 20  # whose password was wrong, of one address; each of them five times
+MOST_NAMES = 20  # names with wrong passwords from one address; each may fail AXES_FAILURE_LIMIT times
 
 
 class ManyNames:
-    """Refuses logins from an address from which passwords of many names are guessed."""
+    """Authentication backend that refuses addresses from which passwords of many names are guessed."""
 
     def authenticate(self, request: HttpRequest | None, **given: Any) -> None:
-        """PermissionDenied where it is one; the middleware of axes answers by `answer`."""
+        """Raise PermissionDenied for such an address; the axes middleware then responds with `lockout_response`."""
         if request is not None and _many_names_until(request) is not None:
             request.axes_locked_out = True  # type: ignore[attr-defined]
             raise PermissionDenied
 
 
 def lockout_response(request: HttpRequest, *given: Any) -> HttpResponse:
-    """429 with how long it lasts."""
+    """Return a response with status 429 that states how long the lock lasts."""
     until = _many_names_until(request)
     seconds = _seconds_to(until or _name_until(request))
     minutes = ceil(seconds / 60)
@@ -63,7 +63,7 @@ def lockout_response(request: HttpRequest, *given: Any) -> HttpResponse:
 
 
 def _name_until(request: HttpRequest) -> datetime:
-    """When the newest failure of the name no longer counts."""
+    """Return when the newest failure of the name expires."""
     username = (getattr(request, "axes_credentials", None) or {}).get("username")
     attempts = AccessAttempt.objects.filter(username=username, ip_address=lockable_of(request))
     newest: datetime = attempts.aggregate(at=Max("attempt_time"))["at"] or timezone.now()
@@ -71,7 +71,7 @@ def _name_until(request: HttpRequest) -> datetime:
 
 
 def _many_names_until(request: HttpRequest) -> datetime | None:
-    """When the failures of fewer names will count that came from this address; None where that is so now."""
+    """Return when fewer than MOST_NAMES names have recent failures from this address; None if that is so now."""
     since = timezone.now() - settings.AXES_COOLOFF_TIME
     attempts = AccessAttempt.objects.filter(ip_address=lockable_of(request), attempt_time__gt=since)
     newest = attempts.values("username").annotate(at=Max("attempt_time")).order_by("-at")

@@ -1,4 +1,4 @@
-"""Questions to the database that strangers can cause: each caller has a share, and a crowd waits behind itself."""
+"""Thread pool for database lookups that strangers can cause: clients have shares, a crowd waits behind itself."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from typing import Generic, TypeVar
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-_MOST = 1024  # that wait, of all shares together
+_MOST = 1024  # queued lookups of all shares
 
 
 class LookupQueueFull(Exception):
-    """There is no place to wait for this one."""
+    """The queue is full."""
 
     def __init__(self) -> None:
         super().__init__("too many logins from this address are looked up at once")
 
 
 class FairLookupPool(Generic[T]):
-    """Work in `threads`, the oldest of each share in turn; from any thread, and none of its callers waits.
+    """Pool of `threads` that serves shares in turn, each in order of arrival; `submit` never blocks. Thread-safe.
 
-    Each thread does `begin` first.
-
-    Where `most` wait, the newest of the share that has most of them gives way, or is not taken: it fails with Crowded.
+    Each thread calls `begin` first. If `most` are waiting, the newest work of the longest queue is dropped, or the new
+    work refused: its future fails with LookupQueueFull.
     """
 
     def __init__(
@@ -43,9 +42,9 @@ class FairLookupPool(Generic[T]):
         self._threads = ThreadPoolExecutor(threads, name, initializer=begin)
 
     def submit(self, share: Hashable, work: Callable[[], T]) -> Future[T]:
-        """Result of `work`, once it had its turn."""
+        """Queue `work` in this share and return the future of its result."""
         answer: Future[T] = Future()
-        answer.set_running_or_notify_cancel()  # who stops waiting for it ends nobody else's
+        answer.set_running_or_notify_cancel()  # shared by callers: one must not cancel it for others
         with self._lock:
             turned_away = self._place_for(share, answer)
             if turned_away is not answer:
@@ -53,15 +52,18 @@ class FairLookupPool(Generic[T]):
                 self._waiting += 1
         if turned_away is not None:
             turned_away.set_exception(LookupQueueFull())
-        if turned_away is None:  # else a thread is promised to the one that gave way
+        if turned_away is None:  # otherwise the removed work's thread task serves this one
             try:
                 self._threads.submit(self._next)
-            except RuntimeError as error:  # no more threads: it waits for those that there are
+            except RuntimeError as error:  # cannot start a thread: existing ones serve it later
                 log.error("%s", error)
         return answer
 
     def _place_for(self, share: Hashable, answer: Future[T]) -> Future[T] | None:
-        """Look-up to drop so that one of this share may wait: None, `answer`, or one of a longer share."""
+        """Make room if the queue is full, by removing the newest work of a longer share.
+
+        Returns: The future to fail: None if there was room, `answer` if no other share is longer, else the removed one.
+        """
         if self._waiting < self._most:
             return None
         longest = max(self._shares.values(), key=len)
@@ -75,7 +77,7 @@ class FairLookupPool(Generic[T]):
             share, waiting = self._shares.popitem(last=False)
             work, answer = waiting.popleft()
             if waiting:
-                self._shares[share] = waiting  # behind all others
+                self._shares[share] = waiting  # at the end of the rotation
             self._waiting -= 1
         try:
             found = work()

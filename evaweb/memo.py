@@ -1,4 +1,4 @@
-"""Values made of rows, kept as long as their fingerprint stays what it was; in each process of the web."""
+"""Cache of values computed from database rows, valid while the rows' fingerprint is unchanged; one per web process."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable, Hashable
 from threading import Lock
 from typing import Generic, TypeVar
 
-_MOST = 256  # analyses of 500 trials each: some 100 MB
+_MOST = 256  # values; with analyses of 500 trials about 100 MB
 T = TypeVar("T")
 
 
 class FingerprintCache(Generic[T]):
-    """The most recently used of what was made, each with the fingerprint it was made at."""
+    """Least-recently-used cache of `most` values, each with the fingerprint of the rows that it was made from."""
 
     def __init__(self, most: int = _MOST) -> None:
         self._most = most
@@ -20,13 +20,13 @@ class FingerprintCache(Generic[T]):
         self._lock = Lock()
 
     def get(self, key: Hashable, fingerprint: Hashable, make: Callable[[], T]) -> T:
-        """Value of `key` at this `fingerprint`, made now where it is not kept."""
+        """Return the value of `key` at this `fingerprint`; call `make` if it is missing or outdated."""
         with self._lock:
             found = self._rows.get(key)
             if found is not None and found[0] == fingerprint:
                 self._rows.move_to_end(key)
                 return found[1]
-        made = make()  # outside of the lock: two who ask at once both make it, and nobody waits
+        made = make()  # outside the lock: concurrent callers both compute it, and neither waits
         with self._lock:
             self._rows[key] = (fingerprint, made)
             self._rows.move_to_end(key)
@@ -35,20 +35,23 @@ class FingerprintCache(Generic[T]):
         return made
 
     def renew(self, key: Hashable, make: Callable[[T | None], T]) -> T:
-        """What `make` makes of the value of before, None where there is none; two who ask at once both make theirs."""
+        """Replace the value of `key` by `make` of the previous value (None if there is none) and return it.
+
+        Concurrent callers each make a value.
+        """
         with self._lock:
             found = self._rows.get(key)
         return self.get(key, object(), lambda: make(found[1] if found else None))
 
     def clear(self) -> None:
-        """Forget all of it."""
+        """Drop all values."""
         with self._lock:
             self._rows.clear()
 
 
 def rounded_sum(total: float | None) -> float:
-    """A sum of numbers as part of a fingerprint.
+    """Return a sum rounded to 3 decimals for use in a fingerprint, 0 for None.
 
-    PostgreSQL adds up on several cores, in another order each time, and the last digits are chance.
+    PostgreSQL adds in parallel and in varying order, so the last digits of a sum vary.
     """
     return round(total or 0.0, 3)

@@ -1,4 +1,4 @@
-"""Names that stand in one line: on pages, in drawings, in files that others read."""
+"""Check of names that are printed on one line: on pages, in drawings, in files for other programs."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import re
 
 from django.core.exceptions import ValidationError
 
-# Controls and line ends, surrogates and what else XML has no character for, and marks that turn what follows around.
+# Control characters and line ends; surrogates and other code points that XML forbids; bidirectional marks.
 _REFUSED = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]")
 
 
 def is_name(given: str) -> bool:
-    """True if it has no character that no name has."""
+    """Return True if `given` contains no control, line-end, bidirectional or non-XML character."""
     return _REFUSED.search(given) is None
 
 
 def check_name(given: str) -> None:
-    """ValidationError where it has a character that no name has."""
+    """Raise ValidationError if `given` contains a character that a name must not have."""
     found = _REFUSED.search(given)
     if found:
         raise ValidationError(

@@ -1,9 +1,9 @@
-"""Where large files lie that never change: objects named by their SHA-256, in a folder or an S3-compatible store.
+"""Stores of large immutable files: objects named by their SHA-256, in a folder or an S3-compatible bucket.
 
-One interface, two places. Whoever needs a file as a file gets it through `LocalCache`, which compares what it brings.
-S3 is spoken by obstore (MIT), the Python side of Apache Arrow's object_store in Rust: one wheel of 6 MB that wants
-nothing but typing_extensions, with signed addresses, uploads in parts and retries. boto3 brings four packages and the
-tables of all of Amazon's services; django-storages is a layer above it for fields of models, which these files are not.
+Both implement `Store`. Code that needs a local file gets it from `LocalCache`, which checks the digest.
+The S3 client is obstore (MIT), the Python binding of Apache Arrow's object_store in Rust: one wheel of 6 MB that
+depends only on typing_extensions, with signed URLs, multipart uploads and retries. boto3 brings four packages and the
+tables of all of Amazon's services; django-storages is a layer above it for model fields, which these files are not.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from evaweb.environment import Bucket
 from evaweb.errors import EvaError
 from runtime.core.sentences import Pattern, fixed
 
-LONGEST_S = 300  # for which an address is good
-_STEP = 1 << 20  # bytes
-_IN_USE_S = 600.0  # for which a file that was handed out stays
+LONGEST_S = 300  # longest validity of a signed URL
+_STEP = 1 << 20  # size of a part [bytes]
+_IN_USE_S = 600.0  # time after its last use during which a cached file is not removed
 _CONNECT, _ANSWER = "3s", "30s"
 _RETRIES: Any = {"max_retries": 3, "retry_timeout": timedelta(seconds=20)}
 _NO_STORE = fixed(
@@ -40,36 +40,36 @@ _CHANGED = Pattern(
 
 
 class StoreError(EvaError):
-    """A store that is absent, full or refuses; the message says which and what it was asked for."""
+    """An object store is missing, full or refuses a request; the message names store and request."""
 
     status = 503
 
 
 class Store(Protocol):
-    """Objects by their SHA-256 in hexadecimal. Every method may wait for a network; all raise StoreError."""
+    """Objects by the hexadecimal SHA-256 of their content. Every method may wait for a network and raise StoreError."""
 
     def put(self, path: Path, content_type: str) -> str:
-        """Put a file there, once; the digest by which it is found."""
+        """Store a file unless it is there already; return its digest."""
 
     def exists(self, digest: str) -> bool:
-        """True if it is there."""
+        """Return True if the store has the object."""
 
     def read(self, digest: str) -> Iterator[bytes]:
-        """What is there, in parts; nobody has compared it yet."""
+        """Yield the content in parts; it is not compared with the digest."""
 
     def delete(self, digest: str) -> None:
-        """Remove it; nothing where it is not there."""
+        """Delete the object; do nothing if it is absent."""
 
     def address(self, digest: str, seconds: int = LONGEST_S) -> str:
-        """Where a browser gets it without us, signed, for so long and no longer than LONGEST_S; "" where it cannot."""
+        """Return a signed URL for browsers, valid for `seconds` (at most LONGEST_S) [s]; "" if unsupported."""
 
     def file(self, digest: str) -> Path | None:
-        """Where it lies as a file of this machine; None where it does not."""
+        """Return the local path of the object, None if the store has no local files."""
 
 
 @dataclass(frozen=True, slots=True)
 class FolderStore:
-    """A folder, also of a network file system: FOLDER/ab/abcdef..."""
+    """Objects in a folder, which may be on a network file system: FOLDER/ab/abcdef..."""
 
     folder: Path
 
@@ -78,7 +78,7 @@ class FolderStore:
             draft, digest = _draft(self.folder / ".drafts", _parts(path))
             target = self._at(digest)
             target.parent.mkdir(exist_ok=True)
-            os.replace(draft, target)  # the same, where it is there already
+            os.replace(draft, target)  # an existing file has the same content
         except OSError as error:
             raise self._failed("take a file", error) from None
         return digest
@@ -112,7 +112,7 @@ class FolderStore:
 
 
 class S3Store:
-    """A bucket of an S3-compatible server: PREFIX/ab/abcdef..."""
+    """Objects in a bucket of an S3-compatible server: PREFIX/ab/abcdef..."""
 
     def __init__(self, given: Bucket) -> None:
         from obstore.store import S3Store as Remote
@@ -191,19 +191,19 @@ class S3Store:
     def _failed(self, what: str, error: Exception) -> StoreError:
         if isinstance(error, StoreError):
             return error
-        why = str(error).partition("\n")[0]  # what follows are the insides of its library
+        why = str(error).partition("\n")[0]  # further lines are internals of obstore
         return StoreError(_FAILED(store=self._given, what=what, why=why))
 
 
 @dataclass(frozen=True, slots=True)
 class LocalCache:
-    """Objects of a store as files of this machine, as many as fit into `most` bytes; the longest unused go first."""
+    """Local copies of stored objects, at most `most` bytes; the least recently used are removed first."""
 
     folder: Path
     most: int
 
     def get(self, store: Store, digest: str) -> Path:
-        """A file with just what its name says; StoreError where that cannot be had."""
+        """Return a local file whose content matches `digest`. Raises: StoreError if it is unavailable or differs."""
         if (file := store.file(digest)) is not None:
             return file
         path = self.folder / digest[:2] / digest
@@ -223,7 +223,7 @@ class LocalCache:
         self._trim()
 
     def _trim(self) -> None:
-        """Make room: never of what somebody may be about to open."""
+        """Remove the oldest files beyond `most` bytes, except those used within _IN_USE_S: a caller may open them."""
         files = [(path, path.stat()) for path in self.folder.glob("??/*") if path.exists()]
         size, now = sum(stat.st_size for _, stat in files), time.time()
         for path, stat in sorted(files, key=lambda one: one[1].st_mtime):
@@ -234,7 +234,7 @@ class LocalCache:
 
 
 def the_store() -> Store | None:
-    """That of this lab; None where everything stays in the data folder."""
+    """Return the lab's store, None if large files stay in the data folder."""
     given: Path | Bucket | None = settings.EVA_STORE
     if given is None:
         return None
@@ -242,7 +242,7 @@ def the_store() -> Store | None:
 
 
 def required_store() -> Store:
-    """That of this lab; StoreError where there is none any more."""
+    """Return the lab's store. Raises: StoreError if none is configured any more."""
     store = the_store()
     if store is None:
         raise StoreError(_NO_STORE)
@@ -250,12 +250,12 @@ def required_store() -> Store:
 
 
 def the_cache() -> LocalCache:
-    """That of this lab."""
+    """Return the lab's cache of stored objects."""
     return LocalCache(Path(settings.DATA_DIR) / "cache", settings.EVA_CACHE_BYTES)
 
 
 def compared(store: Store, digest: str) -> None:
-    """Read it back; StoreError where it is not what its name says: nothing is removed elsewhere before that."""
+    """Read the object back and raise StoreError if it does not match its digest; call before deleting another copy."""
     found = hashlib.sha256()
     for part in store.read(digest):
         found.update(part)
@@ -274,7 +274,7 @@ def _parts(path: Path) -> Iterator[bytes]:
 
 
 def _draft(folder: Path, parts: Iterable[bytes]) -> tuple[Path, str]:
-    """Write it whole to a file of that folder, under a name of its own; that, and its SHA-256."""
+    """Write `parts` to a new file in `folder`, flushed to disk; return its path and SHA-256."""
     folder.mkdir(parents=True, exist_ok=True)
     digest = hashlib.sha256()
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".draft", delete=False) as draft:

@@ -1,4 +1,4 @@
-"""Which pages are our own: another site of the same machine, at another port, has the same cookies."""
+"""Check of request origins: another site on the same machine, at another port, receives the same cookies."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _PORT = re.compile(r":([0-9]{1,5})$")
 
 
 def is_own_origin(origin: str, host: str, scheme: str, web_port: int | None = None) -> bool:
-    """True if pages of `origin` are the lab's, for a server that was asked as `host` over `scheme`.
+    """Return True if pages of `origin` belong to the lab, for a request with Host `host` over `scheme`.
 
-    Ours are that scheme, host and port, and the trusted origins: CSRF_TRUSTED_ORIGINS, without wildcards. For a server
-    beside the web it is `web_port` of that host too, over plain HTTP: behind a proxy all have one origin.
+    They do for the same scheme and host, and for CSRF_TRUSTED_ORIGINS (without wildcards). For a server next to the
+    web, `web_port` on that host over plain HTTP counts too; behind a proxy all share one origin.
     """
     try:
         asked = urlsplit(origin)
@@ -33,7 +33,7 @@ def is_own_origin(origin: str, host: str, scheme: str, web_port: int | None = No
 
 
 def scheme_of(scope: Mapping[str, Any]) -> str:
-    """ "https" or "http", as the browser of this request or websocket has it; of a proxy that is believed, its word."""
+    """Return "https" or "http" as the browser used it; a trusted proxy's header takes precedence."""
     if settings.SECURE_PROXY_SSL_HEADER is not None:
         meta, https = settings.SECURE_PROXY_SSL_HEADER
         wanted = meta.removeprefix("HTTP_").replace("_", "-").lower().encode()
@@ -44,12 +44,12 @@ def scheme_of(scope: Mapping[str, Any]) -> str:
 
 
 def origin_at_port(host: str, web_port: int, port: int) -> str:
-    """The origin beside the web's, over plain HTTP; "" where `host` is not the web's own port, but a proxy's."""
+    """Return the plain-HTTP origin at `port`; "" if `host` does not have the web's own port but a proxy's."""
     name, asked = _parts(host)
     return f"http://{name}:{port}" if asked == web_port else ""
 
 
 def _parts(host: str) -> tuple[str, int]:
-    """Name and port of a Host header over plain HTTP."""
+    """Return name and port of a Host header over plain HTTP."""
     found = _PORT.search(host)
     return (host[: found.start()], int(found[1])) if found else (host, 80)

@@ -1,4 +1,4 @@
-"""Changing one's own password: guesses of the old one are counted, and locked, as on the login pages."""
+"""Page on which users change their own password; wrong old passwords count and lock as on the login page."""
 
 from __future__ import annotations
 
@@ -14,22 +14,24 @@ from evaweb.callers import lockable_of
 
 
 class OwnPasswordForm(PasswordChangeForm):
-    """Django's, with an old password that is checked as a login is."""
+    """Django's form, whose check of the old password counts as a login attempt."""
 
     request: Any = None
 
     def clean_old_password(self) -> str:
-        """The right one; ValidationError."""
+        """Return the old password. Raises: ValidationError if it is wrong."""
         given: str = self.cleaned_data["old_password"]
         name = self.user.get_username()
         if authenticate(self.request, username=name, password=given) != self.user:
             raise ValidationError(self.error_messages["password_incorrect"], code="password_incorrect")
-        reset(username=name, ip=lockable_of(self.request))  # as a login forgets those before it
+        reset(
+            username=name, ip=lockable_of(self.request)
+        )  # a correct password clears earlier failures, as a login does
         return given
 
 
 class OwnPasswordView(PasswordChangeView):
-    """On the lab's page."""
+    """Django's view with the lab's template and form."""
 
     form_class = OwnPasswordForm
     template_name = "registration/password.html"

@@ -1,4 +1,4 @@
-"""Whether the data folder is its user's alone, and all there: looked at when a process starts."""
+"""System checks of the data folder and the proxy settings, run when a process starts."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from django.core.checks import CheckMessage, Error, Tags, Warning, register
 
 from evaweb.environment import database_files, readable_by_others
 
-RESTORING = ".restoring"  # of the data folder: what a restore has copied and not put in its place yet
+RESTORING = ".restoring"  # folder in DATA with files that a restore has copied but not moved into place yet
 
 
 @register(Tags.security)
 def check_private_files(**options: Any) -> list[CheckMessage]:
-    """Others cannot read the data folder, the database and the key."""
+    """Warn if other accounts can read the data folder, the database or the secret key."""
     return [
         Warning(
             f"{path} can be read by others: {path.stat().st_mode & 0o777:o}",
@@ -29,7 +29,7 @@ def check_private_files(**options: Any) -> list[CheckMessage]:
 
 @register()
 def data_is_whole(**options: Any) -> list[CheckMessage]:
-    """No restore of a backup was cut off, which leaves the database without its files."""
+    """Report an error if a restore is running or was interrupted: the database then lacks its files."""
     draft = Path(settings.DATA_DIR) / RESTORING
     if not draft.exists():
         return []
@@ -44,7 +44,7 @@ def data_is_whole(**options: Any) -> list[CheckMessage]:
 
 @register(Tags.security)
 def check_declared_proxy(**options: Any) -> list[CheckMessage]:
-    """Behind an undeclared proxy all logins come from one address."""
+    """Warn if HTTPS is on without a declared proxy: all logins then seem to come from one address."""
     if not settings.SESSION_COOKIE_SECURE or settings.EVA_PROXIES:
         return []
     return [

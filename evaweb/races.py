@@ -1,7 +1,7 @@
-"""Two who write the same at one moment: one of them hears so, or what is wrong with it now, and never of a fault.
+"""Concurrent writes of the same key: the loser gets a clear message or a second attempt instead of a server error.
 
-SQLite lets one writer in at a time. PostgreSQL lets both look, find a name free and write it: the second is refused by
-the unique index, after every check.
+SQLite admits one writer at a time. On PostgreSQL two transactions can both check that a name is free and insert it;
+the unique index then refuses the second one, after every check.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _Found = TypeVar("_Found")
 
 
 def was_taken(error: BaseException) -> bool:
-    """True if a row was refused because there is another one of its name, number or key."""
+    """Return True if a row was refused because its name, number or key exists already."""
     if not isinstance(error, IntegrityError):
         return False
     return getattr(error.__cause__, "sqlstate", "") == _UNIQUE_VIOLATION or "UNIQUE constraint" in str(error)
 
 
 def once_more(write: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Have a whole transaction done again, once, where another one took its name: it then sees that one's row."""
+    """Decorate a transaction to run a second time if its name was taken: it then finds the other row."""
 
     @wraps(write)
     def written(*args: _Given.args, **kwargs: _Given.kwargs) -> _Found:

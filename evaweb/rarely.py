@@ -1,4 +1,4 @@
-"""Limit of log lines that a crowd could repeat: one in some time of each name, with how often it came."""
+"""Rate limit for repeated log lines: one line per name and period, with a count of the suppressed ones."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections import OrderedDict
 from collections.abc import Callable
 from threading import Lock
 
-_OTHERS = None  # stands for all names that there is no room for
+_OTHERS = None  # common entry of all names beyond `most`
 
 
 class LogThrottle:
-    """Of `most` names each is due once in `every_s`, and all others together; from any thread."""
+    """Rate limit of one line per name and `every_s` [s]; beyond `most` names the others share one. Thread-safe."""
 
     def __init__(self, every_s: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._every_s, self._most, self._clock = every_s, most, clock
         self._lock = Lock()
         self._told: OrderedDict[str | None, tuple[float, int]] = (
             OrderedDict()
-        )  # when, and how many came since
+        )  # time of the last line; number suppressed since
 
     def suffix_if_due(self, name: str, times: int = 1) -> str | None:
-        """Suffix of the line about `name`: how often it was left unsaid, or nothing. None: say no line."""
+        """Return the suffix of the next line about `name` (how many were suppressed), or None to suppress it."""
         now = self._clock()
         with self._lock:
             entry = name if name in self._told or self._has_room(now) else _OTHERS
@@ -36,7 +36,7 @@ class LogThrottle:
         return f" ({unsaid}{names} before it)" if unsaid else ""
 
     def _has_room(self, now: float) -> bool:
-        """The one told longest ago is forgotten where it would be told again: nothing is told more often for that."""
+        """Return True if another name can be tracked; drop the oldest if its period is over, which loses nothing."""
         names = [name for name in self._told if name is not _OTHERS]
         if len(names) >= self._most and now - self._told[names[0]][0] >= self._every_s:
             del self._told[names.pop(0)]

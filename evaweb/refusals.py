@@ -1,6 +1,6 @@
-"""Turns an EvaError that a page raises into its HTTP answer; evaweb.api does the same for REST.
+"""Conversion of exceptions on pages to HTTP responses; evaweb.api does the same for REST.
 
-What fails before a view is reached or after it is said here too: to programs as JSON.
+Failures before and after a view are handled here too; programs get JSON.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FAILED = fixed("web.failed", "this failed; the log of the web says why")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):
-    """Django's own, which asks the database for the user of every address, also where no login is needed."""
+    """Login middleware that skips the user lookup for views without login; Django's own queries the user for all."""
 
     def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
         if not getattr(view, "login_required", True):
@@ -47,10 +47,10 @@ class LoginMiddleware(LoginRequiredMiddleware):
 
 
 class RefusalMiddleware(MiddlewareMixin):
-    """A page with the sentence for a browser that navigates, JSON as by `errors.refusal` for everything else."""
+    """Error responses: a page with the message for a browser that navigates, JSON (`errors.refusal`) otherwise."""
 
     def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
-        # REST reads its body itself, and looks at it in evaweb.api.questions.
+        # REST parses its body itself, checked by evaweb.api.questions.
         fields = [request.GET] if _of_programs(request) else [request.GET, request.POST]
         texts = (text for one in fields for name, values in one.lists() for text in (name, *values))
         if not is_text(request.path):
@@ -60,7 +60,7 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Reword a refusal without a sentence, or one to a program in HTML, as all are said."""
+        """Replace an error response without a message, or in HTML to a program, by the common form."""
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")
         if status < 400 or spoken or not (_of_programs(request) or status == 405):
@@ -83,14 +83,14 @@ class RefusalMiddleware(MiddlewareMixin):
 
 
 def retrying(answer: HttpResponse, fault: EvaError) -> HttpResponse:
-    """The answer to `fault`, with when to try again where it says so."""
+    """Return `answer` with a Retry-After header if `fault` has a delay."""
     if fault.retry_after_s is not None:
         answer["Retry-After"] = str(fault.retry_after_s)
     return answer
 
 
 def unknown_address_sentence(path: str) -> str:
-    """Sentence on an unknown address of REST."""
+    """Return the message for an unknown REST path."""
     return _NOWHERE(path=path)
 
 
@@ -104,31 +104,31 @@ def _sentence_of(request: HttpRequest, response: HttpResponseBase) -> str:
 
 
 def _is_no_number(exception: Exception) -> bool:
-    """True if forms have let through what is no number of the database's, or of Python's."""
+    """Return True if forms have passed a number that the database or Python cannot represent."""
     said = str(exception)
     none = "expected a number but got" in said or said.startswith("Exceeds the limit")
     return isinstance(exception, OverflowError) or none
 
 
 def is_text(given: str) -> bool:
-    """True if every database and every wire takes it: no NUL, no half of a character."""
+    """Return True if every database and protocol accepts the text: no NUL, no lone surrogate."""
     return _NO_TEXT.search(given) is None
 
 
 def error_response(request: HttpRequest, sentence: str, status: int, template: str) -> HttpResponse:
-    """`template` with the sentence for a browser that navigates, JSON as by `errors.refusal` for everything else."""
+    """Return `template` with the message for a browser that navigates, JSON (`errors.refusal`) otherwise."""
     if "text/html" in request.headers.get("Accept", "") and not _of_programs(request):
         return render(request, template, {"sentence": sentence, "status": status}, status=status)
     return JsonResponse(refusal(sentence), status=status)
 
 
 def bad_request(request: HttpRequest, exception: Exception) -> HttpResponse:
-    """handler400: such as a host that is not allowed."""
+    """Respond to a bad request, such as a host that is not allowed (Django's handler400)."""
     return error_response(request, f"{exception!s:.300}" or "bad request", 400, "unavailable.html")
 
 
 def server_error(request: HttpRequest) -> HttpResponse:
-    """handler500: what the disk or the database refused, with a sentence, or a fault of ours."""
+    """Respond to an exception: storage faults with a message, others as an internal error (Django's handler500)."""
     fault = sys.exc_info()[1]
     refused = storage_error_response(fault)
     if refused is not None:

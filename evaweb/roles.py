@@ -1,4 +1,4 @@
-"""Roles and their rights: three groups, each with the rights of the one before it."""
+"""Roles of users as three groups, each with all rights of the previous one."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Role(StrEnum):
     ADMIN = "admin"
 
     def includes(self, other: Role) -> bool:
-        """True if this role has all rights of the other."""
+        """Return True if this role has all rights of `other`."""
         return _RANK[self] >= _RANK[other]
 
     @property
     def with_article(self) -> str:
-        """With its article, as sentences say it."""
+        """Name with its article, for messages."""
         return f"a {self}" if self is Role.VIEWER else f"an {self}"
 
 
@@ -39,7 +39,7 @@ _RANK = {Role.VIEWER: 0, Role.OPERATOR: 1, Role.ADMIN: 2}
 
 
 def role_of(user: Any) -> Role:
-    """The highest role of a user; a superuser is an admin."""
+    """Return the highest role of a user; a superuser is an admin."""
     if user.is_superuser:
         return Role.ADMIN
     held = set(user.groups.values_list("name", flat=True))
@@ -47,7 +47,7 @@ def role_of(user: Any) -> Role:
 
 
 def require_role(user: Any, role: Role) -> Role:
-    """The role of the user; NotAllowed unless it is at least `role`."""
+    """Return the role of the user. Raises: NotAllowed unless it is at least `role`."""
     has = role_of(user)
     if not has.includes(role):
         raise NotAllowed(
@@ -58,16 +58,16 @@ def require_role(user: Any, role: Role) -> Role:
 
 @transaction.atomic
 def set_role(*, user: Any, role: Role) -> None:
-    """Give a user this role and no other; what they were by another way, a superuser say, they are no more."""
+    """Set the only role of a user; this also ends superuser rights and other groups."""
     user.is_superuser = False
-    user.is_staff = role is Role.ADMIN  # pages of others look at it; ours look at the role
+    user.is_staff = role is Role.ADMIN  # third-party pages check this flag; ours check the role
     user.save(update_fields=["is_superuser", "is_staff"])
     groups = user.groups.model.objects  # models cannot be imported before the apps are ready
-    user.groups.set([groups.get_or_create(name=role.value)[0]])  # also where somebody has removed the group
+    user.groups.set([groups.get_or_create(name=role.value)[0]])  # recreates a group that was deleted
 
 
 def get_or_create_person(name: str) -> Any:
-    """The account of that name; one that is gone is made again, deactivated and without a password."""
+    """Return the account of that name; if it is gone, create it deactivated and without a password."""
     from django.contrib.auth import get_user_model  # models cannot be imported before the apps are ready
 
     person, made = get_user_model().objects.get_or_create(

@@ -1,4 +1,4 @@
-"""The settings of every Django process; all from the environment, and none is needed."""
+"""Django settings of all processes, read from environment variables; every one has a default."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ TEMPLATES = [
                 "django.contrib.messages.context_processors.messages",
             ],
             "builtins": [
-                "evaweb.blinding_tags",  # no template names a checkpoint in another way
+                "evaweb.blinding_tags",  # templates get checkpoint names only through these tags
                 "evaweb.language_tags",
                 "evaweb.time_tags",
             ],
@@ -94,16 +94,16 @@ TEMPLATES = [
 # --- database ----------------------------------------------------------------------------------------------
 
 _SQLITE = {
-    "transaction_mode": "IMMEDIATE",  # a writer that begins as a reader could not wait for its turn
+    "transaction_mode": "IMMEDIATE",  # a transaction that starts as a reader cannot wait for the write lock
     "timeout": 20,
     "init_command": "PRAGMA journal_mode=WAL; PRAGMA synchronous=FULL; PRAGMA foreign_keys=ON; "
-    "PRAGMA recursive_triggers=ON;",  # what REPLACE removes is guarded too
+    "PRAGMA recursive_triggers=ON;",  # fires DELETE triggers for rows that REPLACE removes
 }
 
 
 _POSTGRESQL = {
-    "connect_timeout": 10,  # of the web shorter: evaweb.lock_wait
-    "tcp_user_timeout": 10_000,  # ms, for a server whose machine is gone
+    "connect_timeout": 10,  # shorter in the web: evaweb.lock_wait
+    "tcp_user_timeout": 10_000,  # [ms], detects a server that has vanished
     "keepalives_idle": 5,
     "keepalives_interval": 2,
     "keepalives_count": 3,
@@ -113,11 +113,11 @@ _POSTGRESQL = {
 def _database() -> dict[str, object]:
     url = os.environ.get("DATABASE_URL")
     if not url:
-        # Whoever can read it can be everybody who is logged in.
+        # Private, because readers of the session table could impersonate every logged-in user.
         name = environment.private_file(DATA_DIR / "eva.sqlite3")
         return {"ENGINE": "evaweb.sqlite3", "NAME": name, "OPTIONS": _SQLITE}
     try:
-        # Each request has a thread of its own: a connection that outlived its request would never be used again.
+        # Each request has its own thread, so a persistent connection would never be used again.
         found = dj_database_url.parse(url, conn_max_age=0)
     except (ValueError, dj_database_url.ParseError) as error:
         raise ImproperlyConfigured(
@@ -136,13 +136,15 @@ DEFAULT_AUTO_FIELD = "django.db.models.BigAutoField"
 
 # --- broker ------------------------------------------------------------------------------------------------
 
-REDIS_URL = os.environ.get("REDIS_URL", "")  # of evaweb.celery; without it a folder of the data folder serves
+REDIS_URL = os.environ.get(
+    "REDIS_URL", ""
+)  # broker of evaweb.celery; if empty, a folder in the data folder is the broker
 
 # --- static files ------------------------------------------------------------------------------------------
 
 
 def _viewer() -> Path | None:
-    """The folder of the 3D viewer's script; the Python package around it, and what that wants, is never imported."""
+    """Return the folder of the 3D viewer's script; its Python package and dependencies are never imported."""
     try:
         brought = files("meshcat") or ()
     except PackageNotFoundError:
@@ -151,9 +153,9 @@ def _viewer() -> Path | None:
     return Path(str(scripts[0].locate())).parent if scripts else None
 
 
-LANGUAGES_DIR = BASE_DIR / "static" / "languages"  # of the sentences that are shown: evaweb.languages
+LANGUAGES_DIR = BASE_DIR / "static" / "languages"  # translations, see evaweb.languages
 STATICFILES_DIRS: list[Path | tuple[str, Path]] = [BASE_DIR / "static"]
-# `make setup` brings both; the system check of evaweb.console says so where one is absent.
+# `make setup` installs both; a system check of evaweb.console reports a missing one.
 for _name, _folder in (("meshcat", _viewer()), ("uplot", BASE_DIR / "node_modules" / "uplot" / "dist")):
     if _folder is not None and _folder.is_dir():
         STATICFILES_DIRS.append((_name, _folder))
@@ -166,19 +168,17 @@ STATIC_URL = f"static/{STATIC_DIGEST}/" if STATIC_DIGEST else "static/"
 LANGUAGE_CODE = "en-gb"
 TIME_ZONE = environment.time_zone("EVA_TIME_ZONE", "UTC")
 USE_TZ = True
-# Cookies know no ports: another lab of this host, or another program of Django's, has cookies of other names.
+# Cookies ignore ports: distinct names keep other labs and other Django programs on this host apart.
 EVA_LAB_ID = environment.lab_id(DATA_DIR)
 SESSION_COOKIE_NAME, CSRF_COOKIE_NAME = f"eva_session_{EVA_LAB_ID}", f"eva_csrf_{EVA_LAB_ID}"
-MESSAGE_STORAGE = (
-    "django.contrib.messages.storage.session.SessionStorage"  # not in a cookie of its usual name
-)
+MESSAGE_STORAGE = "django.contrib.messages.storage.session.SessionStorage"  # needs no cookie of its own
 SESSION_COOKIE_AGE = 14 * 24 * 3600
 _HTTPS = environment.read_flag("EVA_HTTPS", False)
 SESSION_COOKIE_SECURE = CSRF_COOKIE_SECURE = _HTTPS
 SECURE_PROXY_SSL_HEADER = ("HTTP_X_FORWARDED_PROTO", "https") if _HTTPS else None
-# Browsers remember for so long that this name is reached over HTTPS alone; a month, so that it can be taken back.
+# Time for which browsers insist on HTTPS for this name [s]; only a month, so that it can be revoked.
 SECURE_HSTS_SECONDS = int(environment.read_seconds("EVA_HSTS_S", 30 * 24 * 3600)) if _HTTPS else 0
-# Where large files lie that never change: None, they stay in the data folder; another folder, or a bucket.
+# Store of large immutable files: a folder or a bucket; None: the data folder.
 EVA_STORE = environment.store()
 CONTENT_SECURITY_POLICY = headers.content_security_policy(getattr(EVA_STORE, "origin", ""))
 SECURE_REFERRER_POLICY = "same-origin"
@@ -189,13 +189,13 @@ AUTHENTICATION_BACKENDS = [
     "django.contrib.auth.backends.ModelBackend",
     "evaweb.administration.RoleBackend",
 ]
-PASSWORD_HASHERS = ["evaweb.hashing.QueuedHasher"]  # whose hashes are those of PBKDF2PasswordHasher
+PASSWORD_HASHERS = ["evaweb.hashing.QueuedHasher"]  # same hashes as PBKDF2PasswordHasher
 AUTH_PASSWORD_VALIDATORS = [
     {"NAME": "django.contrib.auth.password_validation.UserAttributeSimilarityValidator"},
     {"NAME": "django.contrib.auth.password_validation.MinimumLengthValidator"},
     {"NAME": "django.contrib.auth.password_validation.CommonPasswordValidator"},
 ]
-# A name is locked at an address, not everywhere: nobody can lock others out from elsewhere.
+# A name is locked only at one address, so that users cannot be locked out from elsewhere.
 AXES_LOCKOUT_PARAMETERS = [["username", "ip_address"]]
 AXES_FAILURE_LIMIT = 5
 AXES_COOLOFF_TIME = timedelta(minutes=15)
@@ -204,8 +204,8 @@ AXES_RESET_COOL_OFF_ON_FAILURE_DURING_LOCKOUT = False
 AXES_CLIENT_IP_CALLABLE = "evaweb.callers.lockable_of"
 AXES_LOCKOUT_CALLABLE = "evaweb.lockout.lockout_response"
 AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
-AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs who comes and goes
-AXES_ENABLE_ADMIN = False  # evaweb.api.admin has a page of its own
+AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs logins and logouts
+AXES_ENABLE_ADMIN = False  # evaweb.api.admin has its own page
 AXES_VERBOSE = False
 
 
@@ -221,31 +221,33 @@ LOGGING = {
     "handlers": {"console": {"class": "logging.StreamHandler", "formatter": "line"}},
     "filters": {"in_one_line": {"()": "django.utils.log.CallbackFilter", "callback": _in_one_line}},
     "loggers": {
-        "axes": {"level": "ERROR"},  # what it tells of logins evaweb.audit tells better
-        "django.security.DisallowedHost": {"filters": ["in_one_line"]},  # anybody can ask by any name
+        "axes": {"level": "ERROR"},  # evaweb.audit logs the logins
+        "django.security.DisallowedHost": {
+            "filters": ["in_one_line"]
+        },  # any client can cause it, so log one line without traceback
     },
     "root": {"handlers": ["console"], "level": environment.log_level("EVA_LOG_LEVEL", "INFO")},
 }
 
 # --- ours --------------------------------------------------------------------------------------------------
 
-# The proxies in front, whose X-Forwarded-For is believed.
+# Trusted proxies, which set X-Forwarded-For.
 EVA_PROXIES = environment.read_networks("EVA_PROXIES")
-# Where stations on other computers connect; None: there are none. The port after it takes their pictures.
+# Address for stations on other computers; None: there are none. The next port receives their images.
 EVA_GATE = environment.address("EVA_GATE")
-# By which name those computers reach this one.
+# Host name by which those computers reach this one.
 EVA_GATE_NAME = os.environ.get("EVA_GATE_NAME", "")
-# How much of the disk stays free of what stations on other computers send [GB].
+# Disk space that data from stations on other computers must leave free, set in [GB].
 EVA_RESERVE_BYTES = int(1e9 * environment.gigabytes("EVA_RESERVE_GB", 5.0))
-# How many of a bucket's objects are kept here as files [GB].
+# Size of the local cache of a bucket's objects, set in [GB].
 EVA_CACHE_BYTES = int(1e9 * environment.gigabytes("EVA_CACHE_GB", 10.0))
-# What a page is held that it does not read [MiB]; beyond it is cut off.
+# Unread data buffered for a page before it is disconnected, set in [MiB].
 EVA_UNREAD_BYTES = int(2**20 * environment.mebibytes("EVA_UNREAD_MIB", 8.0))
-# How long a request waits for a station's answer [s]; after it the outcome is unknown.
+# Longest wait of a request for a station's answer [s]; after it the outcome is unknown.
 EVA_COMMAND_TIMEOUT_S = environment.read_seconds("EVA_COMMAND_TIMEOUT_S", 2.0)
-# Without a sign of life for so long a worker's job is taken from it [s].
+# Time without a heartbeat after which a worker's job is reclaimed [s].
 EVA_JOB_STALE_S = environment.read_seconds("EVA_JOB_STALE_S", 60.0)
-# How long a worker that is told to end may finish its job [s]; then it puts it back.
+# Time for which a stopping worker may finish its job [s]; then the job is requeued.
 EVA_WORKER_GRACE_S = environment.read_seconds("EVA_WORKER_GRACE_S", 12.0)
-# How much a worker gives way to whatever else runs on its machine.
+# Niceness of a worker's process.
 EVA_WORKER_NICE = environment.niceness("EVA_WORKER_NICE", 19)

@@ -1,4 +1,4 @@
-"""Number of HTTP requests that are worked on at once: each has a thread and a connection to the database."""
+"""Limit on concurrent HTTP requests: each needs a thread and a database connection."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from evaweb.lock_wait import short_lock_wait
 
 _AT_ONCE = 32
 _MOST_WAITING = 256
-_OF_ONE, _OF_ADDRESS = 8, 24  # of them, for one login or token, and for an address with all of its people
+_OF_ONE, _OF_ADDRESS = 8, 24  # concurrent requests of one login or token; of one address with all its users
 _WAITING_OF_ONE = 64
-_EXPORTS = 2  # tables of a whole lab, each of which keeps a processor for seconds
+_EXPORTS = 2  # concurrent exports; each occupies a CPU core for seconds
 _EXPORTED = (b"format=csv", b"format=parquet")
-_COMMANDING = "/api/v1/stations/"  # what is posted there commands, takes or renews
+_COMMANDING = "/api/v1/stations/"  # path of POSTs that send commands and acquire or renew leases
 _BUSY = b'{"error": "too many requests at once: try again in a few seconds"}'
 
 
 class RequestLimiter:
-    """An ASGI application in front of another one: requests take turns, and those that command do not wait long.
+    """ASGI middleware that queues requests and bounds the lock waits of requests that command a station.
 
-    Nobody has more than a share of them, so that one who asks for a lot keeps pages for the others.
+    Each login and each address has a bounded share, so that a client with many requests leaves slots for the others.
 
-    A turn ends with the work on its request, whose thread and connection to the database nobody can end: not when its
-    client hangs up. Nothing that stops a robot comes here: evaweb.api.door answers it before.
+    A slot is released when the work on its request ends, not when its client hangs up: the thread and its database
+    connection cannot be interrupted. Requests that stop a robot never get here: evaweb.api.door answers them first.
     """
 
     def __init__(self, application: Callable[..., Awaitable[Any]]) -> None:
@@ -53,7 +53,7 @@ class RequestLimiter:
             shares = self._people.asked(who), self._addresses.asked(address)
             task = asyncio.create_task(self._in_turn(scope, _Client(receive, send), *shares))
             task.add_done_callback(lambda _: (self._people.answered(who), self._addresses.answered(address)))
-            self._tasks.add(task)  # an event loop keeps none by itself
+            self._tasks.add(task)  # strong reference: the event loop has only weak ones
             task.add_done_callback(self._tasks.discard)
             await asyncio.shield(task)
 
@@ -62,6 +62,7 @@ class RequestLimiter:
     ) -> None:
         exports = (self._exports,) if _is_export(scope) else ()
         async with AsyncExitStack() as stack:
+            # From the narrowest share to the global one: a request that waits for its own share holds no global slot.
             for turns in (own, *exports, of_all, self._turns):
                 await client.unless_gone(turns.acquire())
                 stack.callback(turns.release)
@@ -69,7 +70,7 @@ class RequestLimiter:
             await self._work(scope, client)
 
     async def _work(self, scope: dict[str, Any], client: _Client) -> None:
-        SHARE.set(client_key(scope))  # of this task alone, and of the threads that work for it
+        SHARE.set(client_key(scope))  # context of this task and of the threads that work for it
         if scope["method"] == "POST" and scope["path"].startswith(_COMMANDING):
             with short_lock_wait():
                 await self._application(scope, client.receive, client.send)
@@ -78,7 +79,7 @@ class RequestLimiter:
 
 
 class _Shares:
-    """At most so many turns at once of each name; `asking`: how many have one, or wait."""
+    """Semaphores with at most `most` permits per name; `asking` counts the holders and waiters of each name."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -86,12 +87,12 @@ class _Shares:
         self.asking: Counter[Hashable] = Counter()
 
     def asked(self, name: Hashable) -> asyncio.Semaphore:
-        """The turns of that name, which asks for one."""
+        """Return the semaphore of `name` and count one request for it; call `answered` when the request ends."""
         self.asking[name] += 1
         return self._of.setdefault(name, asyncio.Semaphore(self._most))
 
     def answered(self, name: Hashable) -> None:
-        """It has had it, or waits no more."""
+        """End one request of `name`; drop its semaphore after the last one."""
         self.asking[name] -= 1
         if not self.asking[name]:
             del self.asking[name], self._of[name]
@@ -103,14 +104,17 @@ def _is_export(scope: dict[str, Any]) -> bool:
 
 
 def _login_of(scope: dict[str, Any]) -> bytes:
-    """What says who asks, not looked at: made-up ones of one address have that address's share together."""
+    """Return the credentials of a request, unverified.
+
+    Invented credentials cannot multiply the share: the limit per address holds as well.
+    """
     return b"".join(value for name, value in scope["headers"] if name in (b"authorization", b"cookie"))
 
 
 class _Client:
-    """Who sent a request. That they have hung up is told where more is sent, and not to who waits for a thread.
+    """Receiver and sender of one request. A hang-up is reported only when the application sends.
 
-    Django, told of it at once, would leave its thread alone.
+    If Django learned of it at once, it would abandon its thread, which keeps running outside the limit.
     """
 
     def __init__(self, receive: Any, send: Any) -> None:
@@ -132,7 +136,7 @@ class _Client:
             self._waits.cancel()
 
     async def unless_gone(self, turn: Coroutine[Any, Any, Any]) -> None:
-        """Wait for `turn`; CancelledError where the client hangs up before it comes."""
+        """Wait for `turn`. Raises: CancelledError if the client hangs up first."""
         self._waits = asyncio.create_task(turn)
         if self._gone:
             self._waits.cancel()
@@ -142,15 +146,15 @@ class _Client:
             self._waits = None
 
     def end(self) -> None:
-        """Nothing more is heard."""
+        """Stop reading from the client."""
         self._listens.cancel()
 
     async def receive(self) -> dict[str, Any]:
-        """The next part of the body."""
+        """Return the next message of the request body."""
         return await self._body.get()
 
     async def send(self, message: dict[str, Any]) -> None:
-        """Send it; to who is gone nothing more is made, in the way in which Django hears of it while it answers."""
+        """Send `message`. Raises: CancelledError if the client is gone, which ends the response as Django expects."""
         if self._gone:
             raise asyncio.CancelledError
         await self._send(message)

@@ -1,7 +1,7 @@
-"""Static files as the web serves them: from memory, compressed once, at addresses that name the content of all.
+"""Static files served from memory, compressed once, at URLs that contain a digest of all files.
 
-A browser that has a file does not ask for it again: a page has a hundred of them. After an upgrade the addresses are
-others, so that no page is made of two versions.
+A browser does not request a file again that it has: a page has about a hundred of them. After an upgrade the URLs
+differ, so that no page mixes files of two versions.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from evaweb.headers import DEFAULT_HEADERS
 _PREFIX = "/static/"
 _DIGEST = re.compile(r"([0-9a-f]{16})/")
 _KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".json": "application/json"}
-_SMALL = 64 * 1024  # bytes, which are compressed at once; more in a thread
+_SMALL = 64 * 1024  # largest file that is compressed in the event loop [bytes]; others in a thread
 _KEPT, _ASKED = b"max-age=31536000, public, immutable", b"max-age=0, public"
-_POLICY = b"default-src 'self'"  # of a script that works beside a page
+_POLICY = b"default-src 'self'"  # for scripts that run as workers
 
 
 def digest_of(folders: Iterable[Path], *versions: str) -> str:
-    """A name for everything in these folders, and for the versions of packages that bring files of their own."""
+    """Return a digest [16 hex digits] of all files in `folders` and of the versions of packages with static files."""
     found = hashlib.sha256("\n".join(versions).encode())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
@@ -41,8 +41,10 @@ def digest_of(folders: Iterable[Path], *versions: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A file as it is sent; `packed` is empty where it is no smaller. `changed`: one that is newer than the process is
-    not what its digest means."""
+    """File ready for sending; `packed` is empty if gzip does not shrink it.
+
+    `changed`: modification time; a file newer than the process may differ from the content that the digest stands for.
+    """
 
     content: bytes
     packed: bytes
@@ -52,10 +54,10 @@ class _File:
 
 
 class StaticFiles:
-    """An ASGI application in front of another one, which gets what is no static file.
+    """ASGI middleware that serves static files and passes all other requests on.
 
-    `digest` is part of the addresses that pages name: what is asked for by it may be kept for good. Without one,
-    while the files are worked on, each is read anew.
+    `digest` is part of the URLs in pages; responses to such URLs may be cached forever. If it is empty, as during
+    development, each file is read anew.
     """
 
     def __init__(self, application: Callable[..., Awaitable[Any]], digest: str) -> None:
@@ -95,7 +97,7 @@ def _found(name: str) -> Path | None:
 
     try:
         found = finders.find(name) if name else None
-    except (SuspiciousFileOperation, ValueError):  # it leads out of its folder, or holds a NUL
+    except (SuspiciousFileOperation, ValueError):  # a path outside the folder, or with a NUL
         return None
     return Path(found) if isinstance(found, str) and Path(found).is_file() else None
 

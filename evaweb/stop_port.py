@@ -1,4 +1,4 @@
-"""Ports of the process for stops: told to the web by a file, as either may be started first, or again."""
+"""Port of the stop process, announced to the web by a file, because either may start first or restart."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from runtime.recording.files import write_atomic
 
 
 class StopPort(NamedTuple):
-    """The port of the process for stops, and that of the web whose pages it answers."""
+    """Port of the stop process, and the port of the web whose pages it serves."""
 
     port: int
     web_port: int
 
     def start(self) -> None:
-        """It listens."""
+        """Announce that the stop process is listening."""
         write_atomic(_path(), json.dumps(self._asdict()).encode())
 
     def end(self) -> None:
-        """It ends."""
+        """Withdraw the announcement."""
         remove_stop_port()
 
 
 def remove_stop_port() -> None:
-    """Nothing listens any more, and nothing will."""
+    """Delete the announcement: the stop process does not listen any more."""
     _path().unlink(missing_ok=True)
 
 
 def read_stop_port() -> StopPort | None:
-    """Ports of the process for stops, as it or its lab last said; None where there is none."""
+    """Return the announced ports, None if there is no valid announcement."""
     try:
         found = json.loads(_path().read_bytes())
         return StopPort(int(found["port"]), int(found["web_port"]))
@@ -43,9 +43,9 @@ def read_stop_port() -> StopPort | None:
 
 
 def origin_for(request: HttpRequest) -> str:
-    """The origin at which the page that is asked for presses; "" where it has none beside its own.
+    """Return the origin to which this page sends stops besides its own, "" if there is none.
 
-    A page that came through a proxy has its own alone, and one of EVA_HTTPS: it must not call plain HTTP.
+    There is none for a page that came through a proxy or with EVA_HTTPS: it must not call plain HTTP.
     """
     found = read_stop_port()
     if found is None or settings.SESSION_COOKIE_SECURE or request.META["SERVER_PORT"] != str(found.web_port):

@@ -1,4 +1,4 @@
-"""Faults of a database or a disk that takes nothing, for the caller: a sentence and an HTTP status."""
+"""Mapping of database and disk errors to a message and an HTTP status."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DATABASE_AWAY = fixed(
 
 
 def storage_error_response(fault: BaseException | None) -> tuple[str, int] | None:
-    """507 where there is no room, 503 where database or disk cannot be written or reached; None for any other fault."""
+    """Return message and status (507 disk full, 503 disk or database unavailable); None for other errors."""
     if not isinstance(fault, Error | OSError):
         return None
     text = str(fault).lower()
@@ -34,5 +34,5 @@ def storage_error_response(fault: BaseException | None) -> tuple[str, int] | Non
     if getattr(fault, "errno", None) == errno.EROFS or any(word in text for word in _READ_ONLY):
         return _CANNOT_WRITE(fault=fault), 503
     if isinstance(fault, OperationalError | InterfaceError | InternalError) or type(fault) is DatabaseError:
-        return _DATABASE_AWAY, 503  # where it is, the log says
+        return _DATABASE_AWAY, 503  # the log names the database
     return None

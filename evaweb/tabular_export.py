@@ -1,4 +1,4 @@
-"""Rows as files that others read: CSV that a spreadsheet can open without being told what to do by a cell, Parquet."""
+"""Export of rows as Parquet and as CSV that is safe to open in a spreadsheet."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from enum import Enum
 from itertools import islice
 from typing import Any, Union, get_args, get_origin
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # wide ones too
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # includes full-width characters
 Pages = Iterable[Iterable[Mapping[str, Any]]]
 
 
 def csv_cell(value: object) -> str:
-    """A value as it stands in CSV: as `plain` says, and no text is a formula.
+    """Return a value as CSV text (see `plain`), escaped so that no spreadsheet takes it for a formula.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe in front (OWASP, CSV injection), and so does
-    one that looks as if it had got some: one apostrophe less is always what it was.
+    A text that looks like a formula gets an apostrophe in front (OWASP, CSV injection), and so does one that looks
+    already escaped: removing one apostrophe always restores the original.
     """
     text = plain(value)
-    is_text = not isinstance(value, int | float | datetime)  # a number below 0 is no formula
+    is_text = not isinstance(value, int | float | datetime)  # a negative number is not a formula
     return f"'{text}" if is_text and text.lstrip("'").startswith(_FORMULA) else text
 
 
 def plain(value: object) -> str:
-    """A value in words: None is empty, times are ISO 8601."""
+    """Return a value as text: "" for None, ISO 8601 for times."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -38,14 +38,14 @@ def plain(value: object) -> str:
 
 
 def iter_csv(columns: Sequence[str], pages: Pages) -> Iterator[str]:
-    """A header line, then all rows, a piece per page."""
+    """Yield a header line, then one piece of CSV per page."""
     yield _lines([columns])
     for page in pages:
         yield _lines([csv_cell(row[column]) for column in columns] for row in page)
 
 
 def in_pages(rows: Iterable[Mapping[str, Any]], size: int = 1000) -> Iterator[list[Mapping[str, Any]]]:
-    """Rows of any length, so many at a time."""
+    """Yield the rows in lists of at most `size`."""
     left = iter(rows)
     while page := list(islice(left, size)):
         yield page
@@ -58,9 +58,9 @@ def _lines(rows: Iterable[Sequence[str]]) -> str:
 
 
 def iter_parquet(columns: Mapping[str, Any], pages: Pages) -> Iterator[bytes]:
-    """A Parquet file, written page by page, each a row group; `columns` has the type of each: `int | None`, `str`.
+    """Yield a Parquet file with one row group per page; `columns` maps names to types: `int | None`, `str`.
 
-    Texts, names of enumerations and what has no type of its own are strings; times are UTC in microseconds.
+    Texts, enumerations and values of any other type become strings; times are UTC in microseconds.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -97,7 +97,7 @@ def _text(value: object) -> str | None:
 
 
 class _Sink(io.RawIOBase):
-    """Buffer of what is written until it is taken; a Parquet file is written from front to back."""
+    """Write-only buffer for the Parquet writer, which never seeks."""
 
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
@@ -116,6 +116,6 @@ class _Sink(io.RawIOBase):
         return len(piece)
 
     def taken(self) -> bytes:
-        """All since the last time."""
+        """Return everything written since the last call."""
         whole, self._pieces = b"".join(self._pieces), []
         return whole

@@ -1,4 +1,4 @@
-"""Template tags for times: in the lab's time zone, which is said wherever somebody looks for it."""
+"""Template tags for times in the lab's time zone, which is shown on hover."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ register = template.Library()
 
 @register.simple_tag
 def lab_zone() -> str:
-    """The time zone of the lab, with what it is ahead of UTC now."""
+    """Return the lab's time zone with its current offset from UTC."""
     return f"{timezone.get_default_timezone_name()}{_offset(timezone.localtime())}"
 
 
 @register.simple_tag
 def zone_name() -> str:
-    """The name of the lab's time zone, for scripts."""
+    """Return the name of the lab's time zone, for scripts."""
     return timezone.get_default_timezone_name()
 
 
 @register.simple_tag
 def when(moment: datetime | date | None, form: str = "Y-m-d H:i", nothing: str = "–") -> str:
-    """A time or a day as `form` has it, with all of it and the time zone on hover; `nothing` where there is none."""
+    """Return a `<time>` element in the format `form`, with full time and zone on hover; `nothing` without a time."""
     if not moment:
         return nothing
     if not isinstance(moment, datetime):
@@ -42,6 +42,6 @@ def when(moment: datetime | date | None, form: str = "Y-m-d H:i", nothing: str =
 
 
 def _offset(moment: datetime) -> str:
-    """Such as " (UTC+01:00)"; nothing in UTC itself."""
+    """Return the UTC offset such as " (UTC+01:00)", "" if the lab's zone is UTC."""
     ahead = moment.strftime("%z")
     return f" (UTC{ahead[:3]}:{ahead[3:5]})" if timezone.get_default_timezone_name() != "UTC" else ""

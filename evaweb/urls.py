@@ -1,4 +1,4 @@
-"""Every address over HTTP."""
+"""URL configuration of all HTTP endpoints."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaweb.passwords import OwnPasswordView
 
 @login_not_required
 async def healthz(request: HttpRequest) -> HttpResponse:
-    """This process answers; says nothing of database or stations."""
+    """Respond as long as this process works; checks neither database nor stations."""
     return HttpResponse("ok\n", content_type="text/plain")
 
 

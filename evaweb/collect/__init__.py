@@ -1,1 +1,1 @@
-"""Sessions of collecting demonstrations: what they are to yield, the episodes they have, on the way to a dataset."""
+"""Sessions in which demonstrations are collected, with their targets, episodes and publication to a dataset."""

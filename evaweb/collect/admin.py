@@ -1,4 +1,4 @@
-"""Sessions in the admin pages: to look at. Rows are written by services alone, after the disk."""
+"""Read-only admin pages of sessions; only services write the rows, after the disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 
 
 class _Kept(admin.ModelAdmin):
-    """Nothing is added, changed or removed here."""
+    """Base of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -37,7 +37,7 @@ class _Events(admin.TabularInline):
 
 @admin.register(CollectSession)
 class CollectSessionAdmin(_Kept):
-    """Sessions of collection, past and current; opened, closed and resumed at the station's Collect page."""
+    """Collection sessions; opened, closed and resumed on the station's Collect page."""
 
     list_display = ("task", "dataset", "station", "operator", "target", "episodes", "opened_at", "closed_at")
     list_filter = ("station", "dataset", "operator")
@@ -50,13 +50,13 @@ class CollectSessionAdmin(_Kept):
 
     @admin.display(description="episodes", ordering="episode_count")
     def episodes(self, session: CollectSession) -> int:
-        """All, discarded ones included."""
+        """Return the number of episodes, including discarded ones."""
         return int(session.episode_count)  # type: ignore[attr-defined]
 
 
 @admin.register(Demonstration)
 class DemonstrationAdmin(_Kept):
-    """Episodes of sessions with their labels."""
+    """Demonstrations with their labels."""
 
     list_display = ("episode", "session", "result", "discarded", "labelled_by", "labelled_at")
     list_filter = ("result", "discarded", "session__dataset")

@@ -1,10 +1,10 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 
 
 class CollectConfig(AppConfig):
-    """Collecting sessions and their demonstrations."""
+    """Collection sessions and their demonstrations."""
 
     name = "evaweb.collect"
     default_auto_field = "django.db.models.BigAutoField"

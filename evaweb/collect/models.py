@@ -1,4 +1,4 @@
-"""Sessions and their demonstrations. The disk is the authority: sessions/<uuid>.jsonl, manifests, labels."""
+"""Sessions and their demonstrations; the disk is authoritative: sessions/<uuid>.jsonl, manifests, labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evaweb.stations.models import Station
 
 
 class CollectSession(models.Model):
-    """One task demonstrated at one station for one dataset, over days where need be; it never changes its set-up."""
+    """One task demonstrated at one station for one dataset, possibly over days, with a constant set-up."""
 
     uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="collect_sessions")
@@ -51,7 +51,7 @@ class CollectSession(models.Model):
 
 
 class SessionEventKind(models.TextChoices):
-    """What happens to a session."""
+    """Kinds of session events."""
 
     OPENED = "opened", "opened"
     CLOSED = "closed", "closed"
@@ -61,7 +61,7 @@ class SessionEventKind(models.TextChoices):
 
 
 class SessionEvent(models.Model):
-    """One line of a session's history."""
+    """Entry of a session's history."""
 
     session = models.ForeignKey(CollectSession, on_delete=models.CASCADE, related_name="events")
     kind = models.CharField(max_length=12, choices=SessionEventKind)
@@ -79,7 +79,7 @@ class SessionEvent(models.Model):
 
 
 class Result(models.TextChoices):
-    """How a demonstration went; nothing while nobody has said."""
+    """Result of a demonstration; empty before it is labelled."""
 
     NONE = "", "not labelled"
     SUCCESS = "success", "success"
@@ -88,7 +88,7 @@ class Result(models.TextChoices):
 
 
 class Demonstration(models.Model):
-    """An episode of a session, with its newest label; labels/<uuid>.jsonl is the authority of that."""
+    """Episode of a session with its newest label, for which labels/<uuid>.jsonl is authoritative."""
 
     episode = models.OneToOneField(
         Episode, on_delete=models.CASCADE, primary_key=True, related_name="demonstration"

@@ -1,4 +1,4 @@
-"""Contents of a station's Collect page, for its two fragments."""
+"""Context of the two fragments of a station's Collect page."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from evaweb.collect import selectors
 from evaweb.collect.work import session_queue
 from evaweb.stations.models import Station
 
-SHOWN = 8  # jobs that are listed; the others are counted
+SHOWN = 8  # listed jobs; the remaining ones are counted
 
 
 def session_panel(*, station: Station) -> dict[str, Any]:
-    """The open session with its counts, else what another one is opened or resumed with."""
+    """Return the open session with its counts, else the data for opening or resuming one."""
     session = selectors.session_open(station=station)
     shown: dict[str, Any] = {"station": station, "session": session}
     if session is not None:
@@ -27,7 +27,7 @@ def session_panel(*, station: Station) -> dict[str, Any]:
 
 
 def progress_panel(*, station: Station) -> dict[str, Any]:
-    """Of the open session: its last episode, what the worker does for all of them, what can be published."""
+    """Return for the open session its last episode, the job queue, and what can be published."""
     session = selectors.session_open(station=station)
     shown: dict[str, Any] = {"station": station, "session": session}
     if session is None:

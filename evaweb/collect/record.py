@@ -1,4 +1,4 @@
-"""The lines of DATA/sessions/<uuid>.jsonl: what happened to a session of collecting."""
+"""Lines of DATA/sessions/<uuid>.jsonl: events of a collection session."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from evaweb.collect.models import SessionEvent
 from evaweb.journal import Journal, Line, Moment, Person, RowPath
 from evaweb.stations.models import STATION_NAME
 
-_OPENED = ("station", "dataset", "task", "setup")  # what never changes
+_OPENED = ("station", "dataset", "task", "setup")  # constant values
 
 
 class EventLine(Line):
-    """One line; the first one, `opened`, has all that never changes as well."""
+    """Event of a session; the first, `opened`, also has all constant values."""
 
     ELSEWHERE: ClassVar = frozenset[str]()
 
@@ -30,7 +30,7 @@ class EventLine(Line):
 
     @classmethod
     def written(cls, row: SessionEvent, **given: Any) -> dict[str, Any]:
-        """Of `opened` and `target` as the session is from then on."""
+        """Return the line; `opened` has the whole session, `target` the target, others neither."""
         without = {"opened": (), "target": _OPENED}.get(row.kind, ("target", *_OPENED))
         return {name: value for name, value in super().written(row).items() if name not in without}
 

@@ -1,4 +1,4 @@
-"""Sessions and demonstrations that the database has lost, made again from the disk."""
+"""Restoring of lost sessions and demonstrations from the disk."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MANIFEST_DOES_NOT_SAY_HOW = Pattern(
 
 @register_restorer
 def restore(kept: RestorableRun) -> int:
-    """Make the rows of an episode's session and of itself as its demonstration that are not there; how many."""
+    """Restore the missing rows of an episode's session and demonstration; return their number."""
     episode = Episode.objects.filter(uuid=kept.uuid).first() if kept.recorded else None
     if episode is None:
         return 0
@@ -56,7 +56,10 @@ def restore(kept: RestorableRun) -> int:
 
 
 def _session(uuid: UUID, episode: Episode, kept: RestorableRun) -> CollectSession:
-    """From its own file, else from the manifest of the first episode that is met: without target and history then."""
+    """Restore a session from its file, else from the manifest of its first episode found.
+
+    A manifest has neither target nor history.
+    """
     events = SESSIONS.read(uuid, kept.report_problem)
     first = next((event for event in events if event.kind == "opened"), None)
     if first is None:
@@ -107,7 +110,7 @@ def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
 
 
 def _made(uuid: UUID, station: Station, **facts: Any) -> CollectSession:
-    """Closed where another one is open at the station."""
+    """Create the session; closed if another one is open at the station."""
     if facts["closed_at"] is None and CollectSession.objects.filter(station=station, closed_at=None).exists():
         facts["closed_at"] = timezone.now()
     return CollectSession.objects.create(uuid=uuid, station=station, **facts)

@@ -1,4 +1,4 @@
-"""Reads of sessions and their demonstrations."""
+"""Queries on sessions and their demonstrations."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _SESSION_DOES_NOT_EXIST_THIS = Pattern(
     "session {uuid} does not exist in this lab",
 )
 
-EARLIER = 12  # sessions offered to be resumed, tasks to be picked
+EARLIER = 12  # sessions offered for resuming, tasks offered for reuse
 PUBLISHED_RESULTS = (Result.SUCCESS.value, Result.PARTIAL.value)
 
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Episodes of a session: `saved` are whole and not discarded, those by result among them; `cut` ended otherwise."""
+    """Numbers of a session's episodes: `saved` (complete, not discarded) in all and by result; `cut` are incomplete."""
 
     saved: int
     success: int
@@ -43,7 +43,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """Destination of a session's episodes: the folder's name, its version, "" where it does not exist yet."""
+    """Target dataset of a session: name and version, "" if it does not exist yet."""
 
     name: str
     version: str
@@ -51,7 +51,7 @@ class Dataset:
 
     @property
     def versions(self) -> tuple[str, ...]:
-        """Those that may be asked for, the usual one first."""
+        """Versions that can be requested, the default first."""
         if self.version:
             return (self.version,)
         others = (version for version in WRITABLE_VERSIONS if version != DEFAULT_VERSION)
@@ -61,7 +61,7 @@ class Dataset:
 def session_list(
     *, station: str = "", dataset: str = "", is_open: bool | None = None
 ) -> QuerySet[CollectSession]:
-    """The newest first."""
+    """Return the sessions, newest first."""
     found = CollectSession.objects.select_related("station", "operator").order_by("-opened_at", "pk")
     wanted = {"station__name": station, "dataset": dataset}
     found = found.filter(**{name: value for name, value in wanted.items() if value})
@@ -69,7 +69,7 @@ def session_list(
 
 
 def session_get(*, uuid: UUID) -> CollectSession:
-    """The session; NotFound where there is none."""
+    """Return the session. Raises: NotFound."""
     found = session_list().filter(pk=uuid).first()
     if found is None:
         raise NotFound(_SESSION_DOES_NOT_EXIST_THIS(uuid=uuid))
@@ -77,12 +77,12 @@ def session_get(*, uuid: UUID) -> CollectSession:
 
 
 def session_open(*, station: Station) -> CollectSession | None:
-    """The one that goes on at the station."""
+    """Return the station's open session, None if there is none."""
     return session_list(is_open=True).filter(station=station).first()
 
 
 def resumable_sessions(*, station: Station) -> QuerySet[CollectSession]:
-    """Those that may be resumed there, the last used first."""
+    """Return the closed sessions of the station, most recently closed first."""
     closed = session_list(is_open=False).filter(station=station)
     return closed.annotate(saved=Count("demonstrations", _saved("demonstrations__"))).order_by("-closed_at")[
         :EARLIER
@@ -90,13 +90,13 @@ def resumable_sessions(*, station: Station) -> QuerySet[CollectSession]:
 
 
 def earlier_tasks(*, station: Station) -> list[str]:
-    """Tasks demonstrated at the station, the newest first, each once."""
+    """Return the distinct tasks demonstrated at the station, newest first."""
     newest = session_list().filter(station=station).values_list("task", flat=True)
     return list(dict.fromkeys(newest[:200]))[:EARLIER]
 
 
 def session_counts(*, session: CollectSession) -> Counts:
-    """Number of its episodes, in all and by outcome."""
+    """Return the numbers of the session's episodes."""
     cut = Q(discarded=False, episode__status__in=(EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED))
     wanted = {
         "saved": _saved(),
@@ -105,7 +105,7 @@ def session_counts(*, session: CollectSession) -> Counts:
         "cut": cut,
         "published": Q(episode__dataset_index__isnull=False),
     }
-    # Names of their own: one that is also a field's would hide it from those after it.
+    # Prefixed names: an aggregate with a field's name would shadow the field in later ones.
     counted = session.demonstrations.aggregate(
         **{f"n_{name}": Count("pk", of) for name, of in wanted.items()}
     )
@@ -113,19 +113,19 @@ def session_counts(*, session: CollectSession) -> Counts:
 
 
 def _saved(path: str = "") -> Q:
-    """Of demonstrations; `path` leads to them."""
+    """Return the condition for saved demonstrations; `path` is the query path to them."""
     named = {"discarded": False, "episode__frames__gt": 0, "episode__status": EpisodeStatus.FINISHED}
     return Q(**{f"{path}{name}": value for name, value in named.items()})
 
 
 def demonstrations_of(*, session: CollectSession) -> QuerySet[Demonstration]:
-    """The newest first."""
+    """Return the session's demonstrations, newest first."""
     newest = (F("episode__started_at").desc(nulls_last=True), "-episode__created_at")
     return session.demonstrations.select_related("episode__standing__review").order_by(*newest)
 
 
 def accepted_demonstrations(*, session: CollectSession, results: tuple[str, ...]) -> QuerySet[Demonstration]:
-    """Those that may be published: whole, not discarded, of these results, failed by no review."""
+    """Return those that may be published: complete, not discarded, with these results, not failed by review."""
     return (
         demonstrations_of(session=session)
         .filter(_saved(), result__in=results)
@@ -136,13 +136,13 @@ def accepted_demonstrations(*, session: CollectSession, results: tuple[str, ...]
 def unpublished_demonstrations(
     *, session: CollectSession, results: tuple[str, ...] = PUBLISHED_RESULTS
 ) -> QuerySet[Demonstration]:
-    """Those of them that are in no dataset yet, in the order in which they were recorded."""
+    """Return the accepted demonstrations that are in no dataset yet, in order of recording."""
     waiting = accepted_demonstrations(session=session, results=results).filter(episode__dataset_index=None)
     return waiting.order_by("episode__started_at", "episode__created_at")
 
 
 def dataset_of(*, session: CollectSession) -> Dataset:
-    """Destination of its episodes; `problem` says why nothing can be put there now."""
+    """Return the session's target dataset; `problem` is the reason why nothing can be published there."""
     name = session_dataset(session.dataset, simulated=session.station.simulated)
     folder = datasets_dir() / name
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""Actions on sessions: begin, close, resume, publish. A line on the disk first, then the row."""
+"""Services for sessions: open, close, resume, publish. The line on disk is written before the row."""
 
 from __future__ import annotations
 
@@ -77,18 +77,18 @@ _TARGET_ALLOWED_1_NONE = Pattern(
     "target = {target}; allowed: 1 to {highest_target}, or none",
 )
 
-LONGEST_TASK = 2000  # characters; as a station takes it
+LONGEST_TASK = 2000  # characters; the limit of a station
 HIGHEST_TARGET = 100_000
-_ROLLOUTS = "rollouts"  # begins the names of datasets of policies' runs
+_ROLLOUTS = "rollouts"  # reserved prefix of datasets with policies' runs
 
 
 def open_session(
     *, user: Any, station: Station, task: str, dataset: str = "", target: int | None = None
 ) -> CollectSession:
-    """Open a session with the station's present set-up; operators, while no other user commands it.
+    """Open a session with the station's present set-up; for operators, while no other user commands the station.
 
-    `dataset` "" takes the deployment's own. Conflict where one is open there, or the dataset was collected with
-    another set-up: every difference is listed.
+    `dataset` "" selects the deployment's own. Raises: Conflict if a session is open at the station, or the dataset was
+    collected with another set-up; SetupChanged lists every difference.
     """
     require_role(user, Role.OPERATOR)
     task = clean_text("task", task, LONGEST_TASK)
@@ -117,7 +117,7 @@ def open_session(
 
 
 def close_session(*, user: Any, session: CollectSession) -> CollectSession:
-    """End it for now; it can be resumed."""
+    """Close a session; it can be resumed. Raises: Conflict while one of its episodes is being recorded."""
     require_role(user, Role.OPERATOR)
     snapshot = _commanded_snapshot(user, session.station, needed=False)
     running = (snapshot.get("collect") or {}).get("episode")
@@ -134,7 +134,7 @@ def close_session(*, user: Any, session: CollectSession) -> CollectSession:
 
 
 def resume_session(*, user: Any, session: CollectSession) -> CollectSession:
-    """Go on with it, however long ago it was closed; SetupChanged where the station is not as it was then."""
+    """Resume a closed session, of any age. Raises: SetupChanged if the station's set-up has changed."""
     require_role(user, Role.OPERATOR)
     station = session.station
     require_same_setup(
@@ -156,7 +156,7 @@ def resume_session(*, user: Any, session: CollectSession) -> CollectSession:
 
 @transaction.atomic
 def set_session_target(*, user: Any, session: CollectSession, target: int | None) -> CollectSession:
-    """Set the number of episodes wanted, None for no target."""
+    """Set the desired number of episodes, None for no target."""
     require_role(user, Role.OPERATOR)
     _check_target(target)
     held = _lock_session(session)
@@ -173,10 +173,10 @@ def publish_session(
     results: Sequence[str] = selectors.PUBLISHED_RESULTS,
     version: str = "",
 ) -> list[Job]:
-    """Have the accepted episodes of these results that are in no dataset yet written into the session's.
+    """Queue the publication of the accepted episodes with these results that are in no dataset yet.
 
-    `version` is that of a new dataset, "" for the usual one or that which it has. Conflict where there is none to
-    publish, or the dataset is of another version.
+    `version` is that of a new dataset; "" for the default, or the existing dataset's. Raises: Conflict if there is
+    nothing to publish, or the dataset has another version.
     """
     require_role(user, Role.OPERATOR)
     allowed = [result.value for result in Result if result.value]
@@ -206,7 +206,7 @@ def publish_session(
 
 
 def _record_event(session: CollectSession, user: Any, kind: SessionEventKind, words: str = "") -> None:
-    """The caller holds the session's row."""
+    """Write an event to disk and database; the caller holds a lock on the session's row."""
     event = SessionEvent(session=session, kind=kind, text=words, by=user, at=timezone.now())
     SESSIONS.append(session.pk, EventLine.written(event))
     event.save(force_insert=True)
@@ -224,7 +224,10 @@ def _require_none_open(station: Station) -> None:
 
 
 def _commanded_snapshot(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
-    """The station's snapshot; Conflict while another user commands it. Not `needed`: {} of a station that is away."""
+    """Return the station's snapshot. Raises: Conflict while another user commands it.
+
+    If not `needed`, {} for a station that does not respond.
+    """
     try:
         snapshot = connection_to(station.name).status()
     except EvaError:

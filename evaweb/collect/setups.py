@@ -1,4 +1,4 @@
-"""Set-ups of sessions: what a station says that its next episode will be like, and what differs from another one."""
+"""Set-ups of sessions: what a station will record next, and the differences from another set-up."""
 
 from __future__ import annotations
 
@@ -26,11 +26,14 @@ _PLAIN = ("robot", "groups", "joints", "fps")
 
 
 class SetupChanged(Conflict):
-    """The station is not as the session had it."""
+    """The station's set-up differs from that of the session."""
 
 
 def setup_from_snapshot(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:
-    """The set-up that a station's snapshot shows; Conflict where it collects nothing or a camera is not seen yet."""
+    """Return the set-up in a station's snapshot.
+
+    Raises: Conflict if the station collects nothing or a camera has not delivered an image yet.
+    """
     collect = snapshot.get("collect")
     if collect is None:
         raise Conflict(_COLLECTS_NOTHING_DEPLOYMENT_HAS_NO(station=station))
@@ -40,7 +43,7 @@ def setup_from_snapshot(snapshot: Mapping[str, Any], station: str) -> dict[str, 
 
 
 def setup_from_manifest(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """The set-up that an episode's manifest shows."""
+    """Return the set-up in an episode's manifest."""
     robot = manifest["robot"]
     return {
         "robot": robot["name"],
@@ -53,7 +56,7 @@ def setup_from_manifest(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def setup_differences(given: Setup, allowed: Setup) -> list[str]:
-    """A sentence for everything in which `given` is not as `allowed`; none where they are alike."""
+    """Return a message for each difference of `given` from `allowed`; [] if they are equal."""
     return [
         *_plain(given, allowed),
         *_cameras(given["cameras"], allowed["cameras"]),
@@ -62,7 +65,7 @@ def setup_differences(given: Setup, allowed: Setup) -> list[str]:
 
 
 def require_same_setup(given: Setup, allowed: Setup, whose: str) -> None:
-    """SetupChanged with every difference; `whose` is what `allowed` belongs to."""
+    """Raise SetupChanged with every difference; `whose` names the owner of `allowed`."""
     found = setup_differences(given, allowed)
     if found:
         raise SetupChanged(_SET_UP_DIFFERS_FROM(whose=whose, found="; ".join(found)))

@@ -1,4 +1,4 @@
-"""The commands of a session: what its set-up and its runs take with them, and what an accepted run does to it."""
+"""Commands of a session: arguments of its set-up and runs, and effects of an accepted run."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def session_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Give a command for a session: `setup` and `run` get task and session from it; `given` as in `issue_command`.
+    """Send a command for a session: `setup` and `run` get task and session from it; `given` as in `issue_command`.
 
-    Before each run the station is looked at: SetupChanged where it is not as the session had it. Never within a
-    transaction. An accepted run has begun: its episode has a row.
+    Before each run the station's set-up is compared with the session's. Never call it within a transaction. After an
+    accepted run its episode has a row. Raises: SetupChanged.
     """
     require_role(user, Role.OPERATOR)
     identity = parse_command_uuid(uuid)
@@ -55,7 +55,7 @@ def session_command(
     doubled = sorted(own.keys() & beside.keys())
     if doubled:
         raise EvaError(_ARGS_SAY_BESIDE_SESSION_WHICH(doubled=", ".join(doubled)))
-    if not Command.objects.filter(pk=identity).exists():  # else it is asked again what became of it
+    if not Command.objects.filter(pk=identity).exists():  # a repeated uuid only asks for the outcome
         _require_fit(session, kind)
     row = issue_command(
         user=user, station=session.station, kind=kind, args={**beside, **own}, uuid=identity, **given
@@ -67,7 +67,7 @@ def session_command(
 
 @transaction.atomic
 def _begun(session: CollectSession, row: Command, operator: str) -> None:
-    """Its episode has a row, unless the station has said meanwhile that it could not be opened."""
+    """Create the row of the run's episode, unless the station has reported that it could not be opened."""
     if Command.objects.select_for_update().get(pk=row.pk).unopened:
         return
     episode = record_opened(
@@ -95,7 +95,7 @@ def _own(session: CollectSession, kind: str, user: Any) -> dict[str, Any]:
 
 
 def _require_fit(session: CollectSession, kind: str) -> None:
-    """Whatever the page thinks: the session is open, and before a run the station is as it was."""
+    """Raise Conflict if the session is closed; before a run also if the station's set-up has changed."""
     if session_get(uuid=session.pk).closed_at is not None:
         raise Conflict(_SESSION_CLOSED_RESUME_FIRST(session=session))
     if kind == "run":

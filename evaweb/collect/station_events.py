@@ -1,4 +1,4 @@
-"""Effects of a station's events on demonstrations: bound to their session, labelled. Any may come twice."""
+"""Effects of a station's events on demonstrations: assignment to a session, labels. Events may be repeated."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from runtime.recording.labels import latest_label
 
 log = logging.getLogger(__name__)
 TOLD = ("episode_closed", "labelled")
-"""The kinds of events that say something of a demonstration."""
+"""Kinds of events that concern demonstrations."""
 
 
 def apply_station_event(*, event: Mapping[str, Any]) -> Demonstration | None:
-    """Take one row of a station's event log; the demonstration it is about, None where that is of no session."""
+    """Apply one row of a station's event log; return its demonstration, None outside any session."""
     data = event.get("data") or {}
     try:
         uuid = UUID(str(data.get("episode") or data.get("uuid")))
@@ -35,7 +35,7 @@ def apply_station_event(*, event: Mapping[str, Any]) -> Demonstration | None:
 
 
 def get_or_create_demonstration(*, episode: Episode | None) -> Demonstration | None:
-    """That of an episode, made where its manifest names a session that is known."""
+    """Return the demonstration of an episode; create it if the manifest names a known session."""
     if episode is None:
         return None
     found = Demonstration.objects.filter(pk=episode.pk).first()
@@ -43,7 +43,7 @@ def get_or_create_demonstration(*, episode: Episode | None) -> Demonstration | N
 
 
 def bind_demonstration(*, episode: Episode, session: CollectSession | None) -> Demonstration | None:
-    """Say that the episode is one of the session; None for none."""
+    """Assign the episode to the session and return its demonstration; None without a session."""
     if session is None:
         return None
     return Demonstration.objects.get_or_create(episode=episode, defaults={"session": session})[0]
@@ -60,7 +60,7 @@ def _session_of(episode: Episode) -> CollectSession | None:
 
 @transaction.atomic
 def sync_label(*, demonstration: Demonstration) -> Demonstration:
-    """Bring the row up to the newest label on the disk; a published episode goes to its dataset anew with it."""
+    """Update the row from the newest label on disk; republish a published episode if its result changed."""
     held = (
         Demonstration.objects.select_for_update(of=("self",))
         .select_related("episode")

@@ -1,4 +1,4 @@
-"""Jobs of the worker for the episodes of a session: their progress, and the time they take."""
+"""Jobs for the episodes of a session: progress and remaining time."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.workers import Served, served
 
 KINDS = ("preview", "quality", "export", "publish", "sides")
-_MEASURED = 20  # jobs of a kind that its speed is taken from
-_AT_ONCE = 500  # keys in one question
+_MEASURED = 20  # newest jobs of a kind from which its speed is estimated
+_AT_ONCE = 500  # keys per query
 
 
 @dataclass(frozen=True, slots=True)
 class QueueItem:
-    """A job that is not done: `number` counts the session's episodes, `left_s` is how long it still takes if known."""
+    """Unfinished job: `number` of the episode in its session, remaining time `left_s` [s] if known."""
 
     job: Job
     episode: UUID
     number: int
     left_s: float | None
     expected_s: float | None
-    lacks: str = ""  # why no running worker can take it
+    lacks: str = ""  # reason why no running worker can execute it
 
     @property
     def fraction(self) -> float | None:
-        """Share of it that is done, by the time it takes."""
+        """Finished fraction of the job, estimated from its expected duration."""
         if self.left_s is None or not self.expected_s or self.job.status != JobStatus.RUNNING:
             return None
         return min(1.0, max(0.0, 1 - self.left_s / self.expected_s))
@@ -40,7 +40,7 @@ class QueueItem:
 
 @dataclass(frozen=True, slots=True)
 class Queue:
-    """Failed, running and waiting jobs, in this order; `left_s` of all that runs and waits, in succession."""
+    """Failed, running and queued jobs, in this order; `left_s` is the total remaining time in succession [s]."""
 
     items: tuple[QueueItem, ...]
     done: int
@@ -48,22 +48,22 @@ class Queue:
 
     @property
     def total(self) -> int:
-        """Jobs about these episodes, each thing once."""
+        """Number of jobs for these episodes, the newest of each kind."""
         return self.done + len(self.items)
 
     @property
     def active(self) -> bool:
-        """True if something runs or waits, so that a page looks again."""
+        """Whether a job is running or queued, so that a page polls."""
         return any(item.job.status != JobStatus.FAILED for item in self.items)
 
     @property
     def failed(self) -> int:
-        """Number of failed jobs, for a person to look at."""
+        """Number of failed jobs, which need a person."""
         return sum(item.job.status == JobStatus.FAILED for item in self.items)
 
 
 def session_queue(*, session: CollectSession) -> Queue:
-    """The newest job of each kind about each of its episodes."""
+    """Return the newest job of each kind for each episode of the session."""
     in_order = session.demonstrations.order_by("episode__started_at", "episode__created_at")
     frames = {
         pk: (number, count)
@@ -113,7 +113,7 @@ def _queue_order(item: QueueItem) -> tuple[int, object]:
 
 
 def _seconds_per_frame(kind: str) -> float | None:
-    """Of the last ones of that kind in this lab; None where none is done yet."""
+    """Return the average of the last finished jobs of that kind [s]; None if there are none."""
     done = Job.objects.filter(
         kind=kind, status=JobStatus.DONE, claimed_at__isnull=False, finished_at__isnull=False
     )

@@ -1,1 +1,1 @@
-"""LeRobot datasets under the data folder: listed, looked at, replayed, converted, merged, split, pruned."""
+"""LeRobot datasets in the data folder: list, view, replay, convert, merge, split, delete episodes."""

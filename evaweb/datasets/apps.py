@@ -1,10 +1,10 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 
 
 class DatasetsConfig(AppConfig):
-    """Datasets of the data folder, ours and those of others; it keeps nothing in the database."""
+    """Datasets in the data folder, own and foreign; without database tables."""
 
     name = "evaweb.datasets"
     default_auto_field = "django.db.models.BigAutoField"

@@ -1,4 +1,4 @@
-"""The jobs about a dataset, in words, and what the newest check of it found."""
+"""Descriptions of the jobs of a dataset, and the result of its newest check."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.workers import waiting_for
 from runtime.datasets import layout
 
-SHOWN = 8  # newest jobs of a page
+SHOWN = 8  # jobs shown on a page
 _VERBS = {
     "check": "Check",
     "repair": "Repair",
@@ -30,32 +30,32 @@ _VERBS = {
 
 @dataclass(frozen=True, slots=True)
 class JobSummary:
-    """One job: a title, how it stands (waiting, running, done, refused, failed), and a sentence."""
+    """Description of one job: title, state (waiting, running, done, refused, failed), and a message."""
 
     job: Job
     title: str
     state: str
     sentence: str
-    made: tuple[str, ...] = ()  # datasets that came of it
+    made: tuple[str, ...] = ()  # datasets that the job has written
 
     @property
     def is_transient(self) -> bool:
-        """True if it changes by itself, so that a page looks again."""
+        """Whether the state changes without user action, so that a page polls."""
         return self.state in ("waiting", "running")
 
 
 @dataclass(frozen=True, slots=True)
 class LatestCheck:
-    """Findings of the newest check; `fresh` is false where the dataset has changed since."""
+    """Result of the newest check; `fresh` is False if the dataset has changed since."""
 
     at: datetime
     problems: tuple[str, ...]
-    remarks: tuple[str, ...]  # worth saying, and no damage
+    remarks: tuple[str, ...]  # notable, but not damage
     fresh: bool
 
 
 def jobs_of(name: str = "") -> list[JobSummary]:
-    """The newest jobs about a dataset, or about all."""
+    """Return the newest jobs of a dataset, or of all datasets."""
     rows = Job.objects.filter(kind=KIND)
     if name:
         rows = rows.filter(
@@ -65,7 +65,7 @@ def jobs_of(name: str = "") -> list[JobSummary]:
 
 
 def summarize_job(job: Job) -> JobSummary:
-    """State of a job, in words."""
+    """Return the description of a job."""
     args, result = job.args, job.result
     title = f"{_VERBS.get(args['what'], args['what'])} {_about(args)}"
     if job.status == JobStatus.DONE and not result.get("done"):
@@ -115,7 +115,7 @@ def _counted(count: int, thing: str) -> str:
 
 
 def latest_check(name: str) -> LatestCheck | None:
-    """Findings of the newest finished check of the dataset; None where there is none."""
+    """Return the result of the newest finished check or repair of the dataset; None if there is none."""
     key = key_of("check", name, {})
     repaired = key_of("repair", name, {})
     job = Job.objects.filter(key__in=(key, repaired), status=JobStatus.DONE, result__done=True).first()

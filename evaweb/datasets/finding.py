@@ -1,4 +1,4 @@
-"""Which datasets there are under the data folder, and what each says of itself."""
+"""Datasets in the data folder, and their overviews."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _THERE_NO_DATASET_THERE = Pattern(
     "there is no dataset {name!r:.120}; there are: {there}{more}",
 )
 
-_LONGEST_PART = 255  # bytes; no file system takes more
-DEPTH = 3  # folders below the data folder at which datasets are looked for
-# Of the lab itself: nothing in there is a dataset.
+_LONGEST_PART = 255  # limit of file systems [bytes]
+DEPTH = 3  # levels below the data folder that are searched for datasets
+# Folders of the lab itself, which contain no datasets.
 _OWN = frozenset(
     (
         *(
@@ -56,9 +56,9 @@ _OWN = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """Contents of info.json; where that cannot be read or is contradicted, `problem` says why, the rest is empty."""
+    """Content of info.json; if it is unreadable or contradictory, `problem` is the reason and all else is unset."""
 
-    name: str  # its folder, relative to the data folder
+    name: str  # folder relative to the data folder
     version: str = ""
     robot: str = ""
     fps: float = 0.0
@@ -66,17 +66,17 @@ class Overview:
     frames: int = 0
     tasks: int = 0
     cameras: tuple[str, ...] = ()
-    size: int = 0  # bytes on the disk
+    size: int = 0  # size on disk [bytes]
     problem: str = ""
 
     @property
     def seconds(self) -> float:
-        """Duration of all of it."""
+        """Total duration [s]."""
         return self.frames / self.fps if self.fps else 0.0
 
     @property
     def duration_text(self) -> str:
-        """The same in words."""
+        """Total duration as text."""
         seconds = self.seconds
         if seconds < 120:
             return f"{seconds:.1f} s"
@@ -84,25 +84,25 @@ class Overview:
 
     @property
     def short(self) -> str:
-        """Its name without the folder that most of them are in."""
+        """Name without the usual folder."""
         return self.name.removeprefix("datasets/")
 
 
 def dataset_names() -> list[str]:
-    """All datasets there are, relative to the data folder, in order."""
+    """Return the sorted names of all datasets, relative to the data folder."""
     root = data_dir()
     return sorted(path.relative_to(root).as_posix() for path in _walk(root, DEPTH))
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """Datasets below `folder`; hidden ones are on their way, or were left by a crash.
+    """Yield the datasets below `folder`; hidden ones are drafts, or left by a crash.
 
-    Folders that no address can name are none: one of them would take the lists of all others with it.
+    Folders with names that no URL can carry are skipped: one of them would break the whole list.
     """
     try:
         below = [Path(entry.path) for entry in os.scandir(folder) if entry.is_dir()]
     except OSError:
-        return  # it went away meanwhile, or is somebody else's
+        return  # removed meanwhile, or not accessible
     for path in below:
         if not _is_part(path.name) or (folder == data_dir() and path.name in _OWN):
             continue
@@ -113,7 +113,7 @@ def _walk(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def folder_named(name: str) -> Path:
-    """The folder of a new dataset or of one that is there: below the data folder, never hidden; EvaError."""
+    """Return the folder of an existing or new dataset: below the data folder, never hidden. Raises: EvaError."""
     parts = PurePosixPath(name).parts
     wrong = not parts or len(parts) > DEPTH or not all(map(_is_part, parts))
     long = any(len(part.encode("utf-8", "surrogatepass")) > _LONGEST_PART for part in parts)
@@ -124,12 +124,12 @@ def folder_named(name: str) -> Path:
 
 
 def _is_part(name: str) -> bool:
-    """True if a folder on the way to a dataset may have this name; "-" ends a dataset's in addresses."""
+    """Return True if a dataset's path may contain this name; "-" ends a dataset's name in URLs."""
     return is_name(name) and name != "-" and not name.startswith(".")
 
 
 def dataset_found(name: str) -> Path:
-    """The folder of a dataset that is there; NotFound lists what is."""
+    """Return the folder of an existing dataset. Raises: NotFound, which lists the existing ones."""
     folder = folder_named(name)
     if not (folder / layout.INFO).is_file():
         there = dataset_names()
@@ -139,7 +139,7 @@ def dataset_found(name: str) -> Path:
 
 
 def overview(name: str) -> Overview:
-    """Overview of the dataset of that name."""
+    """Return the overview of the dataset of that name."""
     folder = dataset_found(name)
     try:
         info = layout.read_info(folder)
@@ -163,24 +163,24 @@ def overview(name: str) -> Overview:
 
 
 def overviews() -> list[Overview]:
-    """All datasets."""
+    """Return the overviews of all datasets."""
     return [overview(name) for name in dataset_names()]
 
 
 def camera_keys(features: dict[str, Any]) -> dict[str, str]:
-    """The feature of each camera's pictures, videos first, by the name that a person calls it."""
+    """Return the feature of each camera's images, videos first, by its short name."""
     keys = [*layout.video_keys(features), *layout.image_keys(features)]
     return {key.removeprefix("observation.images.").removeprefix("observation."): key for key in keys}
 
 
 def open_cached(name: str) -> Dataset:
-    """The dataset with its list of episodes; read again only after it has changed. RecordingError."""
+    """Return the dataset with its list of episodes; re-read only after a change. Raises: RecordingError."""
     folder = dataset_found(name)
     return _opened(folder, _stamp(folder))
 
 
 def _stamp(folder: Path) -> tuple[int, int]:
-    """Changes with every publication: info.json is written last."""
+    """Return a value that changes with every publication, because info.json is written last."""
     stat = (folder / layout.INFO).stat()
     return stat.st_mtime_ns, stat.st_ino
 
@@ -192,7 +192,7 @@ def _opened(folder: Path, stamp: tuple[int, int]) -> Dataset:
 
 @lru_cache(256)
 def _contradiction(folder: Path, stamp: tuple[int, int]) -> str:
-    """Why its list of episodes cannot be what info.json counts, "" where it is."""
+    """Return why the list of episodes contradicts the counts in info.json, "" if it does not."""
     try:
         episode_lines(folder, layout.read_info(folder))
     except RecordingError as error:
@@ -208,5 +208,5 @@ def _size(folder: Path, stamp: tuple[int, int]) -> int:
             try:
                 total += os.stat(os.path.join(place, file)).st_size
             except FileNotFoundError:
-                continue  # published anew meanwhile
+                continue  # replaced by a publication meanwhile
     return total

@@ -1,4 +1,4 @@
-"""Episodes that were recorded elsewhere become ones of this lab, to be checked, reviewed, annotated like its own."""
+"""Import of episodes recorded elsewhere into the lab, for checks, reviews and annotations."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _ALLOWED_NAME_DATASETS_NAME_WHAT = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class ImportResult:
-    """Result of an import: the dataset's name, its episodes in order, and how many of them were new."""
+    """Result of an import: dataset name, its episodes in order, and the number of new ones."""
 
     dataset: str
     episodes: tuple[UUID, ...]
     made: int
-    problems: tuple[str, ...]  # of datasets that could not be read meanwhile
+    problems: tuple[str, ...]  # other datasets that could not be read
 
 
 def import_dataset(
@@ -44,12 +44,12 @@ def import_dataset(
     reencode: bool = False,
     tell: Callable[[str], None] = lambda _: None,
 ) -> ImportResult:
-    """Import a LeRobot dataset of any version as the dataset `to`; by default of its folder's name. RecordingError.
+    """Import a LeRobot dataset of any version as the dataset `to`, by default named as its folder.
 
-    What was imported before stays as it is, so that one that was cut short is gone on with.
+    Episodes imported before are unchanged, so that an interrupted import can be continued. Raises: RecordingError.
     """
     if not rename:
-        resolve_source_robot(open_dataset(dataset), state, robot)  # before anything is copied
+        resolve_source_robot(open_dataset(dataset), state, robot)  # fails before anything is copied
     target = _target(dataset, to)
     if target.resolve() != dataset.resolve():
         tell(f"{dataset} is copied to {target}")
@@ -67,7 +67,7 @@ def import_dataset(
 
 
 def _target(dataset: Path, to: str) -> Path:
-    """Folder it is in already, or the folder below datasets/ of that name; by default of its own."""
+    """Return the folder below datasets/ of that name, or the one in which the dataset is already."""
     here, root = dataset.resolve(), datasets_dir().resolve()
     if not to and here.parent == root:
         return datasets_dir() / here.name

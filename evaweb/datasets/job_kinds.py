@@ -1,4 +1,4 @@
-"""The job of datasets: whatever is asked for is done here, and the rows of episodes follow."""
+"""The job kind of datasets: executes orders and updates the rows of episodes."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
 from runtime.recording.files import RecordingError
 
 Found = dict[str, Any]
-_READ = ("check", "push")  # they change no dataset here
+_READ = ("check", "push")  # orders that change no dataset
 
 
 @job_kind(KIND, least=lambda args: least_for(args["what"]))
 def dataset(work: JobContext) -> Mapping[str, Any]:
-    """Do an order; args: those of evaweb.datasets.orders, checked.
+    """Execute an order; args: a checked order of evaweb.datasets.orders.
 
-    What is refused is a result (`done` false, `why`): to try it again would change nothing.
+    A refusal is a result (`done` False, `why`), because a retry would not change it.
     """
     try:
         work.hold(_names(work.args))
         found = _KINDS[work.args["what"]](work)
     except (RecordingError, EvaError) as fault:
         return {"done": False, "why": str(fault)}
-    except Cancelled:  # it may have been changed by then
+    except Cancelled:  # the dataset may have changed before
         if work.args["what"] not in _READ:
             sync_memberships()
         raise
@@ -38,11 +38,11 @@ def dataset(work: JobContext) -> Mapping[str, Any]:
 
 
 def _names(args: Mapping[str, Any]) -> list[str]:
-    """All datasets that an order reads or writes."""
+    """Return the names of all datasets that an order reads or writes."""
     names = [*args.get("datasets", ()), *filter(None, (args.get("dataset"), args.get("to")))]
     if args["what"] == "split":
         names += [f"{args['to']}/{part}" for part in args["parts"]]
-    if args["what"] == "import":  # which lies below datasets/ from then on
+    if args["what"] == "import":  # its copy below datasets/
         names.append(f"datasets/{PurePosixPath(args['dataset']).name}")
     return names
 
@@ -50,7 +50,7 @@ def _names(args: Mapping[str, Any]) -> list[str]:
 def _check(work: JobContext) -> Found:
     from runtime.datasets.consistency import (
         check_with_remarks,
-    )  # web processes know this kind too, and never do it
+    )  # imported late: web processes import this module but never run the job
 
     work.report_progress("every file is compared with the metadata")
     found = check_with_remarks(_source(work))
@@ -149,7 +149,7 @@ def _source(work: JobContext) -> Path:
 
 
 def _made(name: str, made: Any) -> Found:
-    """Result of an operation that wrote a dataset."""
+    """Return the job's result for an operation that wrote a dataset."""
     return {
         "dataset": name,
         "version": made.version,

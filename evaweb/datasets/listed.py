@@ -1,4 +1,4 @@
-"""Columns and filters of the list of datasets, and of the episodes of one."""
+"""Columns and filters of the list of datasets, and of the episodes of one dataset."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COLUMNS = (
 
 
 def filters(found: Sequence[Overview]) -> list[Filter]:
-    """What the list of these is narrowed by."""
+    """Return the filters of the list of datasets."""
     robots, versions = ({getattr(one, name) for one in found} - {""} for name in ("robot", "version"))
     return [
         Filter("words", "Words", kind=SEARCH, hint="of its name"),
@@ -34,7 +34,7 @@ def filters(found: Sequence[Overview]) -> list[Filter]:
 
 
 def fits(one: Overview, *, words: str, robot: str, version: str) -> bool:
-    """True if the dataset is one of those that are meant; "" where it does not matter."""
+    """Return True if the dataset matches the filters; "" matches all."""
     return (
         all(word in one.name.casefold() for word in words_of(words.casefold()))
         and robot in ("", one.robot)

@@ -1,4 +1,4 @@
-"""The episodes of one dataset as a page lists them: what it says of each, what the lab knows of it."""
+"""Episodes of one dataset for a page: data of the dataset, and what the lab knows about them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VERDICTS = ("pass", "fail", "unreviewed")
 
 @dataclass(frozen=True, slots=True)
 class DatasetRow:
-    """One episode; `recording` is the lab's own, where it is one of ours that the database knows."""
+    """Episode of a dataset; `recording` is the lab's row, if it was recorded here."""
 
     index: int
     length: int
@@ -29,14 +29,14 @@ class DatasetRow:
     task: str
     uuid: str = ""
     success: bool | None = None
-    result: str = ""  # as its operator said it: of what is no success some is partial
+    result: str = ""  # label by the operator; unlike `success` it can be partial
     outcome: str = ""
     station: str = ""
     recording: Episode | None = None
 
     @property
     def verdict(self) -> str:
-        """pass, fail, or "" where it is undecided."""
+        """Verdict of its review: "pass", "fail", or "" if undecided."""
         review = getattr(getattr(self.recording, "standing", None), "review", None)
         return str(review.verdict) if review else ""
 
@@ -44,10 +44,10 @@ class DatasetRow:
 def list_rows(
     name: str, *, words: str = "", success: str = "", result: str = "", verdict: str = ""
 ) -> list[DatasetRow]:
-    """The episodes of a dataset, narrowed to those whose task or uuid has all `words`, and so on.
+    """Return the episodes of a dataset whose task, uuid or station contain all `words`, filtered further.
 
-    `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; others choose nothing.
-    RecordingError; EvaError where there are too many words.
+    `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; other values have no effect.
+    Raises: RecordingError; EvaError for too many words.
     """
     wanted = words_of(words.lower())
     dataset = open_cached(name)
@@ -58,7 +58,7 @@ def list_rows(
 
 
 def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
-    """Our own lines about the episodes of a dataset, by index; {} for one of others."""
+    """Return this program's own lines about the episodes of a dataset, by index; {} for a foreign dataset."""
     lines = layout.read_lines(dataset.root / layout.EVA_EPISODES)
     try:
         return {int(line["episode_index"]): line for line in lines}
@@ -69,7 +69,7 @@ def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
 
 
 def _known(uuids: Sequence[str]) -> dict[str, Episode]:
-    """Those that the database knows."""
+    """Return the rows of these episodes in the database, by uuid."""
     wanted = []
     for uuid in uuids:
         try:
@@ -77,7 +77,7 @@ def _known(uuids: Sequence[str]) -> dict[str, Episode]:
         except ValueError:
             continue
     found: dict[str, Episode] = {}
-    for first in range(0, len(wanted), 500):  # a database takes so many parameters at once
+    for first in range(0, len(wanted), 500):  # limit of query parameters
         chosen = Episode.objects.select_related("trial", "standing__review__reviewer")
         found |= {str(row.uuid): row for row in chosen.filter(uuid__in=wanted[first : first + 500])}
     return found
@@ -100,7 +100,7 @@ def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[
 
 
 def result_of(told: Mapping[str, Any]) -> str:
-    """ "success", "partial", "fail", or "" by our own line about an episode; lines of before have no `result`."""
+    """Return "success", "partial", "fail" or "" from the line of an episode; older lines have only `success`."""
     if told.get("result") in RESULTS[:3]:
         return str(told["result"])
     return {True: "success", False: "fail"}.get(told.get("success"), "")  # type: ignore[call-overload,no-any-return]

@@ -1,4 +1,4 @@
-"""A recorded episode played on a robot: what would be sent, whether a station can, and what its set-up is told."""
+"""Replay of a recorded episode on a robot: values to be sent, suitability of a station, set-up arguments."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ _EPISODE_DAMAGED = Pattern("datasets.on_robot.episode_damaged", "episode {uuid} 
 _SPACE_ALLOWED = Pattern("datasets.on_robot.space_allowed", "space = {space!r:.40}; allowed: {spaces}")
 
 SPACES = {"joint": "joints", "eef": "end-effector poses"}
-TAIL_S = 1.0  # for which the last row is held before the run ends by itself
-RATE = 5.0  # answers per second; each reaches a second ahead
+TAIL_S = 1.0  # time for which the last row is held before the run ends
+RATE = 5.0  # inference rate [Hz]; each chunk covers at least a second
 
 
 @dataclass(frozen=True, slots=True)
 class PlayableEpisode:
-    """An episode as a robot would get it; `columns` are the names of the numbers by space, and what stores them."""
+    """Episode for replay on a robot; `columns` maps spaces to the dataset's columns."""
 
-    source: str  # as in addresses
+    source: str  # name in URLs
     title: str
-    path: str  # of the dataset's folder, or of the recording's
+    path: str  # folder of the dataset or recording
     index: int
     rows: int
     fps: float
@@ -66,8 +66,8 @@ class PlayableEpisode:
     robot: str
     joints: Sequence[str]
     poses: Sequence[str]
-    columns: Mapping[str, str]  # of a dataset by space; those of a recording are known
-    ours: bool  # recorded by a lab like this: it is known in which frames its poses are
+    columns: Mapping[str, str]  # columns of a dataset by space; {} for a recording
+    ours: bool  # recorded by this program, so that the frames of its poses are known
 
     @property
     def seconds(self) -> float:
@@ -75,7 +75,7 @@ class PlayableEpisode:
 
     @property
     def page(self) -> str:
-        """Address of its replay without a robot."""
+        """URL of its replay without a robot."""
         if not self.columns:
             return reverse("replay", args=[self.source])
         name, _, index = self.source.rpartition(":")
@@ -86,13 +86,13 @@ class PlayableEpisode:
 
 @dataclass(frozen=True, slots=True)
 class ReplayOffer:
-    """Replay of it at one station in one space; `differences` say why it is not possible."""
+    """Replay of an episode at one station in one space; `differences` are the reasons why it is impossible."""
 
     recorded: PlayableEpisode
     station: Station
     space: str
     differences: tuple[str, ...]
-    running: bool  # the station answers
+    running: bool  # the station responds
 
     @property
     def sent(self) -> str:
@@ -101,7 +101,7 @@ class ReplayOffer:
 
     @property
     def names(self) -> Sequence[str]:
-        """Of the numbers that are sent."""
+        """Names of the values that are sent."""
         return self.recorded.joints if self.space == "joint" else self.recorded.poses
 
     @property
@@ -112,7 +112,7 @@ class ReplayOffer:
 
     @property
     def set_up(self) -> dict[str, Any]:
-        """The arguments of the set-up."""
+        """Arguments of the set-up command."""
         recorded = self.recorded
         policy: dict[str, Any] = {
             "kind": "replay",
@@ -129,17 +129,17 @@ class ReplayOffer:
 
     @property
     def run(self) -> str:
-        """The arguments of the run, as JSON: it ends by itself after the last row."""
+        """Arguments of the run command, as JSON: it ends by itself after the last row."""
         return json.dumps({"duration_s": round(self.recorded.seconds + TAIL_S, 3)})
 
     @property
     def address(self) -> str:
-        """Address of the station's own page, where it is set up and run."""
+        """URL of the station's own page, on which it is set up and run."""
         return f"{reverse('station-debug', args=[self.station.name])}?{query(self.recorded, self.space)}"
 
 
 def query(recorded: PlayableEpisode, space: str) -> str:
-    """Query string for it."""
+    """Return the query string that selects the episode and space."""
     return urlencode({"replay": recorded.source, "space": space, **_assumed(recorded)})
 
 
@@ -158,9 +158,9 @@ def replay_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Set a station up to play an episode, by its uuid or as DATASET:INDEX; `given` as in `issue_command`.
+    """Set a station up to play an episode, given by uuid or DATASET:INDEX; `given` as in `issue_command`.
 
-    EvaError for other commands, Conflict where the station's robot is not the episode's.
+    Raises: EvaError for other commands; Conflict if the station's robot is not the episode's.
     """
     require_role(user, Role.OPERATOR)
     if kind != "setup":
@@ -177,7 +177,7 @@ def replay_command(
 
 
 def playable_episode(source: str, robot: str = "") -> PlayableEpisode:
-    """The episode of that name, with the numbers of `robot` where a person says so; NotFound, Conflict."""
+    """Return the episode of that name, interpreted for `robot` if given. Raises: NotFound, Conflict."""
     try:
         uuid = UUID(source)
     except ValueError:
@@ -245,7 +245,7 @@ def _of_dataset(shown: PlayedEpisode) -> PlayableEpisode:
 
 
 def make_offer(recorded: PlayableEpisode, station: Station, space: str) -> ReplayOffer:
-    """Offer of the station for the episode; EvaError for an unknown space."""
+    """Return the station's offer for the episode. Raises: EvaError for an unknown space."""
     if space not in SPACES:
         raise EvaError(_SPACE_ALLOWED(space=space, spaces=", ".join(SPACES)))
     facts, running = _facts(station)
@@ -253,7 +253,7 @@ def make_offer(recorded: PlayableEpisode, station: Station, space: str) -> Repla
 
 
 def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
-    """Facts of the station's robot, and if it answers; where it does not, what is known of such a robot."""
+    """Return the facts of the station's robot and True; else those of its description and False."""
     try:
         return connection_to(station.name).status()["facts"], True
     except (StationGone, KeyError):
@@ -261,7 +261,7 @@ def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
 
 
 def _differences(recorded: PlayableEpisode, facts: Mapping[str, Any], space: str) -> list[str]:
-    """Everything in which the episode's robot is not the station's; [] where it is the same."""
+    """Return all differences between the episode's robot and the station's; [] if there are none."""
     found = []
     own = str(facts.get("robot", ""))
     if recorded.robot not in robots.robot_names():

@@ -1,4 +1,4 @@
-"""Orders for datasets: checked here, done by the worker, one kind of job for all."""
+"""Orders for operations on datasets: validated here, executed by a worker as jobs of one kind."""
 
 from __future__ import annotations
 
@@ -128,12 +128,12 @@ _OF_ADMINS = ("delete", "push")
 
 
 def least_for(what: str) -> Role:
-    """The role that may order this."""
+    """Return the lowest role that may submit this order."""
     return Role.ADMIN if what in _OF_ADMINS else Role.OPERATOR
 
 
 def parse_order(given: Mapping[str, Any]) -> Any:
-    """The order that is meant; EvaError names what is wrong with it."""
+    """Return the validated order. Raises: EvaError with the first problem."""
     try:
         return _ADAPTER.validate_python(dict(given))
     except ValidationError as invalid:
@@ -143,16 +143,16 @@ def parse_order(given: Mapping[str, Any]) -> Any:
 
 
 def full_name(given: str) -> str:
-    """The name of a dataset, whose usual folder need not be said: cups is datasets/cups where that is there."""
+    """Return the full name of a dataset, whose usual folder may be omitted: cups is datasets/cups if that exists."""
     usual = f"datasets/{given}"
     names = dataset_names()
     return usual if usual in names or (given not in names and "/" not in given) else given
 
 
 def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
-    """Have the worker do it; operators, what takes data away or out of the house administrators.
+    """Queue an order; deleting and pushing need an administrator, other orders an operator.
 
-    Raises EvaError where a dataset is not there, a new one is already, or a name leads out of the data folder.
+    Raises: EvaError if a source does not exist, a target exists, or a name is outside the data folder.
     """
     order = parse_order(given)
     require_role(user, least_for(order.what))
@@ -176,7 +176,7 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
 
 
 def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:
-    """Key of the job's subject: one check of a dataset at a time, while two exports of it are two things."""
+    """Return the job's key: one check or repair per dataset at a time, but different keys for other orders."""
     if what in ("check", "repair"):
         return f"dataset:{what}:{_short(name)}"
     rest = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]
@@ -188,7 +188,7 @@ def _short(name: str) -> str:
 
 
 def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
-    """The name of what is to be written; Conflict where that is there already."""
+    """Return the full name of a new dataset. Raises: Conflict if it exists or is inside another dataset."""
     name = to if "/" in to else f"datasets/{to}"
     for wanted in [f"{name}/{part}" for part in parts] or [name]:
         folder = folder_named(wanted)
@@ -208,7 +208,7 @@ def _known(name: str) -> str:
 
 
 def _require_no_deletion(names: Sequence[str]) -> None:
-    """Two deletions that wait for each other would be about different episodes."""
+    """Raise Conflict during a deletion, which changes the episode indices that a waiting order refers to."""
     for job in Job.objects.filter(
         kind=KIND, status__in=(JobStatus.QUEUED, JobStatus.RUNNING), args__what="delete"
     ):

@@ -1,4 +1,4 @@
-"""An episode of a dataset in the form of a recording of ours, so that the same modules play both."""
+"""Episodes of datasets in the form of recordings, so that the same modules play both."""
 
 from __future__ import annotations
 
@@ -46,34 +46,34 @@ _EPISODE_HAS_JOINTS_HAS_CHOOSE = Pattern(
     "the episode has {count} joints, {robot} has {count_2}: choose another robot",
 )
 
-STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
+STATES = ("observation.state", "observation.qpos")  # columns of measured joints, in order of preference
 _SOURCE = "control_source"
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlayedEpisode:
-    """One episode of a dataset; `robot` is whose numbers are meant, "" where it is not known.
+    """Episode of a dataset; `robot` is the robot that its values are for, "" if unknown.
 
-    `assumed`: a person says so, whatever the dataset says, and that they are in that robot's order.
+    `robot_is_assumed`: the user has chosen the robot, whatever the dataset declares, and the values are in its order.
     """
 
-    name: str  # of the dataset
+    name: str  # name of the dataset
     index: int
     dataset: Dataset
     entry: EpisodeEntry
-    told: Mapping[str, Any]  # our own line about it; {} for one of others
+    told: Mapping[str, Any]  # this program's own line about it; {} for a foreign episode
     robot: str
     robot_is_assumed: bool
 
     @property
     def result(self) -> str:
-        """As its operator said it, "" where nobody has."""
+        """Label by its operator, "" if there is none."""
         return result_of(self.told)
 
     @property
     def uuid(self) -> str:
-        """Of the recording, "" for an episode of others."""
+        """UUID of the recording, "" for a foreign episode."""
         try:
             return str(UUID(str(self.told["uuid"])))
         except (KeyError, ValueError):
@@ -93,11 +93,11 @@ class PlayedEpisode:
 
     @property
     def cameras(self) -> dict[str, str]:
-        """The feature of each camera's pictures."""
+        """Feature of each camera's images by its short name."""
         return camera_keys(dict(self.dataset.features))
 
     def video(self, camera: str) -> Span | None:
-        """Span of a camera's video; None where its pictures are in a column. NotFound for no camera of it."""
+        """Return the span of a camera's video; None if its images are in a column. Raises: NotFound."""
         key = self.cameras.get(camera)
         if key is None:
             raise NotFound(
@@ -107,14 +107,14 @@ class PlayedEpisode:
 
     @property
     def state(self) -> str:
-        """The column of measured joints, "" where there is none."""
+        """Column of measured joints, "" if there is none."""
         vectors = _vectors(self.dataset)
         usual = [name for name in STATES if name in vectors]
         return next(iter([*usual, *(name for name in vectors if name.startswith("observation"))]), "")
 
     @property
     def action(self) -> str:
-        """The column of commanded joints, "" where there is none."""
+        """Column of commanded joints, "" if there is none."""
         vectors = _vectors(self.dataset)
         return (
             "action"
@@ -123,21 +123,21 @@ class PlayedEpisode:
         )
 
     def names(self, column: str) -> list[str]:
-        """Of the numbers of a column."""
+        """Return the names of a column's values."""
         feature = self.dataset.features.get(column, {})
         width, names = int((feature.get("shape") or [0])[0]), feature.get("names")
-        if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
+        if isinstance(names, Mapping) and len(names) == 1:  # some datasets use {"motors": [...]}
             names = next(iter(names.values()))
         told = [str(name) for name in names] if isinstance(names, list) else []
         return told if len(told) == width else [f"{column}[{k}]" for k in range(width)]
 
     def sidecars(self) -> dict[str, Path]:
-        """The side files of the episode by kind."""
+        """Return the sidecar files of the episode by kind."""
         return sidecar_paths(self.dataset.root, self.uuid) if self.uuid else {}
 
 
 def load_played_episode(name: str, index: int, robot: str = "") -> PlayedEpisode:
-    """Episode `index` of a dataset, with the numbers of `robot` where that is given; NotFound, RecordingError."""
+    """Return episode `index` of a dataset, interpreted for `robot` if given. Raises: NotFound, RecordingError."""
     dataset = open_cached(name)
     listed = next((one for one in dataset.episodes if one.index == index), None)
     if listed is None:
@@ -161,9 +161,9 @@ def _vectors(dataset: Dataset) -> list[str]:
 
 
 def as_recording(shown: PlayedEpisode) -> Episode:
-    """The episode with the tables that a recording has; the three action streams where they lie beside it.
+    """Return the episode with the tables of a recording, including the three action streams if in a sidecar.
 
-    Where state and action are of different numbers, the joints are those of both. Raises RecordingError.
+    If state and action have different dimensions, the joints are those of both. Raises: RecordingError.
     """
     table = shown.dataset.table(shown.index)
     joints, measured, commanded = _numbers(shown, table)
@@ -201,7 +201,7 @@ def as_recording(shown: PlayedEpisode) -> Episode:
 
 
 def _numbers(shown: PlayedEpisode, table: Any) -> tuple[list[str], Array, Array]:
-    """Names of the joints, measured and commanded ones [N, D]; NaN where a column has nothing of a joint."""
+    """Return joint names, and measured and commanded joints [N, D]; NaN if a column lacks a joint."""
     state, action = shown.state, shown.action
     if not state and not action:
         raise RecordingError(f"{shown.name} has no column of joints, neither measured nor commanded")
@@ -246,7 +246,7 @@ def _manifest(shown: PlayedEpisode, joints: list[str]) -> dict[str, Any]:
 
 
 def _renamed_joints(shown: PlayedEpisode, joints: list[str]) -> list[str]:
-    """The joints as the robot calls them, where a person says that they are that robot's; NotFound for too many."""
+    """Return the joint names, those of the robot if the user has chosen one. Raises: NotFound if counts differ."""
     if not shown.robot_is_assumed:
         return joints
     known = list(drawn_robot(shown.robot).robot.joint_names)
@@ -285,7 +285,7 @@ def _episode(
 
 
 def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
-    """With what the policy meant, what was planned and what was sent, from the side file."""
+    """Return the episode with the raw, smoothed and executed streams of the sidecar file."""
     try:
         table = pq.read_table(path)
         manifest = json.loads((table.schema.metadata or {})[b"eva.manifest"])
@@ -324,18 +324,18 @@ def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
 
 
 def _renamed(table: Any, new: Mapping[str, str], same: tuple[str, ...], numbers: tuple[str, ...]) -> Any:
-    """Columns as a recording names them; in `numbers` -1 stands for none."""
+    """Return columns under the names of a recording; in `numbers`, null becomes -1."""
     columns = {name: table[old] for name, old in new.items()} | {name: table[name] for name in same}
     return pa.table(columns | {name: table[name].fill_null(-1) for name in numbers})
 
 
 def annotations(shown: PlayedEpisode) -> list[dict[str, Any]]:
-    """The segments that travel with the episode; RecordingError where their file is damaged."""
+    """Return the segments in the dataset's sidecar. Raises: RecordingError if the file is damaged."""
     path = shown.sidecars().get("annotations")
     return [] if path is None else layout.read_lines(path)
 
 
 def reviews(shown: PlayedEpisode) -> list[dict[str, Any]]:
-    """The verdicts that travel with the episode, oldest first; RecordingError where their file is damaged."""
+    """Return the reviews in the dataset's sidecar, oldest first. Raises: RecordingError if the file is damaged."""
     path = shown.sidecars().get("reviews")
     return [] if path is None else layout.read_lines(path)

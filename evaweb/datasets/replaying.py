@@ -1,4 +1,4 @@
-"""Pages that replay episodes of datasets and several episodes beside each other, and the files they play."""
+"""Pages that replay episodes of datasets, and several episodes side by side, and the media they use."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _ALLOWED_WHOLE_NUMBER_FROM_0 = Pattern(
 )
 
 Result = TypeVar("Result")
-MOST = 6  # episodes beside each other
+MOST = 6  # episodes side by side
 _TYPES = {".mp4": "video/mp4", ".mkv": "video/x-matroska", ".webm": "video/webm", ".mov": "video/quicktime"}
 
 
@@ -58,7 +58,7 @@ _TYPES = {".mp4": "video/mp4", ".mkv": "video/x-matroska", ".webm": "video/webm"
 
 @require_GET
 def replay(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """One episode of a dataset: cameras, robot and curves on one clock."""
+    """Show one episode of a dataset: cameras, robot and curves on one clock."""
     episode = _episode(request, name, index)
     context = {
         "episode": episode,
@@ -74,7 +74,7 @@ def replay(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def side_by_side(request: HttpRequest) -> HttpResponse:
-    """Several episodes on one clock; ?show= names each, see evaweb.datasets.sources."""
+    """Show several episodes on one clock; each ?show= names one, see evaweb.datasets.sources."""
     names = list(dict.fromkeys(name.strip() for name in request.GET.getlist("show") if name.strip()))
     if len(names) > MOST:
         raise EvaError(_EPISODES_BESIDE_EACH_OTHER_ALLOWED(count=len(names), most=MOST))
@@ -91,7 +91,7 @@ def side_by_side(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def on_robot(request: HttpRequest) -> HttpResponse:
-    """Which stations can play an episode, and what they would send."""
+    """Show which stations can play an episode, and what they would send."""
     recorded = playable_episode(request.GET.get("show", ""), request.GET.get("robot", ""))
     space = request.GET.get("space", "joint")
     offers = [make_offer(recorded, station, space) for station in Station.objects.filter(active=True)]
@@ -110,7 +110,7 @@ def on_robot(request: HttpRequest) -> HttpResponse:
 
 
 async def video(request: HttpRequest, name: str, index: int, camera: str) -> HttpResponseBase:
-    """The video in which the pictures of a camera are, also in parts; others may be in it too."""
+    """Return the video that contains a camera's images, also in ranges; it may contain other episodes."""
     episode = await sync_to_async(_episode)(request, name, index)
     span = episode.video(camera)
     if span is None:
@@ -121,7 +121,7 @@ async def video(request: HttpRequest, name: str, index: int, camera: str) -> Htt
 
 @require_GET
 def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpResponse:
-    """Picture ?row= of a camera whose pictures are in a column."""
+    """Return image ?row= of a camera whose images are in a column."""
     episode = _episode(request, name, index)
     row = _number(request, "row")
     if row >= episode.frames:
@@ -132,7 +132,7 @@ def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpRes
 
 @require_GET
 def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Joint curves, and the action streams where they lie beside it, as one message of evaweb.binary_frames."""
+    """Return joint curves, and the action streams if there is a sidecar, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     recording = _recording(episode)
     covered = recording is not None and visibility_for_request(request).hides_episode(recording)
@@ -141,7 +141,7 @@ def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def geometry_json(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Geometry of the robot for the 3D scene, as JSON."""
+    """Return the geometry of the robot for the 3D scene, as JSON."""
     episode = _episode(request, name, index)
     found = _or_conflict(lambda: as_recording(episode))
     robot = drawn_robot_for(found.manifest).robot
@@ -150,7 +150,7 @@ def geometry_json(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
+    """Return the poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
     episode = _episode(request, name, index)
     first = _number(request, "first")
     return _binary_response(lambda: pose_streams(as_recording(episode), first))
@@ -158,7 +158,7 @@ def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def segments(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """The annotations and verdicts that travel with the episode, as JSON."""
+    """Return the annotations and reviews in the dataset's sidecars, as JSON."""
     episode = _episode(request, name, index)
     said = _or_conflict(
         lambda: {"segments": playing.annotations(episode), "reviews": playing.reviews(episode)}
@@ -171,7 +171,7 @@ def _episode(request: HttpRequest, name: str, index: int) -> PlayedEpisode:
 
 
 def _recording(episode: PlayedEpisode) -> Episode | None:
-    """The lab's own recording of it, where the database knows it."""
+    """Return the lab's own recording of the episode, None if the database has none."""
     if not episode.uuid:
         return None
     return Episode.objects.select_related("trial").filter(uuid=episode.uuid).first()

@@ -1,4 +1,4 @@
-"""Whatever can be replayed, by one name each: a recording by its uuid, an episode of a dataset as NAME:INDEX."""
+"""Everything that can be replayed, by name: a recording by its uuid, an episode of a dataset as NAME:INDEX."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NO_EPISODE_ALLOWED_UUID_RECORDING = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class ReplayEntry:
-    """One of the episodes of a page: `name` as in addresses, what the page's modules have to know in `config`."""
+    """Episode on a page: its `name` in URLs, and the `config` of the page's modules."""
 
     name: str
     title: str
@@ -43,7 +43,7 @@ class ReplayEntry:
 
 
 def resolve_entry(request: Any, name: str) -> ReplayEntry:
-    """Episode of that name; NotFound, Conflict where it cannot be played."""
+    """Return the episode of that name. Raises: NotFound; Conflict if it cannot be played."""
     try:
         uuid = UUID(name)
     except ValueError:
@@ -83,7 +83,7 @@ def _of_dataset(name: str) -> ReplayEntry:
 
 
 def open_dataset_episode(name: str, index: int, robot: str = "") -> PlayedEpisode:
-    """As `played`; Conflict where the dataset cannot be read."""
+    """Return an episode as `load_played_episode`. Raises: NotFound; Conflict if the dataset is unreadable."""
     try:
         return load_played_episode(name, index, robot)
     except RecordingError as error:
@@ -91,13 +91,13 @@ def open_dataset_episode(name: str, index: int, robot: str = "") -> PlayedEpisod
 
 
 def dataset_address(route: str, episode: PlayedEpisode, *more: Any) -> str:
-    """The address of something of an episode of a dataset; whose robot's numbers are meant goes along."""
+    """Return a URL of an episode of a dataset, with the chosen robot if there is one."""
     path = reverse(route, args=[episode.name, episode.index, *more])
     return f"{path}?{urlencode({'robot': episode.robot})}" if episode.robot_is_assumed else path
 
 
 def dataset_config(episode: PlayedEpisode) -> dict[str, Any]:
-    """Settings of the page's modules, as evaweb.episodes.views has them for a recording."""
+    """Return the settings of the page's modules, in the form of evaweb.episodes.views.replay_config."""
     known = episode.robot in robots.robot_names()
     videos = []
     for camera in episode.cameras:

@@ -1,4 +1,4 @@
-"""Single pictures of cameras that a dataset keeps in a column instead of a video."""
+"""Single images of cameras that a dataset stores in a column instead of a video."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ from runtime.recording.files import RecordingError
 _PICTURES_VIDEO = Pattern("datasets.stills.pictures_video", "the pictures of {camera} are in a video")
 
 QUALITY = 85
-_SHOWN = {"JPEG": "image/jpeg", "PNG": "image/png"}  # as they are coded
+_SHOWN = {"JPEG": "image/jpeg", "PNG": "image/png"}  # formats that are served unchanged
 
 
 def still_image(episode: PlayedEpisode, camera: str, row: int) -> tuple[bytes, str]:
-    """Picture `row` of a camera and its type; coded again only where no browser shows it. RecordingError, NotFound."""
+    """Return image `row` of a camera and its media type; re-encoded only if browsers cannot show it.
+
+    Raises: RecordingError, NotFound.
+    """
     if episode.video(camera) is not None:
         raise NotFound(_PICTURES_VIDEO(camera=camera))
     key = episode.cameras[camera]
@@ -35,7 +38,7 @@ def still_image(episode: PlayedEpisode, camera: str, row: int) -> tuple[bytes, s
         with Image.open(io.BytesIO(content)) as picture:
             require_size(*picture.size, f"picture {row} of {key!r} is")
             kind = _SHOWN.get(picture.format or "")
-            if kind and not picture.mode.startswith("I"):  # depth, which a browser shows black
+            if kind and not picture.mode.startswith("I"):  # depth images, which browsers show as black
                 return content, kind
             pixels = np.ascontiguousarray(shown(picture))
     except TooLargeError as error:
@@ -47,7 +50,7 @@ def still_image(episode: PlayedEpisode, camera: str, row: int) -> tuple[bytes, s
 
 
 def _stored(episode: PlayedEpisode, key: str, row: int) -> bytes:
-    """Picture in one row of the column, without reading those of other episodes into Python."""
+    """Return the encoded image in one row of the column, without converting other episodes' images."""
     path = episode.entry.data
     try:
         columns = [key, *(["episode_index"] if episode.entry.shared else [])]

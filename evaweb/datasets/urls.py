@@ -1,4 +1,4 @@
-"""Addresses of the pages of datasets and of what they play; `-` ends the name of a dataset, which may have slashes."""
+"""URLs of the pages of datasets and their media; `-` ends a dataset's name, which may contain slashes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages of datasets: the list, one of them, and what is asked for about them."""
+"""Pages of datasets: the list, one dataset, and orders."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _INDICES = re.compile(r"[0-9]{1,9}(,[0-9]{1,9}){0,199}")
 
 @require_GET
 def dataset_list(request: HttpRequest) -> HttpResponseBase:
-    """All datasets of the data folder."""
+    """Show all datasets in the data folder."""
     found = overviews()
     shown = Listing(request.GET, listed.COLUMNS, listed.filters(found))
     fits = shown.sorted([one for one in found if listed.fits(one, **shown.chosen)])
@@ -55,7 +55,7 @@ def dataset_list(request: HttpRequest) -> HttpResponseBase:
 
 @require_GET
 def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
-    """One dataset: its figures, its episodes, what can be done with it."""
+    """Show one dataset: its overview, episodes and operations."""
     name = orders.full_name(name)
     shown = Listing(request.GET, listed.EPISODE_COLUMNS, listed.EPISODE_FILTERS)
     found = overview(name)
@@ -84,7 +84,7 @@ def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
 
 
 def _chosen(given: str) -> str:
-    """Indices of episodes that another page has handed over; EvaError."""
+    """Return the indices of episodes selected on another page. Raises: EvaError if malformed."""
     if given and not _INDICES.fullmatch(given):
         raise EvaError(f"chosen = {given!r:.80}; allowed: indices of episodes, separated by commas")
     return given
@@ -92,7 +92,7 @@ def _chosen(given: str) -> str:
 
 @require_GET
 def dataset_work(request: HttpRequest) -> HttpResponse:
-    """The newest jobs, to be put into a page; a page is told to load again when one has ended."""
+    """Return the newest jobs as a fragment; make the page reload when none is active."""
     given = request.GET.get("dataset", "")
     name = orders.full_name(given) if given else ""
     context = {"name": name, **_work(name)}
@@ -104,7 +104,7 @@ def dataset_work(request: HttpRequest) -> HttpResponse:
 
 @require_POST
 def dataset_ask(request: HttpRequest) -> HttpResponse:
-    """Have something done, as the forms of the pages say it."""
+    """Submit an order from a form."""
     try:
         job = orders.submit_order(user=request.user, given=_order(request.POST))
     except EvaError as error:
@@ -116,7 +116,7 @@ def dataset_ask(request: HttpRequest) -> HttpResponse:
 
 
 def _order(form: QueryDict) -> Mapping[str, Any]:
-    """The order that a form means; its fields are text."""
+    """Convert a form, whose fields are text, to an order."""
     what = form.get("what", "")
     order: dict[str, Any] = {"what": what}
     if what == "merge":
@@ -141,7 +141,7 @@ def _order(form: QueryDict) -> Mapping[str, Any]:
 
 
 def _pairs(name: str, text: str) -> dict[str, str]:
-    """NAME=VALUE, separated by blanks or lines."""
+    """Parse NAME=VALUE pairs separated by white space."""
     pairs = [part.partition("=") for part in text.split()]
     wrong = [f"{key}{sign}{value}" for key, sign, value in pairs if not (key and sign and value)]
     if wrong or len({key for key, _, _ in pairs}) < len(pairs):
@@ -150,7 +150,7 @@ def _pairs(name: str, text: str) -> dict[str, str]:
 
 
 def _parts(text: str) -> dict[str, list[int]]:
-    """Episodes of each part; together as many as one order may name."""
+    """Parse the episodes of each part; the total is limited as in one order."""
     parts: dict[str, list[int]] = {}
     for part, which in _pairs("parts", text).items():
         try:
@@ -161,7 +161,7 @@ def _parts(text: str) -> dict[str, list[int]]:
 
 
 def _require_confirmed(form: QueryDict) -> None:
-    """Refuse to delete episodes unless the form names their dataset."""
+    """Raise Conflict unless the form repeats the dataset's name, before deleting episodes."""
     name = form.get("dataset", "").removeprefix("datasets/")
     if form.get("confirm", "").strip() != name:
         raise Conflict(_NOTHING_DELETED_TYPE_NAME_DATASET(name=name))

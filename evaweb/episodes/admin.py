@@ -1,4 +1,4 @@
-"""Episodes in the admin pages: to look at, and to ask anew for their preview."""
+"""Read-only admin pages of episodes, with an action that renews previews."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evaweb.episodes.models import Episode
 
 @admin.register(Episode)
 class EpisodeAdmin(admin.ModelAdmin):
-    """The folders are the authority: rows are written by services alone."""
+    """Episodes; the folders are authoritative, and only services write the rows."""
 
     list_display = (
         "uuid",

@@ -1,4 +1,4 @@
-"""Episodes of stations on other computers: whose they are, how far they have come, their rows when they are here."""
+"""Episodes of stations on other computers: their owners, transfer progress, and rows on arrival."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DECLINED = Pattern(
 
 
 def owner_of(uuid: str) -> str:
-    """The name of the station that an episode is known to be of, "" for none; OSError while the database is away."""
+    """Return the name of the station that owns an episode, "" if unknown. Raises: OSError if the database is away."""
     try:
         return Episode.objects.filter(uuid=uuid).values_list("station__name", flat=True).first() or ""
     except Error as error:
@@ -38,7 +38,7 @@ def owner_of(uuid: str) -> str:
 
 
 def whereabouts(episode: Episode) -> str:
-    """Where an episode is that is not here yet, and how much of it is here, for people."""
+    """Return the location of an episode in transfer, and the transferred part, as a message."""
     name = episode.station.name
     found = progress_of(data_dir(), name, str(episode.uuid))
     if found is None:
@@ -49,7 +49,7 @@ def whereabouts(episode: Episode) -> str:
 
 
 def take_in_arrived() -> int:
-    """Make rows of episodes that have arrived since the last look, and of labels; how many."""
+    """Create rows of newly arrived episodes and labels; return the number of episodes."""
     marks = {UUID(uuid): mark for uuid, mark in arrivals(data_dir())}
     waited_for = Episode.objects.filter(away_since__isnull=False).values_list("uuid", flat=True)
     here = {uuid for uuid in waited_for if journal_folder(uuid).is_dir()}
@@ -58,9 +58,7 @@ def take_in_arrived() -> int:
             log.warning("episode %s has arrived: %s", uuid, problem)
         episode = Episode.objects.filter(uuid=uuid, away_since=None).first()
         if episode is not None and job_newest(key=f"publish:{uuid}") is not None:
-            services.request_publish(
-                episode=episode
-            )  # it was asked for when there was nothing to publish yet
+            services.request_publish(episode=episode)  # an earlier job found nothing to publish
         if uuid in marks:
             marks[uuid].unlink(missing_ok=True)
     return len(here.union(marks))

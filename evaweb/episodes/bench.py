@@ -1,4 +1,4 @@
-"""Positions and milestones of a simulated bench in a recording, as the bench itself said them."""
+"""Ground truth of a simulated bench in a recording: positions of objects, and milestones."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from runtime.recording.reader import Episode, open_episode
 
 
 def bench_course(folder: Path) -> list[dict[str, Any]]:
-    """Where its things lay, [{row, blocks, plate}] from each row on in which that changed; without what is judged.
+    """Return the positions of the objects, [{row, blocks, plate}] at each row where they changed, without outcomes.
 
-    Empty for a recording of no simulated bench. RecordingError names the file that is absent or damaged.
+    [] for a recording without simulated bench. Raises: RecordingError, which names the absent or damaged file.
     """
     course: list[dict[str, Any]] = []
     for row, said in truth_changes(open_episode(folder).rows):
@@ -24,7 +24,7 @@ def bench_course(folder: Path) -> list[dict[str, Any]]:
 
 
 def milestones_reached(episode: Episode) -> Iterator[tuple[str, int]]:
-    """(name, row) of every milestone that the bench said was reached, at the first row in which it did."""
+    """Yield (name, row) of every milestone in the ground truth, at the first row with it."""
     known: set[str] = set()
     for row, said in truth_changes(episode.rows):
         reached = {name for name, yes in (said.get(JUDGED) or {}).items() if yes is True}

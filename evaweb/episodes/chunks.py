@@ -1,4 +1,4 @@
-"""Chunks that the policy answered: when, how late, which of their rows were planned."""
+"""Chunks of the policy: observation and arrival times, delays, planned rows."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ UNKNOWN = -1
 
 
 def chunk_arrays(episode: Episode, times_of: Callable[[Array], Array]) -> Stream:
-    """Every chunk of the episode, by its number; `times_of` says when control steps were [s].
+    """Return every chunk of the episode as a stream; `times_of` maps control steps to times [s].
 
-    Arrays [C]: id i4; observed and arrived f8 [s] (NaN: it never arrived); delay, mistimed and overlap i4
-    [steps]; rows i4, how many it has; first and last i4, the rows that were planned; strategy i4, a place in
-    the list `strategies` beside them; inference f4 [ms]. -1 stands for unknown or none: episodes from before
-    have no overlap and no strategy.
+    Arrays [C]: id i4; observed and arrived f8 [s] (NaN: never arrived); delay, mistimed and overlap i4 [steps];
+    rows i4, the number of rows; first and last i4, the planned rows; strategy i4, index into the list `strategies`;
+    inference f4 [ms]. -1 means unknown or none: older episodes have no overlap and no strategy.
     """
     raw = episode.raw
     numbers, firsts, counts = np.unique(
@@ -53,14 +52,14 @@ def chunk_arrays(episode: Episode, times_of: Callable[[Array], Array]) -> Stream
 
 
 def _strategies(heads: Any) -> tuple[list[str], Array]:
-    """The kinds that merged them, and which one each chunk has."""
+    """Return the kinds of strategies, and the index of each chunk's."""
     kinds = [kind or "" for kind in heads.column("strategy").to_pylist()]
     names = sorted(set(kinds) - {""})
     return names, np.array([names.index(kind) if kind else UNKNOWN for kind in kinds], np.int32)
 
 
 def _planned(raw: Any, numbers: Array) -> tuple[Array, Array]:
-    """The first and the last row of each chunk that has a step it was planned for."""
+    """Return the first and the last row of each chunk with a planned step."""
     used = raw.filter(np.asarray(raw.column("target_step").to_numpy() >= 0))
     places = np.searchsorted(numbers, used.column("chunk_id").to_numpy())
     index = used.column("index").to_numpy()

@@ -1,4 +1,4 @@
-"""The curves of an episode on the clock of its videos: what was measured, asked for, smoothed and sent."""
+"""Curves of an episode on the clock of its videos: measured, raw, smoothed and executed."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from runtime.recording.summary import HELD
 Array = NDArray[Any]
 
 
-# Events that say nothing of the policy, for those who are not to know which it was.
+# Events that reveal nothing about the policy.
 _OPEN_MARKS = ("command", "estopped", "released", "truth")
-_JUDGED = ("truth",)  # people score before they hear it
+_JUDGED = ("truth",)  # hidden until the operator has scored
 
 
 def curve_message(
@@ -34,18 +34,22 @@ def curve_message(
     unscored: bool = False,
     milestones: Sequence[tuple[float, str]] = (),
 ) -> bytes:
-    """One message of evaweb.binary_frames; RecordingError names the file that is absent or damaged.
+    """Return one message of evaweb.binary_frames with the curves of a recording.
 
-    Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (a row per joint):
-    ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN where nothing was
-    asked for or sent), safety u1 [M] (1 changed, 2 refused), chunk i4 [M] (with the largest weight, -1 none,
-    0 the held target), makers i4 [M + 1]: tick k was made of the entries makers[k] to makers[k + 1] of stream
-    makers. makers: chunk i4 [W], weight f4 [W]. raw, where the policy speaks in joints: time f8 [R], values
-    f4 [D, R], chunk i4 [R]. chunks: see evaweb.episodes.chunks.
+    Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (one row per joint):
+    ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN if nothing was planned or
+    sent), safety u1 [M] (1 changed, 2 refused), chunk i4 [M] (with the largest weight, -1 none, 0 the held target),
+    makers i4 [M + 1]: tick k consists of the entries makers[k] to makers[k + 1] of stream makers.
+    makers: chunk i4 [W], weight f4 [W]. raw, if the policy answers in joints: time f8 [R], values f4 [D, R],
+    chunk i4 [R]. chunks: see evaweb.episodes.chunks.
 
-    `covered`: without what tells which policy it was, as of an episode of which no policy's answers were recorded;
-    `unscored`: without what a simulated bench says of how it went. `milestones` are (time of the run [s], words) as
-    they were scored; without any the bench's own are marked.
+    Args:
+        covered: Omit what reveals the policy, as if its answers had not been recorded.
+        unscored: Omit what the ground truth reveals about the outcome.
+        milestones: (time of the run [s], text) as scored; if empty, those of the ground truth are marked.
+
+    Raises:
+        RecordingError: Names the absent or damaged file.
     """
     return curve_streams(open_episode(folder), covered=covered, unscored=unscored, milestones=milestones)
 
@@ -57,7 +61,7 @@ def curve_streams(
     unscored: bool = False,
     milestones: Sequence[tuple[float, str]] = (),
 ) -> bytes:
-    """The same of an episode that is open already."""
+    """Return the message of `curve_message` for an open episode."""
     start = _start(episode)
     if covered:
         episode = _redacted(episode)
@@ -87,7 +91,7 @@ def curve_streams(
 
 
 def _redacted(episode: Episode) -> Episode:
-    """Without the policy's answers, the plans that were made of them, and what was said of them."""
+    """Return the episode without the policy's answers, the plans made from them, and revealing events."""
     events = tuple(
         {**event, "text": str(event.get("text", "")).partition(",")[0]}
         for event in episode.events
@@ -106,7 +110,7 @@ def _redacted(episode: Episode) -> Episode:
 
 
 def _numbers(episode: Episode) -> dict[str, Any]:
-    """The `units` of the joints and which are `grippers`; not known where the robot is another one today."""
+    """Return the `units` of the joints and the indices of `grippers`; unknown if the robot has changed since."""
     try:
         looks = drawn_robot_for(episode.manifest)
     except NotFound:
@@ -115,7 +119,7 @@ def _numbers(episode: Episode) -> dict[str, Any]:
 
 
 def _start(episode: Episode) -> float:
-    """The clock of the tables at which the videos begin."""
+    """Return the start of the videos on the clock of the tables [s]."""
     for table, name in ((episode.ticks, "planned"), (episode.rows, "tick_time")):
         if table.num_rows:
             return float(table.column(name)[0].as_py())
@@ -123,7 +127,7 @@ def _start(episode: Episode) -> float:
 
 
 def vectors(table: Any, name: str, width: int) -> Array:
-    """A column of vectors, joint by joint: float32 [W, N], NaN where it is null."""
+    """Return a column of vectors joint by joint: float32 [W, N], NaN if null."""
     column = table.column(name).combine_chunks()
     values = np.full((table.num_rows, width), np.nan, np.float32)
     known = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), bool)
@@ -132,7 +136,7 @@ def vectors(table: Any, name: str, width: int) -> Array:
 
 
 def _requested_rows(episode: Episode) -> tuple[Array, Array]:
-    """Of the rows of the smoothed stream: the tick of each, and whether that was recorded."""
+    """Return for each row of the smoothed stream its tick, and whether that was recorded."""
     steps = episode.ticks.column("step").to_numpy()
     asked = episode.smoothed.column("step").to_numpy()
     places = np.searchsorted(steps, asked)
@@ -142,7 +146,7 @@ def _requested_rows(episode: Episode) -> tuple[Array, Array]:
 
 
 def _contribution_ranges(episode: Episode) -> tuple[Array, Stream]:
-    """Places where the makers of each tick begin and end (int32 [M + 1]), and all makers, tick by tick."""
+    """Return the boundaries of each tick's contributions (int32 [M + 1]), and all contributions in order."""
     places, known = _requested_rows(episode)
     table = episode.smoothed.filter(known)
     chunk_ids, weights = (table.column(name).combine_chunks() for name in ("chunk_ids", "weights"))
@@ -176,7 +180,7 @@ def _ticks(episode: Episode, start: float, made: Array) -> Stream:
 
 
 def _raw(episode: Episode, start: float) -> Stream:
-    """The policy's raw actions for each step; dropped rows and chunks in another space have no place here."""
+    """Return the policy's raw actions by step; dropped rows and chunks in another space are omitted."""
     raw, dim = episode.raw, episode.layout.dim
     spaces = sorted(set(raw.column("space").to_pylist()))
     lengths = raw.column("action").combine_chunks().value_lengths().to_numpy(zero_copy_only=False)
@@ -196,7 +200,7 @@ def _raw(episode: Episode, start: float) -> Stream:
 
 
 def _times_of(episode: Episode, steps: Array) -> Array:
-    """When each control step was, on the clock of the tables; steps that never came by the rate."""
+    """Return the time of each control step on the clock of the tables; outside the recording by the rate."""
     ticks = episode.ticks
     if not ticks.num_rows:
         return np.zeros(len(steps))
@@ -208,13 +212,13 @@ def _times_of(episode: Episode, steps: Array) -> Array:
 
 
 def _period(episode: Episode) -> float:
-    """Of the control loop [s]."""
+    """Return the period of the control loop [s]."""
     rate = episode.manifest.get("control_rate")
     return 1.0 / rate if isinstance(rate, int | float) and rate > 0 else 1.0 / episode.layout.fps
 
 
 def hold_spans(sources: Sequence[str], fps: float) -> list[list[float]]:
-    """Spans [s] in which the robot was not asked for anything."""
+    """Return the spans [s] during which the robot was not asked to move."""
     return _spans([source in HELD for source in sources], fps)
 
 
@@ -226,7 +230,7 @@ def _spans(there: Sequence[bool], fps: float) -> list[list[float]]:
 
 
 def _interventions(episode: Episode) -> list[dict[str, Any]]:
-    """Where a person had a hand in it; nothing of what a person drove throughout."""
+    """Return marks of a person's interventions; none if a person drove throughout."""
     if "intervention" not in episode.rows.column_names:
         return []
     spans = _spans([bool(one) for one in episode.rows.column("intervention").to_pylist()], episode.layout.fps)
@@ -239,7 +243,7 @@ def _interventions(episode: Episode) -> list[dict[str, Any]]:
 
 
 def _marks(episode: Episode, start: float, without: Sequence[str]) -> list[dict[str, Any]]:
-    """The events of the episode but for kinds `without`; one without a time has no place on the axis."""
+    """Return the events except kinds `without`; events without a time are omitted."""
     marks = []
     for event in episode.events:
         time = event.get("time")
@@ -252,7 +256,7 @@ def _marks(episode: Episode, start: float, without: Sequence[str]) -> list[dict[
 
 
 def _played(at: float, held: Sequence[Sequence[float]]) -> float:
-    """When on the clock of the videos a run was `at` seconds old: its time stands still while it is held."""
+    """Return the video time at run time `at` [s]: the run's clock stops while the robot is held."""
     for begin, end in held:
         if begin <= at:
             at += end - begin
@@ -262,7 +266,7 @@ def _played(at: float, held: Sequence[Sequence[float]]) -> float:
 def _milestones(
     episode: Episode, unscored: bool, scored: Sequence[tuple[float, str]]
 ) -> list[dict[str, Any]]:
-    """Marks of the milestones as they were scored, else as the bench says them where that may be told."""
+    """Return marks of the scored milestones, else those of the ground truth unless hidden."""
     found = list(scored)
     if not found and not unscored:
         fps = episode.layout.fps

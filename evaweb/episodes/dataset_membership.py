@@ -1,4 +1,4 @@
-"""Which dataset each episode is in, as the datasets themselves say; copies of a dataset hold the same episodes."""
+"""Dataset of each episode, as recorded in the datasets; copies of a dataset contain the same episodes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from runtime.recording.files import RecordingError
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """Place of an episode in one dataset, and what that says of it."""
+    """Entry of an episode in one dataset."""
 
     dataset: str  # relative to the data folder
     index: int
-    copied: bool  # the dataset was made from others
+    copied: bool  # the dataset was made from other datasets
     success: bool | None
     at: datetime
 
 
 def sync_memberships() -> list[str]:
-    """Make the rows say in which dataset their episodes are, and in none where they are in none any more.
+    """Update the rows of episodes with the dataset that contains them, or none.
 
-    Of several the one counts that it was published into, not a copy of that; then the one that knows its success, the
-    one that counted before. What cannot be read is returned as sentences, and rows that are there stay as they are.
+    Of several datasets, one that the episode was published to is preferred to copies; then a scored one; then the
+    previous. Unreadable datasets are returned as messages, and rows that refer to them are unchanged.
     """
     places: dict[UUID, list[Membership]] = defaultdict(list)
     problems, unread = [], set()
@@ -53,7 +53,7 @@ def sync_memberships() -> list[str]:
                 Episode.objects.filter(uuid=uuid).update(dataset="", dataset_index=None, published_at=None)
             continue
         if dataset in unread and home.dataset != dataset:
-            continue  # the one that counted may still be the one that counts
+            continue  # the unreadable dataset may still be the right one
         if (dataset, index) != (home.dataset, home.index):
             Episode.objects.filter(uuid=uuid).update(
                 dataset=home.dataset, dataset_index=home.index, published_at=home.at
@@ -63,7 +63,7 @@ def sync_memberships() -> list[str]:
 
 
 def primary_membership(places: Sequence[Membership], before: str) -> Membership | None:
-    """The place that counts; `before` is the dataset that counted until now."""
+    """Return the membership that counts, None if there is none; `before` is the previous dataset."""
     return min(
         places,
         key=lambda place: (
@@ -77,7 +77,7 @@ def primary_membership(places: Sequence[Membership], before: str) -> Membership 
 
 
 def _datasets() -> list[Path]:
-    """Folders of datasets; hidden ones are on their way, or were left by a crash: `repair` removes those."""
+    """Return the dataset folders; hidden ones are drafts, or left by a crash and removed by `repair`."""
     root = datasets_dir()
     there = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
     return sorted(path for path in there if not path.name.startswith("."))
@@ -88,7 +88,7 @@ def _name(folder: Path) -> str:
 
 
 def _places(folder: Path) -> list[tuple[UUID, Membership]]:
-    """The episodes of ours in a dataset; those of others have no uuid, and no row."""
+    """Return the lab's episodes in a dataset; foreign ones have no uuid."""
     told = folder / EVA_EPISODES
     if not (folder / INFO).exists():
         return []
@@ -112,7 +112,7 @@ def _places(folder: Path) -> list[tuple[UUID, Membership]]:
 
 
 def _publish_outdated(uuid: UUID, success: bool | None) -> None:
-    """Have an episode published again that was scored, or scored otherwise, after it was; its job is lost."""
+    """Queue the publication of an episode scored after its publication; the original job may be lost."""
     newest = success_of(scores_file(uuid))
     if newest is not None and newest != success and journal_folder(uuid).is_dir():
         for episode in Episode.objects.filter(uuid=uuid):

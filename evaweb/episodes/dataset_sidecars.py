@@ -1,4 +1,4 @@
-"""Side files of an episode for its dataset; apps above this one have them."""
+"""Sidecar files of an episode in its dataset, provided by apps of higher layers."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _givers: list[SidecarWriter] = []
 
 
 def register_sidecar_writer(function: SidecarWriter) -> SidecarWriter:
-    """Declare what goes beside a published episode, by kind of side file: an app above this one, from its `ready`.
+    """Register a function that writes sidecar files, by kind; apps of higher layers call this in `ready`.
 
-    It is given the episode and a folder of its own, and writes JSON Lines there.
+    It gets the episode's uuid and a folder of its own, and writes JSON Lines there.
     """
     if function not in _givers:
         _givers.append(function)
@@ -22,5 +22,5 @@ def register_sidecar_writer(function: SidecarWriter) -> SidecarWriter:
 
 
 def write_sidecars(uuid: UUID, folder: Path) -> dict[str, Path]:
-    """Side files of the episode, written into `folder`."""
+    """Write the sidecar files of the episode to `folder`; return them by kind."""
     return {kind: path for give in _givers for kind, path in give(uuid, folder).items()}

@@ -1,4 +1,4 @@
-"""The three streams of an episode as one parquet table: where it lies, and how far it is."""
+"""Parquet table with the three action streams of an episode: path and state."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CONTENT_TYPE = "application/vnd.apache.parquet"
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """State of an episode's table: ready, preparing, failed, absent or none; `size` in bytes."""
+    """State of an episode's table: ready, preparing, failed, absent or none; `size` [bytes]."""
 
     name: str
     sentence: str = ""
@@ -38,19 +38,19 @@ class Table:
 
 
 def job_key(uuid: UUID) -> str:
-    """Of the job that makes the table."""
+    """Return the key of the job that makes the table."""
     return f"export:{uuid}"
 
 
 def exported(uuid: UUID) -> Path | None:
-    """The table of an episode, None where it is not made yet; RecordingError where the folder is damaged."""
+    """Return the table of an episode, None if it is not made yet. Raises: RecordingError if the folder is damaged."""
     folder = journal_folder(uuid)
     path = export_path(read_json(folder / "manifest.json"), data_dir())
     return path if is_exported(folder, path) else None
 
 
 def table_file(uuid: UUID) -> Path:
-    """The table that is there; NotFound says how it can be had."""
+    """Return the existing table. Raises: NotFound with the way to request it."""
     try:
         path = exported(uuid)
     except RecordingError as error:
@@ -61,7 +61,7 @@ def table_file(uuid: UUID) -> Path:
 
 
 def table_of(*, episode: Episode) -> Table:
-    """State of the table, from the disk and its newest job; none of what is still being written."""
+    """Return the state of the table, from the disk and its newest job; "none" for an unfinished episode."""
     if episode.away_since or episode.status in (EpisodeStatus.RECORDING, EpisodeStatus.MISSING):
         return Table("none")
     try:

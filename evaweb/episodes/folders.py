@@ -1,4 +1,4 @@
-"""Places of an episode's files in the data folder; names come from the database, never from a client."""
+"""Paths of an episode's files in the data folder; names come from the database, never from a client."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ THUMBNAIL = "thumbnail.jpg"
 
 
 def data_dir() -> Path:
-    """The folder of this lab."""
+    """Return the data folder of this lab."""
     return Path(settings.DATA_DIR)
 
 
 def episodes_dir() -> Path:
-    """The journals of all episodes."""
+    """Return the folder of all recordings."""
     return data_dir() / "episodes"
 
 
 def journal_folder(uuid: UUID) -> Path:
-    """The journal of one episode."""
+    """Return the folder of one recording."""
     return episodes_dir() / str(uuid)
 
 
 def preview_folder(uuid: UUID) -> Path:
-    """Folder of the preview of an episode that a browser plays."""
+    """Return the folder of an episode's preview."""
     return data_dir() / "previews" / str(uuid)
 
 
 def preview_video(uuid: UUID, camera: str) -> Path:
-    """The video of one of the episode's cameras."""
+    """Return the preview video of one camera."""
     return preview_folder(uuid) / f"{camera}.mp4"
 
 
 def preview_sheet(uuid: UUID, camera: str) -> Path:
-    """Small pictures of one of the episode's cameras on one sheet."""
+    """Return the sheet of small images of one camera."""
     return preview_folder(uuid) / sheet_name(camera)
 
 
 def sheet_name(camera: str) -> str:
-    """File of a camera's sheet in the folder of a preview."""
+    """Return the file name of a camera's sheet."""
     return f"{camera}.sheet.jpg"
 
 
 def datasets_dir() -> Path:
-    """All datasets that are published here."""
+    """Return the folder of published datasets."""
     return data_dir() / "datasets"
 
 
 def scores_dir() -> Path:
-    """Folder of the raters' scores, a file per episode."""
+    """Return the folder of score files, one per episode."""
     return data_dir() / "scores"
 
 
 def scores_file(uuid: UUID) -> Path:
-    """File of the raters' scores of an episode, a line each."""
+    """Return the file of an episode's scores, one line each."""
     return scores_dir() / f"{uuid}.jsonl"

@@ -1,4 +1,4 @@
-"""The jobs of episodes: preview, export, smoothness, publish, scrub, reconcile; and what every worker looks after."""
+"""Jobs of episodes: preview, export, smoothness, publish, scrub, reconcile; and their periodic tasks."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from runtime.recording.labels import latest_label
 from runtime.recording.scrub import verify_episode
 from runtime.recording.verdict import DamagedError
 
-_AT_ONCE = 20  # asked for in one look
+_AT_ONCE = 20  # jobs queued per call of a periodic task
 
 
 @job_kind("preview")
 def preview(work: JobContext) -> Mapping[str, Any]:
-    """Make the episode playable; args: uuid."""
+    """Make the episode's preview; args: uuid."""
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.report_progress)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
@@ -48,27 +48,27 @@ def preview(work: JobContext) -> Mapping[str, Any]:
 
 @job_kind("store")
 def store_videos(work: JobContext) -> Mapping[str, Any]:
-    """Put the videos of a preview into the lab's store, where they are played from then on; args: uuid."""
+    """Move the videos of a preview to the lab's store, from which they are then played; args: uuid."""
     return {"videos": put_videos(UUID(work.args["uuid"]))}
 
 
 @startup_task("videos to be stored")
 def store_at_start() -> None:
-    """Those that were made when there was no store, or when it was away."""
+    """Queue videos that were made while there was no store or it was unavailable."""
     for uuid in unstored():
         services.storing_asked(uuid=uuid)
 
 
 @job_kind("export")
 def export_episode(work: JobContext) -> Mapping[str, Any]:
-    """Write its three streams as one parquet table, unless the station has done so; args: uuid."""
+    """Write the three action streams as one Parquet table, unless the station has; args: uuid."""
     path = write_export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
 
 
 @job_kind("smoothness")
 def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
-    """Measure how smoothly the robot moved, or keep why that is not known; args: uuid."""
+    """Measure the smoothness of the robot's motion, or store why it is unknown; args: uuid."""
     uuid = UUID(work.args["uuid"])
     try:
         found = smoothness_in(journal_folder(uuid))
@@ -85,9 +85,9 @@ def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
 
 @job_kind("publish")
 def publish_episode(work: JobContext) -> Mapping[str, Any]:
-    """Write the episode into its dataset with the success of its newest score; args: uuid, and a new one's version.
+    """Write the episode into its dataset with the success of its newest score; args: uuid, version of a new dataset.
 
-    An interrupted one goes there only where it was scored, one that was discarded never.
+    An interrupted episode is published only if it was scored, a discarded one never.
     """
     episode = Episode.objects.select_related("station").get(uuid=UUID(work.args["uuid"]))
     folder = journal_folder(episode.uuid)
@@ -152,13 +152,13 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
 
 @job_kind("scrub")
 def scrub(work: JobContext) -> Mapping[str, Any]:
-    """Verify recordings against their digests, those that were not looked at for longest."""
+    """Verify the recordings that were verified longest ago against their digests."""
     return verifying.scrub_due(work)
 
 
 @job_kind("reconcile")
 def reconcile_all(work: JobContext) -> Mapping[str, Any]:
-    """Read the data folder into the database."""
+    """Synchronise the database with the data folder."""
     report = reconcile()
     return {
         "episodes": report.episodes,
@@ -172,29 +172,29 @@ def reconcile_all(work: JobContext) -> Mapping[str, Any]:
 
 @startup_task("reconcile")
 def reconcile_at_start() -> None:
-    """Reconcile with what happened on the disk while no worker was there."""
+    """Reconcile with changes on the disk while no worker was running."""
     enqueue(kind="reconcile", key="reconcile", args={})
 
 
 @periodic_task("closed recordings")
 def find_closed_episodes() -> int:
-    """Episodes that a station has repaired, or closed while the web was away."""
+    """Close rows of episodes that a station repaired, or closed while the web was not running."""
     return services.close_unheard_episodes()
 
 
 @periodic_task("arrived recordings")
 def look_for_arrived() -> int:
-    """Episodes of stations on other computers that have come here."""
+    """Add rows of episodes that arrived from stations on other computers."""
     return take_in_arrived()
 
 
 @periodic_task("recordings to be verified")
 def find_unverified_episodes() -> bool:
-    """Recordings not verified for long, while the worker has nothing else to do."""
+    """Queue the verification of old recordings if the workers are idle."""
     return verifying.request_scrub() is not None
 
 
 @periodic_task("runs to be measured")
 def find_unmeasured_episodes() -> int:
-    """Runs that were closed, here or elsewhere, since the last look."""
+    """Queue the measurement of newly closed runs."""
     return services.request_smoothness(most=_AT_ONCE)

@@ -1,4 +1,4 @@
-"""Columns and filters of the list of episodes, as far as a user may see them."""
+"""Columns and filters of the list of episodes that a user may see."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evaweb.stations.models import Station
 
 
 def filters(sight: Visibility) -> list[Filter]:
-    """What it is narrowed by; none is about a checkpoint, whose names are looked for by words."""
+    """Return the filters; none is for checkpoints, whose names are found by the word search."""
     stations = [(station.name, str(station)) for station in Station.objects.all()]
     return [
         Filter("words", "Words", kind=SEARCH, hint="task, scene, checkpoint, operator, code"),
@@ -26,7 +26,7 @@ def filters(sight: Visibility) -> list[Filter]:
 
 
 def columns(sight: Visibility) -> list[Column]:
-    """By checkpoint it is sorted only where none is hidden: the order of codes would tell which are of one."""
+    """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
     checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.sees_everything else ()
     return [
         Column("picture", "Picture", quiet=True),

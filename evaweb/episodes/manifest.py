@@ -1,4 +1,4 @@
-"""Manifest and outcome in an episode's folder, in the words of the database."""
+"""Manifest and outcome in an episode's folder, as fields of the database."""
 
 from __future__ import annotations
 
@@ -19,24 +19,26 @@ CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILE
 
 @dataclass(frozen=True, slots=True)
 class RecordedEpisode:
-    """One folder; `facts` are fields of models.Episode, without those that the folder does not know."""
+    """Content of one folder; `facts` are fields of models.Episode, as far as the folder has them."""
 
     uuid: str
     station: str
-    simulated: bool  # declared so by the deployment it was recorded with
-    trial: Mapping[str, Any]  # as the one who asked for the run named it; {} for none
+    simulated: bool  # as declared by its deployment
+    trial: Mapping[str, Any]  # as given in the run command; {} for none
     ended_at: datetime | None  # when the recording ended
     facts: Mapping[str, Any]
-    session: Mapping[str, Any] = field(default_factory=dict)  # of collecting: uuid and dataset; {} for none
+    session: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # collection session: uuid and dataset; {} for none
 
     @property
     def closed(self) -> bool:
-        """True if the recorder, or repair, has finished it."""
+        """Whether the recorder, or repair, has closed the episode."""
         return self.facts["status"] in CLOSED
 
 
 def read_recorded_episode(folder: Path) -> RecordedEpisode:
-    """Read it; RecordingError names the file that is absent, damaged, or says what cannot be."""
+    """Read an episode's folder. Raises: RecordingError, which names the absent, damaged or invalid file."""
     manifest = read_json(folder / "manifest.json")
     layout = Layout.from_manifest(manifest)
     if folder.name != layout.uuid:
@@ -97,7 +99,7 @@ def _text(table: Mapping[str, Any], key: str, longest: int | None = None) -> str
         return ""
     return (
         value.encode("utf-8", "ignore").decode().replace("\x00", "")[:longest]
-    )  # JSON has halves of characters
+    )  # JSON may contain lone surrogates
 
 
 def _table(table: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Episodes: what the database knows of the folders in DATA/episodes, which are the authority."""
+"""Episodes: rows about the folders in DATA/episodes, which are authoritative."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from django.utils import timezone
 
 from evaweb.stations.models import Station
 
-LONGEST_TAG = 60  # characters
+LONGEST_TAG = 60  # longest tag [characters]
 
 
 class EpisodeStatus(models.TextChoices):
@@ -36,7 +36,7 @@ class EpisodeMode(models.TextChoices):
 
 
 class Episode(models.Model):
-    """One recorded run or demonstration."""
+    """A recorded run or demonstration."""
 
     uuid = models.UUIDField(primary_key=True, default=uuid.uuid4)
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="episodes")
@@ -92,7 +92,7 @@ class Episode(models.Model):
         ordering = ("-started_at", "-created_at")
         indexes = [
             models.Index(fields=("verified_at",), name="episode_verified"),
-            # How many were measured is asked for whenever statistics are shown.
+            # Statistics pages count the measured episodes.
             models.Index(
                 fields=("smoothness",),
                 condition=models.Q(smoothness__isnull=False),
@@ -105,7 +105,7 @@ class Episode(models.Model):
 
 
 class Tag(models.Model):
-    """A free word of the lab on an episode, by which lists are narrowed; in small letters, so that it is one word."""
+    """Free tag of an episode for filtering lists, in lower case so that spellings coincide."""
 
     uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
     episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="tags")

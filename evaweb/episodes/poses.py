@@ -1,4 +1,4 @@
-"""Poses of every part of the robot, row by row, for the 3D scene."""
+"""Poses of the robot's parts per row, for the 3D scene."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _ROW_EPISODE_HAS_ROWS_0 = Pattern(
     "row {first}: the episode has rows 0 to {frames}",
 )
 
-MOST_ROWS = 900  # of one answer: half a minute at 30 Hz
+MOST_ROWS = 900  # rows per response: half a minute at 30 Hz
 
 
 def pose_message(folder: Path, first: int) -> bytes:
-    """One message of evaweb.binary_frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
+    """Return a message of evaweb.binary_frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
 
-    Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints. NotFound where there is no such
-    robot or row; RecordingError names the file that is absent or damaged.
+    Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints.
+    Raises: NotFound for an unknown robot or row; RecordingError, which names the absent or damaged file.
     """
     return pose_streams(open_episode(folder), first)
 
 
 def pose_streams(episode: Episode, first: int) -> bytes:
-    """The same of an episode that is open already."""
+    """Return the message of `pose_message` for an open episode."""
     looks = drawn_robot_for(episode.manifest)
     if not 0 <= first < max(1, episode.frames):
         raise NotFound(_ROW_EPISODE_HAS_ROWS_0(first=first, frames=episode.frames - 1))

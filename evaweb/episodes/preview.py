@@ -1,4 +1,4 @@
-"""Makes what a browser can play of an episode: the same coded pictures with the index at the front, small pictures."""
+"""Preview of an episode for browsers: the same encoded video with the index at the front, and small images."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from runtime.datasets.remux import remux
 from runtime.recording.files import RecordingError, disk_error, sync_folder, write_atomic
 from runtime.recording.reader import Episode, open_episode
 
-WIDTH = 320  # of the thumbnail
+WIDTH = 320  # width of the thumbnail [px]
 QUALITY = 82
 
 
 def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> int:
-    """Put <camera>.mp4 and <camera>.sheet.jpg of every camera, as far as it has pictures, and thumbnail.jpg into
-    `target`; the number of rows.
+    """Write <camera>.mp4 and <camera>.sheet.jpg of every camera with images, and thumbnail.jpg, to `target`.
 
-    The folder appears whole or not at all, in the place of an older one. RecordingError names the file that
-    is absent, damaged or cannot be written.
+    The folder appears as a whole, and replaces an older one. `tell` receives progress messages.
+    Returns: The number of rows.
+    Raises: RecordingError, which names the file that is absent, damaged or cannot be written.
     """
     episode = open_episode(journal)
     if episode.outcome is None:
@@ -43,7 +43,9 @@ def make_preview(journal: Path, target: Path, tell: Callable[[str], None]) -> in
             draft = Path(folder) / "new"
             draft.mkdir()
             _fill(episode, draft, tell)
-            if target.is_dir():
+            if (
+                target.is_dir()
+            ):  # a folder cannot replace one that is not empty, so move the old one away first
                 os.replace(target, draft.with_name("old"))
             os.replace(draft, target)
         sync_folder(target.parent)
@@ -57,7 +59,7 @@ def _draft_prefix(target: Path) -> str:
 
 
 def _remove_drafts(target: Path) -> None:
-    """Remove the drafts that a killed worker left."""
+    """Remove drafts that a killed worker left behind."""
     for left in target.parent.glob(f"{_draft_prefix(target)}*"):
         shutil.rmtree(left, ignore_errors=True)
 
@@ -66,7 +68,7 @@ def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
     for number, (camera, source) in enumerate(episode.videos.items(), 1):
         tell(f"camera {number} of {len(episode.videos)}")
         if not episode.shown(camera):
-            continue  # lost before its first picture
+            continue  # the camera was lost before its first image
         video = draft / f"{camera}.mp4"
         remux(source, video, episode.shown(camera), episode.layout.fps)
         _sync(video)
@@ -80,13 +82,13 @@ def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
 
 
 def thumbnail(video: Path, frame: int) -> bytes:
-    """Frame `frame` of the video as a JPEG of WIDTH pixels; RecordingError where it cannot be decoded."""
+    """Return frame `frame` of the video as a JPEG of WIDTH pixels. Raises: RecordingError if it cannot be decoded."""
     with VideoFrames(video) as pictures:
         return jpeg_of(pictures[min(frame, len(pictures) - 1)], WIDTH)
 
 
 def jpeg_of(pixels: NDArray[np.uint8], width: int) -> bytes:
-    """A picture, RGB [H, W, 3], as a JPEG of that width in pixels, with nothing but pixels in it."""
+    """Return an image, RGB [H, W, 3], as a JPEG `width` pixels wide, without metadata."""
     picture = Image.fromarray(pixels)
     height = max(1, round(picture.height * width / picture.width))
     small = picture.resize((width, height), Image.Resampling.LANCZOS)

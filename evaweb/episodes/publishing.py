@@ -1,4 +1,4 @@
-"""Which dataset an episode goes to, and what its raters said of it."""
+"""Target dataset of an episode, and success by its raters."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 
 
 def success_of(path: Path) -> bool | None:
-    """Success by the newest score; None without a score. To void a trial changes no score."""
+    """Return the success in the newest score; None without a score. Voids of trials do not affect it."""
     success = None
     for _, line in read_numbered_lines(path):
         try:
             said = json.loads(line)
-        except (ValueError, RecursionError):  # it never counted
+        except (ValueError, RecursionError):  # an invalid line has never counted
             continue
         if not isinstance(said, dict) or said.get("kind", "score") != "score":
             continue
@@ -30,9 +30,10 @@ def success_of(path: Path) -> bool | None:
 
 
 def dataset_name(recorded: RecordedEpisode, *, scored: bool, simulated: bool) -> str:
-    """Rollouts and demonstrations, real and simulated, scored and unscored ones are kept apart, robot by robot.
+    """Return the dataset's name, which separates robots, rollouts, demonstrations, simulated and unscored ones.
 
-    What was collected in a session goes where that says. RecordingError where a name cannot name a folder.
+    An episode of a collection session goes to the session's dataset.
+    Raises: RecordingError if a name cannot be that of a folder.
     """
     if recorded.session.get("dataset"):
         return session_dataset(str(recorded.session["dataset"]), simulated=simulated)
@@ -49,7 +50,7 @@ def dataset_name(recorded: RecordedEpisode, *, scored: bool, simulated: bool) ->
 
 
 def session_dataset(name: str, *, simulated: bool) -> str:
-    """The folder of a session's dataset; RecordingError where the name cannot be one."""
+    """Return the folder name of a session's dataset. Raises: RecordingError if it is invalid."""
     if not DATASET_NAME.fullmatch(name):
         raise RecordingError(
             f"session.dataset is {name!r:.110}, must be letters, digits, '.', '_' and '-', the first no sign"

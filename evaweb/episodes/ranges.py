@@ -1,4 +1,4 @@
-"""Which bytes of a file a request asks for (RFC 9110, sections 13 and 14); knows nothing of Django."""
+"""Byte ranges and validators of HTTP requests (RFC 9110, sections 13 and 14); independent of Django."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ _DIGITS = 18  # enough for any file; int() of a longer header would only cost ti
 
 @dataclass(frozen=True, slots=True)
 class Validators:
-    """Validators of one version of a file, which tell it from another."""
+    """Validators that identify one version of a file."""
 
     etag: str
     last_modified: str
 
     @classmethod
     def of(cls, stat: stat_result) -> Validators:
-        """Of a file that is never written in place: a new version is another inode."""
+        """Return the validators of a file that is never changed in place: a new version has a new inode."""
         tag = f'"{stat.st_ino:x}-{stat.st_mtime_ns:x}-{stat.st_size:x}"'
         return cls(tag, formatdate(stat.st_mtime, usegmt=True))
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Bytes `first` to `last`, both included."""
+    """Bytes `first` to `last`, inclusive."""
 
     first: int
     last: int
@@ -38,13 +38,13 @@ class Span:
 
 
 class Unsatisfiable(Exception):
-    """A well-formed range that begins behind the end of the file."""
+    """A well-formed range that starts beyond the end of the file."""
 
 
 def span_asked(header: str | None, size: int) -> Span | None:
-    """The one range that `header` asks for; None where it asks for none, for several, or for nonsense.
+    """Return the single range that `header` requests; None for no, several or malformed ranges.
 
-    Those are answered with the whole file, as section 14.2 lets a server do.
+    Those are answered with the whole file, which section 14.2 permits. Raises: Unsatisfiable.
     """
     match = _RANGE.fullmatch(header or "")
     if not match or match[1] == match[2] == "" or max(len(match[1]), len(match[2])) > _DIGITS:
@@ -64,12 +64,12 @@ def span_asked(header: str | None, size: int) -> Span | None:
 
 
 def range_holds(if_range: str | None, validators: Validators) -> bool:
-    """True if If-Range lets the range be answered: same strong tag, or exactly the same date."""
+    """Return True if If-Range permits a partial response: same strong tag, or exactly the same date."""
     return if_range is None or if_range in (validators.etag, validators.last_modified)
 
 
 def not_modified(if_none_match: str | None, if_modified_since: str | None, validators: Validators) -> bool:
-    """True if the client has this version already; the tag decides where one was sent."""
+    """Return True if the client has this version already; if it sent a tag, only that decides."""
     if if_none_match is not None:
         tags = [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]
         return "*" in tags or validators.etag in tags

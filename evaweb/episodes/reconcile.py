@@ -1,4 +1,4 @@
-"""Disk to database: makes the rows say what the folders say. Running it again changes nothing."""
+"""Synchronisation of the database with the folders on disk; idempotent."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)
 
-_SCORES: Journal[Any] = Journal("scores")  # of all kinds: those of the apps above
+_SCORES: Journal[Any] = Journal("scores")  # the kinds of lines are registered by higher apps
 _OF_ONE_RUN = (
     *(RecordingError, EvaError, DataError, IntegrityError),
-    *(OverflowError, RecursionError, ValueError),  # of what no record has declared
+    *(OverflowError, RecursionError, ValueError),  # raised for invalid values that no record validates
 )
 
 
 @dataclass(frozen=True, slots=True)
 class RestorableRun:
-    """Data on the disk of one run: its folder, if `recorded`, and the `lines` of its scores file that say something.
+    """Data on disk of one run: whether its folder exists (`recorded`), and the valid `lines` of its scores file.
 
-    `uuid` is the episode's; of a run that was not recorded, whatever the writers of its lines named it by. `say` takes
-    a sentence about what a person should look at.
+    `uuid` is the episode's, or for a run without recording the name of its scores file. `report_problem` takes a
+    message for an administrator.
     """
 
     uuid: UUID
@@ -48,10 +48,10 @@ _restorers: list[Restorer] = []
 
 
 def register_restorer(function: Restorer) -> Restorer:
-    """Declare the reader of scores and the `trial` of a manifest: an app above this one, from its `ready`.
+    """Register a function that restores rows from scores files and manifests.
 
-    It is given every run once, after the readers before it were, makes the rows that are not there, and returns how
-    many. EvaError says what could not be restored.
+    Apps of higher layers call this in `ready`. The function is called once per run, after earlier restorers, creates
+    missing rows and returns their number. It raises EvaError if a run cannot be restored.
     """
     if function not in _restorers:
         _restorers.append(function)
@@ -64,7 +64,7 @@ _conclusions: list[Conclusion] = []
 
 
 def register_conclusion(function: Conclusion) -> Conclusion:
-    """Declare what says, once all runs were read, what a person should look at: an app above this one."""
+    """Register a function that returns messages for administrators after all runs were read."""
     if function not in _conclusions:
         _conclusions.append(function)
     return function
@@ -72,18 +72,18 @@ def register_conclusion(function: Conclusion) -> Conclusion:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Findings of a reconcile. `problems` are of folders that could not be read; nothing is done to those."""
+    """Result of a reconcile. `problems` concern folders that could not be read, which are left unchanged."""
 
-    episodes: int  # folders that were read
-    made: int  # rows that were not there
-    missing: int  # rows whose folder is not on this disk
-    published: int  # rows that are in a dataset
-    restored: int  # trials and verdicts that were not in the database
+    episodes: int  # folders read
+    made: int  # rows created
+    missing: int  # rows without a folder on this disk
+    published: int  # rows with an episode in a dataset
+    restored: int  # restored trials and scores
     problems: tuple[str, ...]
 
 
 def reconcile() -> Report:
-    """Read every episode and every dataset of the data folder into the database."""
+    """Synchronise the database with every episode and dataset of the data folder."""
     before = set(Episode.objects.values_list("uuid", flat=True))
     found, problems = _folders()
     read = []
@@ -111,7 +111,7 @@ def reconcile() -> Report:
 
 
 def taken_in(uuid: UUID | str) -> list[str]:
-    """Read one episode that has come to the disk, or what was said of it, into the database; what is wrong with it."""
+    """Read one newly arrived episode or label into the database; return the problems."""
     uuid, problems = UUID(str(uuid)), list[str]()
     if problem := services.sync_problem(uuid):
         return [problem]
@@ -121,16 +121,16 @@ def taken_in(uuid: UUID | str) -> list[str]:
 
 
 def _folders() -> tuple[list[UUID], list[str]]:
-    """The episodes that there are, and what else lies there."""
+    """Return the uuids of the existing episode folders, and messages about other content."""
     root, problems = episodes_dir(), list[str]()
-    # Folders with a dot are of what is on its way from other computers, or on its way out.
+    # Folders with a leading dot are incoming from other computers, or being removed.
     named = (path for path in root.iterdir() if not path.name.startswith(".")) if root.is_dir() else ()
     there = (path for path in named if path.is_dir())
     return sorted(_uuids_from_names(there, "", "no episode", problems)), problems
 
 
 def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
-    """What they are named by: a uuid as this program writes it, or it would not be found again."""
+    """Return the uuids in file names; other names are reported, because the file would not be found again."""
     found = set()
     for path in sorted(paths):
         try:
@@ -145,7 +145,7 @@ def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, proble
 
 
 def _restored(read: Sequence[UUID], problems: list[str]) -> int:
-    """Give every run to its readers, one reader after the other; what cannot be restored is added to `problems`."""
+    """Pass every run to all restorers in order and return the number of restored rows."""
     files = {
         folder: _uuids_from_names(
             (data_dir() / folder).glob("*.jsonl"), ".jsonl", f"no file of {folder}", problems

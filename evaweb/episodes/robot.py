@@ -1,4 +1,4 @@
-"""The robot of an episode, in the groups that it had then."""
+"""Robot of an episode, with the groups recorded at the time."""
 
 from __future__ import annotations
 
@@ -25,26 +25,29 @@ _JOINTS_HAVE_OTHER_NAMES_ANOTHER = Pattern(
 
 
 def robot_of_manifest(manifest: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Robot of a manifest; {} where it names none."""
+    """Return the robot entry of a manifest; {} if it has none."""
     robot = manifest.get("robot")
     return robot if isinstance(robot, Mapping) else {}
 
 
 def groups_of_manifest(manifest: Mapping[str, Any]) -> tuple[str, ...] | None:
-    """The groups that the recorded joints are in; None where their names were not recorded."""
+    """Return the groups of the recorded joints; None if joint names were not recorded."""
     names = robot_of_manifest(manifest).get("joint_names")
     return groups_of(map(str, names)) if isinstance(names, list) and names else None
 
 
 def drawn_robot_for(manifest: Mapping[str, Any]) -> DrawnRobot:
-    """The robot as it is described today; NotFound where it is not, or has other joints than were recorded."""
+    """Return the robot for drawing, by its present description.
+
+    Raises: NotFound if it is not described any more, or its joints differ from the recorded ones.
+    """
     looks = drawn_robot(str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest))
     _require_same(looks.robot, manifest)
     return looks
 
 
 def robot_for(manifest: Mapping[str, Any]) -> robots.Robot:
-    """The same without its looks, where nothing is drawn."""
+    """Return the robot's present description, without its scene. Raises: NotFound as `drawn_robot_for`."""
     name, groups = str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest)
     if name not in robots.robot_names():
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.robot_names())))

@@ -1,4 +1,4 @@
-"""Reads of episodes."""
+"""Queries on episodes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _EPISODE_DOES_NOT_EXIST_THIS = Pattern(
     "episode {uuid} does not exist in this lab",
 )
 
-# What a page says of an episode beside its own facts; trial, standing and demonstration are bound to it from above.
+# Related rows on an episode's page; trial, standing and demonstration are defined by higher apps.
 _WITH = (
     "station",
     "trial__scene",
@@ -42,7 +42,7 @@ _WITH = (
     "demonstration",
 )
 
-# What the list can be narrowed to, each with its words.
+# Filters of the list: label and condition.
 _ALL = ("all", Q())
 QUALITY = {
     "clean": ("clean", Q(standing__clean=True)),
@@ -59,19 +59,19 @@ REVIEW = {
 
 @dataclass(frozen=True, slots=True)
 class PlaybackStage:
-    """Stage of an episode on its way to be played: recording, elsewhere, preparing, ready, failed, empty or missing."""
+    """Stage of an episode's playback: recording, elsewhere, preparing, ready, failed, empty or missing."""
 
     name: str
     sentence: str = ""
 
     @property
     def is_transient(self) -> bool:
-        """True if it changes by itself, so that a page looks again."""
+        """Whether the stage changes without user action, so that a page polls."""
         return self.name in ("recording", "elsewhere", "preparing")
 
 
 def episode_get(*, uuid: UUID) -> Episode:
-    """The episode with what a page says of it; NotFound where it is not in the database."""
+    """Return the episode with the related rows of its page. Raises: NotFound."""
     found = Episode.objects.select_related(*_WITH).filter(uuid=uuid).first()
     if found is None:
         raise NotFound(_EPISODE_DOES_NOT_EXIST_THIS(uuid=uuid))
@@ -89,11 +89,11 @@ def episode_list(
     words: str = "",
     sight: Visibility = FULL_VISIBILITY,
 ) -> QuerySet[Episode]:
-    """The newest first; `words` are looked for in task, checkpoint, operator, scene, code and uuid.
+    """Return the episodes, newest first; `words` are searched in task, checkpoint, operator, scene, code and uuid.
 
-    In the names of checkpoints, tags and verdicts only as far as `sight` does not hide them.
-
-    `quality` is a key of QUALITY, `review` one of REVIEW; others choose nothing. EvaError: too many words.
+    Names of checkpoints, tags and review verdicts match only if `sight` does not hide them.
+    `quality` is a key of QUALITY, `review` one of REVIEW; other values have no effect.
+    Raises: EvaError for too many words.
     """
     newest = (F("started_at").desc(nulls_last=True), "-created_at")
     found = Episode.objects.select_related(*_WITH).prefetch_related("tags").order_by(*newest)
@@ -126,19 +126,19 @@ def episode_list(
 
 
 def tag_counts(*, sight: Visibility = FULL_VISIBILITY) -> dict[str, int]:
-    """The lab's tags in the order of the alphabet, and how many episodes have each."""
+    """Return the lab's tags in alphabetical order with the number of episodes of each."""
     seen = ~Q(episode__checkpoint__in=sight.names) & ~Q(episode__trial__checkpoint__in=sight.checkpoints)
     rows = Tag.objects.filter(_by_someone(seen, "by", sight)).order_by("words").values_list("words")
     return {words: n for words, n in rows.annotate(n=Count("pk")) if not sight.named_in(words)}
 
 
 def _by_someone(seen: Q, author: str, sight: Visibility) -> Q:
-    """What somebody said of an episode that is not hidden, or this user of any."""
+    """Return the condition for opinions that this user may see: on visible episodes, or their own."""
     return Q() if sight.sees_everything else seen | Q(**{author: sight.user})
 
 
 def playback_stage(*, episode: Episode) -> PlaybackStage:
-    """Stage of the episode, from its row, the disk and its newest job."""
+    """Return the playback stage, from row, disk and the newest preview job."""
     if preview_folder(episode.uuid).is_dir() and episode.status != EpisodeStatus.RECORDING:
         return PlaybackStage("ready")
     if episode.status == EpisodeStatus.RECORDING:
@@ -162,7 +162,7 @@ def playback_stage(*, episode: Episode) -> PlaybackStage:
 
 
 def why_unrecorded(*, episode: Episode | None) -> str:
-    """Why there is no evidence that a run ever moved anything, not one recorded row; "" where there is."""
+    """Return why there is no evidence that a run moved anything (no recorded row); "" if there is."""
     if episode is None:
         return "nothing of its run was recorded"
     if episode.frames:
@@ -179,7 +179,7 @@ def why_unrecorded(*, episode: Episode | None) -> str:
 
 
 def _rows_written(folder: Path) -> int:
-    """Rows on the disk of an episode that is not closed yet; 0 where its files cannot be read."""
+    """Return the number of rows on disk of an open episode; 0 if its files cannot be read."""
     try:
         layout = Layout.from_manifest(read_json(folder / "manifest.json"))
         return int(read_table(folder / "rows.arrow", rows_schema(layout)).table.num_rows)
@@ -202,17 +202,17 @@ def _preparing(job: Job | None) -> PlaybackStage:
 
 
 def unscored_for(*, episode: Episode, sight: Visibility) -> bool:
-    """True if the user is to score the trial in this recording before hearing how it went."""
+    """Return True if the user is to score the trial of this recording before learning its outcome."""
     return sight.hides_episode(episode) and not getattr(trial_of(episode=episode), "verdict_id", None)
 
 
 def milestones_of(*, episode: Episode) -> list[tuple[float, str]]:
-    """When each milestone was reached [s after the start of the run], by the score that counts; [] without one."""
+    """Return when each milestone was reached [s after the start of the run], by the current score; [] without one."""
     verdict = getattr(trial_of(episode=episode), "verdict", None)
     outcomes = verdict.outcomes.exclude(at_s=None) if verdict is not None else ()
     return [(outcome.at_s, outcome.text) for outcome in outcomes if outcome.reached]
 
 
 def trial_of(*, episode: Episode) -> Any:
-    """The trial that was recorded in it, None where there is none."""
+    """Return the trial of the recording, None if there is none."""
     return getattr(episode, "trial", None)

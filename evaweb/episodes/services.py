@@ -1,4 +1,4 @@
-"""Changes to the rows of episodes; their folders are the authority, and reconcile makes rows of them."""
+"""Services that write the rows of episodes; the folders are authoritative, and reconcile derives rows from them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ANOTHERS = Pattern(
     "episode {uuid} is of {owner}: {station} says nothing of it",
 )
 
-APPEARS_WITHIN = timedelta(seconds=60)  # the folder of an episode that was announced
+APPEARS_WITHIN = timedelta(seconds=60)  # time until the folder of an announced episode appears
 
 
 @transaction.atomic
@@ -51,7 +51,7 @@ def record_opened(
     checkpoint: str = "",
     operator: str = "",
 ) -> Episode:
-    """The station has begun to record; the row that is there already stays as it is."""
+    """Create the row of an episode that the station has begun to record; an existing row is unchanged."""
     episode, _ = Episode.objects.get_or_create(
         uuid=_uuid(uuid),
         defaults={
@@ -70,17 +70,17 @@ def record_opened(
 
 
 def _require_own(station: Station, uuid: UUID) -> None:
-    """A station on another computer is believed of its own episodes alone, whatever its key or computer came to."""
+    """Raise Conflict for another station's episode: a compromised computer may affect only its own."""
     other = Episode.objects.exclude(station=station).select_related("station").filter(uuid=uuid).first()
     if other is not None:
         raise Conflict(_ANOTHERS(uuid=uuid, owner=other.station.name, station=station.name))
 
 
 def record_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
-    """The station says that an episode is on disk: read it there, and ask for its preview.
+    """Read an episode that the station reports as closed, and queue its preview.
 
-    `data` is that of the runtime's event: uuid, status, reason, rows, error, waits. Where the folder is not on this
-    machine, or damaged, the event's own words are kept. EvaError where it names no episode, or another station's.
+    `data` of the runtime's event: uuid, status, reason, rows, error, waits. If the folder is not on this machine or
+    damaged, the values of the event are stored. Raises: EvaError for an invalid uuid, or another station's episode.
     """
     uuid = _uuid(data.get("uuid"))
     _require_own(station, uuid)
@@ -109,7 +109,7 @@ def record_closed(*, station: Station, data: Mapping[str, Any]) -> Episode:
 
 @transaction.atomic
 def forget_unopened(*, station: Station, uuid: UUID | str) -> None:
-    """Forget an episode that was announced and could not be opened; one that has a folder, or a trial, stays."""
+    """Delete the row of an announced episode that could not be opened, unless it has a folder or a trial."""
     announced = station.episodes.filter(uuid=_uuid(uuid), status=EpisodeStatus.RECORDING, trial=None)
     if not journal_folder(_uuid(uuid)).exists():
         announced.delete()
@@ -117,7 +117,7 @@ def forget_unopened(*, station: Station, uuid: UUID | str) -> None:
 
 @transaction.atomic
 def create_missing_episode(*, station: Station, uuid: UUID, **facts: Any) -> Episode:
-    """The row of an episode that others still know of, although its folder is gone."""
+    """Create the row of an episode that other records refer to although its folder is gone."""
     episode, _ = Episode.objects.get_or_create(
         uuid=uuid,
         defaults={"station": station, "robot": station.robot, "status": EpisodeStatus.MISSING, **facts},
@@ -127,10 +127,10 @@ def create_missing_episode(*, station: Station, uuid: UUID, **facts: Any) -> Epi
 
 @transaction.atomic
 def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
-    """Make the row say what the folder says, and ask for a preview where there is something to play.
+    """Update the row from the folder, and queue a preview if there is something to play.
 
-    RecordingError where the folder is absent or damaged, or is not that of the recording that was closed: then the row
-    stays as it is, and is verified next.
+    Raises: RecordingError if the folder is absent or damaged, or is not that of the closed recording; the row is
+    unchanged then, and verified next.
     """
     recorded = read_recorded_episode(journal_folder(uuid))
     row = Episode.objects.filter(uuid=uuid, status__in=CLOSED).first()
@@ -150,15 +150,15 @@ def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
     if episode.status in CLOSED and episode.frames and episode.cameras and episode.previewed_at is None:
         request_preview(episode=episode)
     if episode.smoothness is None and episode.smoothness_detail is not None:
-        episode.smoothness_detail = None  # what the folder lacked may be there now
+        episode.smoothness_detail = None  # measure again: missing files may be there now
         episode.save(update_fields=["smoothness_detail"])
     return episode
 
 
 def outcome_change(row: Episode, seal: str | None) -> str:
-    """Change of the outcome of a closed row, in words that follow its name; "" where it is the same.
+    """Return how the outcome of a closed episode has changed, to follow its name; "" if unchanged.
 
-    `seal` is that of the one that is there now: None where there is none, "" where it has none.
+    `seal` is that of the present outcome: None if there is none, "" if it has no seal.
     """
     if seal is None:
         return f"is absent, though the recording was closed as {row.status}"
@@ -168,45 +168,45 @@ def outcome_change(row: Episode, seal: str | None) -> str:
 
 
 def trial_changed(*, uuid: UUID) -> None:
-    """Mark the episode's trial as changed, where it has one: what is shown of it has."""
+    """Mark the episode's trial as changed, because displayed data of the episode has changed."""
     trials: Any = Episode._meta.get_field("trial").related_model
     trials._default_manager.filter(episode=uuid).update(changed_at=Now())
 
 
 def request_preview(*, episode: Episode) -> Job:
-    """Have the worker make what a browser can play."""
+    """Queue the preview of an episode."""
     return enqueue(kind="preview", key=f"preview:{episode.uuid}", args={"uuid": str(episode.uuid)})
 
 
 def storing_asked(*, uuid: UUID) -> Job:
-    """Have the worker put the videos of its preview into the lab's store."""
+    """Queue the transfer of an episode's preview videos to the lab's store."""
     return enqueue(kind="store", key=f"store:{uuid}", args={"uuid": str(uuid)})
 
 
 def request_export(*, episode: Episode) -> Job:
-    """Have the worker write its three streams as one table; it leaves one alone that is there."""
+    """Queue the export of the three action streams as one table; an existing table is kept."""
     return enqueue(kind="export", key=job_key(episode.uuid), args={"uuid": str(episode.uuid)})
 
 
 def request_smoothness(*, most: int) -> int:
-    """Have the worker measure closed runs not yet asked for, at most so many; how many."""
+    """Queue the measurement of at most `most` closed runs not yet requested; return their number."""
     rows = Episode.objects.filter(
         status__in=CLOSED, kind="rollout", frames__gt=0, smoothness_detail__isnull=True
     )
     found = list(rows.filter(away_since=None).order_by("created_at")[:most])
     for episode in found:
         with transaction.atomic():
-            # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.
+            # Requested once, whatever its outcome: a failed job remains visible and can be retried.
             Episode.objects.filter(pk=episode.pk).update(smoothness_detail={})
             enqueue(kind="smoothness", key=f"smoothness:{episode.uuid}", args={"uuid": str(episode.uuid)})
     return len(found)
 
 
 def request_publish(*, episode: Episode, version: str = "") -> Job | None:
-    """Have the worker write the episode into its dataset, or write it anew with the score that counts now.
+    """Queue the publication of an episode, again with the current score if it is published.
 
-    `version` is that of a dataset that is new, "" for the usual one. None for a run with a simulated robot, which
-    no dataset ever holds.
+    `version` is that of a new dataset, "" for the default. Returns None for a run with a simulated robot, which is
+    never published.
     """
     if episode.mode == EpisodeMode.SIM:
         return None
@@ -215,7 +215,7 @@ def request_publish(*, episode: Episode, version: str = "") -> Job | None:
 
 
 def close_unheard_episodes() -> int:
-    """Close rows of recordings that were closed unheard, as repair does; how many."""
+    """Close rows whose recordings were closed without an event, as by repair; return their number."""
     closed = 0
     for uuid in Episode.objects.filter(status=EpisodeStatus.RECORDING).values_list("uuid", flat=True):
         if (journal_folder(uuid) / "outcome.json").exists():
@@ -224,10 +224,10 @@ def close_unheard_episodes() -> int:
 
 
 def mark_missing() -> int:
-    """Say of every row whose folder is gone that it is missing; how many there are now."""
+    """Mark every row without a folder as missing; return the total number of missing ones."""
     fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
     known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
-    # One that is recorded elsewhere is on that computer until it is closed, and on its way then.
+    # A recording on another computer is there until it is closed, and then in transfer.
     elsewhere = StationKey.objects.filter(withdrawn_at=None).values("station")
     known = known.exclude(status=EpisodeStatus.RECORDING, station__in=elsewhere)
     for uuid in known.values_list("uuid", flat=True):
@@ -237,7 +237,7 @@ def mark_missing() -> int:
 
 
 def request_exports(*, uuids: Iterable[UUID]) -> int:
-    """Have the worker export those that their station has not; how many. A damaged one has no table."""
+    """Queue the export of episodes without a table; return their number. Damaged ones are skipped."""
     asked = 0
     for episode in Episode.objects.filter(uuid__in=list(uuids), status__in=CLOSED):
         try:
@@ -252,7 +252,7 @@ def request_exports(*, uuids: Iterable[UUID]) -> int:
 
 
 def sync_problem(uuid: UUID) -> str:
-    """Read one folder into its row; the sentence that says why that cannot be, "" where it could."""
+    """Update a row from its folder; return the problem as a message, "" on success."""
     try:
         sync_episode(uuid=uuid)
     except RecordingError as error:
@@ -269,20 +269,20 @@ def _previewed_at(uuid: UUID) -> datetime | None:
 
 
 def _station_of(recorded: RecordedEpisode) -> Station:
-    """The station it was recorded at; one that is not known any more is known from it again."""
+    """Return the station of a recording; create it if it is not in the database."""
     return get_or_create_station(
         name=recorded.station or "unknown",
         robot=recorded.facts.get("robot", ""),
         simulated=recorded.simulated,
         source=f"episode {recorded.uuid}",
-        active=recorded.facts["kind"] != IMPORTED,  # of those there is no bench
+        active=recorded.facts["kind"] != IMPORTED,  # imported episodes have no actual station
     )
 
 
 def get_or_create_station(
     *, name: str, robot: str, simulated: bool, source: str, active: bool = True
 ) -> Station:
-    """The station of that name; one that is not in the database any more is made from what `source` says."""
+    """Return the station of that name; create it with the given values, known from `source`."""
     station, made = Station.objects.get_or_create(
         name=name, defaults={"robot": robot, "simulated": simulated, "title": name, "active": active}
     )
@@ -292,7 +292,7 @@ def get_or_create_station(
 
 
 def station_elsewhere(station: Station) -> bool:
-    """True if it runs on a computer of its own, from where its episodes have to come."""
+    """Return True if the station runs on another computer, from which its episodes are transferred."""
     return StationKey.objects.filter(station=station, withdrawn_at=None).exists()
 
 

@@ -1,4 +1,4 @@
-"""Small pictures of a whole episode, one sheet per camera: pages show where a pointer on the time axis leads."""
+"""Sheets of small images of a whole episode, one per camera, which pages show along the time axis."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from runtime.recording.files import RecordingError
 
 MOST = 100  # tiles
 ACROSS = 10
-WIDTH = 160  # of a tile [px]
+WIDTH = 160  # width of a tile [px]
 QUALITY = 70
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Tile k, row by row, shows the rows from k * `every` on; `across` and `down` tiles."""
+    """Layout of a sheet: tile k, row by row, covers rows from k * `every` on; `across` x `down` tiles."""
 
     every: int
     across: int
@@ -29,16 +29,16 @@ class Grid:
 
     @classmethod
     def of(cls, frames: int) -> Grid:
-        """Grid of an episode with so many rows."""
+        """Return the grid of an episode with `frames` rows."""
         every = max(1, ceil(frames / MOST))
         tiles = ceil(frames / every)
         return cls(every, min(tiles, ACROSS), ceil(tiles / ACROSS))
 
 
 def sheet(video: Path, frames: int, shown: int) -> bytes:
-    """The sheet of a camera as a JPEG; `shown` of the `frames` rows have a picture, tiles of the others are black.
+    """Return the sheet of a camera as a JPEG; `shown` of the `frames` rows have an image, other tiles are black.
 
-    So is one whose picture does not decode: the video is played all the same. RecordingError where none of it can be.
+    A tile whose image cannot be decoded is black too. Raises: RecordingError if the video cannot be read at all.
     """
     grid = Grid.of(frames)
     with VideoFrames(video) as pictures:

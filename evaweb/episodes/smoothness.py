@@ -1,9 +1,9 @@
-"""Smoothness of the arms in a run: SPARC of the speed of each end effector, as measured and as it was sent.
+"""Smoothness of the arms in a run: SPARC of the speed of each end effector, measured and commanded.
 
-The speed of the hand is what SPARC was made for (Balasubramanian et al. 2015), and it means the same for robots with
-other joints. Positions follow from the joints by the robot's description, while something was asked for: a robot
-that is held for its operator is not jerky. The measured one counts, at the times of its capture; the sent one,
-beside it, is free of the sensors' noise and of what the robot's own controller smooths.
+SPARC was made for the speed of a hand (Balasubramanian et al. 2015), and is comparable between robots with different
+joints. Positions are computed from the joints by the robot's description, while the robot was asked to move: a robot
+held for its operator is not jerky. The measured value counts, at capture times; the commanded one is free of sensor
+noise and of smoothing by the robot's own controller.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ from runtime.recording.reader import Episode, open_episode
 from runtime.recording.scrub import require_intact
 from runtime.recording.summary import HELD
 
-LEAST_M = 0.02  # an arm that stays within it did not move: its speed is the noise of its sensors
+LEAST_M = 0.02  # least extent of motion; below it the speed is sensor noise
 Array = NDArray[np.float64]
 _STREAMS = ("measured", "commanded")
 _FILES = ("manifest.json", "rows.arrow", "ticks.arrow")
-_LEAST_RATE = 0.95 * 2 * CUT_OFF  # of observations [1/s]; a lost one now and then is none of these
+_LEAST_RATE = 0.95 * 2 * CUT_OFF  # least rate of observations [1/s]; tolerates occasional losses
 
 
 @dataclass(frozen=True, slots=True)
 class Smoothness:
-    """Of a run: the mean over its arms, each as heavy as its way is long; None with `why` where there is none.
+    """Smoothness of a run: mean over its arms weighted by path length; None, with `why`, if unknown.
 
-    `arms`: name -> {"measured", "commanded": SPARC or null, "measured_m", "commanded_m": the way}, those that moved.
+    `arms` of those that moved: name -> {"measured", "commanded": SPARC or None, "measured_m", "commanded_m": path
+    length [m]}.
     """
 
     measured: float | None
@@ -47,13 +48,13 @@ class Smoothness:
 
 
 def smoothness_in(folder: Path) -> Smoothness:
-    """That of a recording; RecordingError names the file that is absent or damaged."""
+    """Return the smoothness of a recording. Raises: RecordingError, which names the absent or damaged file."""
     require_intact(folder, _FILES)
     return smoothness_of(open_episode(folder))
 
 
 def smoothness_of(episode: Episode) -> Smoothness:
-    """The same of an episode that is open already."""
+    """Return the smoothness of an open episode."""
     try:
         robot = robot_for(episode.manifest)
     except NotFound as error:
@@ -96,7 +97,7 @@ def _none(why: str) -> Smoothness:
 
 @dataclass(frozen=True, slots=True)
 class _Samples:
-    """Joints [N, D] at `times` [N] in s, and whether something was asked for then; NaN where nothing is known."""
+    """Joints [N, D] at `times` [N] in s, NaN if unknown, and whether the robot was asked to move."""
 
     times: Array
     joints: Array
@@ -105,9 +106,9 @@ class _Samples:
 
 @dataclass(frozen=True, slots=True)
 class _TipTrack:
-    """Positions of all end effectors [steps, arms, 3] at the control rate, one span for each stretch without a pause.
+    """Positions of all end effectors [steps, arms, 3] at the control rate, one span per uninterrupted motion.
 
-    What was not sampled lies on the straight line between what was; `seen`: samples a second, None for none.
+    Linearly interpolated between samples; `seen`: samples per second, None without samples.
     """
 
     spans: tuple[Array, ...]
@@ -115,18 +116,18 @@ class _TipTrack:
 
 
 def _measured(episode: Episode) -> _Samples:
-    """Joint positions from the robot, at their capture: a tick sees the newest, of whatever age that is."""
+    """Return the joints measured by the robot at their capture times; a tick has the newest sample of any age."""
     rows, name = episode.rows, "capture_time.joints"
     ticked = rows.column("tick_time").to_numpy()
     told = rows.column(name).to_numpy(zero_copy_only=False) if name in rows.column_names else ticked
     times = np.asarray(told if np.isfinite(told.astype(float)).any() else ticked, np.float64)
     joints = vectors(rows, "qpos", episode.layout.dim).T.astype(np.float64)
-    joints[np.diff(rows.column("sequence").to_numpy(), prepend=-1) == 0] = np.nan  # seen before
+    joints[np.diff(rows.column("sequence").to_numpy(), prepend=-1) == 0] = np.nan  # repeated sample
     return _Samples(times, joints, _asked(rows))
 
 
 def _commanded(episode: Episode, rate: float) -> _Samples:
-    """Joint positions as they were sent, at the control steps that they were sent for."""
+    """Return the commanded joints at the times of their control steps."""
     ticks = episode.ticks
     joints = vectors(ticks, "executed", episode.layout.dim).T.astype(np.float64)
     return _Samples(ticks.column("step").to_numpy() / rate, joints, _asked(ticks))
@@ -156,7 +157,7 @@ def _tip_track(samples: _Samples, rate: float, forward: ChainForward) -> _TipTra
 
 
 def _path_lengths(spans: Sequence[Array], arm: int) -> Array:
-    """Distance that the arm's end effector went in each step [m]; empty where it did not move."""
+    """Return the distance that the arm's end effector moved in each step [m]; empty if it did not move."""
     if not spans:
         return np.empty(0)
     places = np.concatenate([span[:, arm] for span in spans])
@@ -168,7 +169,7 @@ def _path_lengths(spans: Sequence[Array], arm: int) -> Array:
 def _sparc(way: Array, rate: float) -> float | None:
     try:
         return sparc(way.tolist(), rate)
-    except StatisticsError:  # it did not move, or not for long enough
+    except StatisticsError:  # no motion, or too short
         return None
 
 

@@ -1,6 +1,6 @@
-"""Sends a file over ASGI in pieces, so that seeking in a video works and memory stays small.
+"""File responses over ASGI in pieces, with ranges for seeking in videos and small memory use.
 
-Django's FileResponse knows no Range, and under ASGI reads a whole file into memory.
+Django's FileResponse does not support ranges, and under ASGI reads a whole file into memory.
 """
 
 from __future__ import annotations
@@ -24,18 +24,17 @@ _THIS_EPISODE_NOT_ON_THIS = Pattern(
 )
 
 PIECE = 256 * 1024
-# Daphne takes all that we have, however slow the client; a browser asks for the rest of a video by itself
-# (section 15.3.7 of RFC 9110 lets a server send less than was asked for).
+# Daphne buffers everything it gets, however slow the client; a browser requests further parts of a video itself
+# (section 15.3.7 of RFC 9110 lets a server send less than requested).
 LONGEST_PART = 2 * 1024 * 1024
 
 
 async def file_answer(
     request: HttpRequest, path: Path, content_type: str, name: str = ""
 ) -> HttpResponseBase:
-    """The file, the part of it that is asked for, or that the client has it already.
+    """Return the file, the requested range of it, or status 304.
 
-    With a `name` it is one to keep, not one to show. NotFound where there is none. Neither `path` nor `name`
-    comes from the client.
+    With a `name` it is a download. Neither `path` nor `name` may come from the client. Raises: NotFound if absent.
     """
     if request.method not in ("GET", "HEAD"):
         return HttpResponseNotAllowed(["GET", "HEAD"])
@@ -68,7 +67,7 @@ def _answer(
     if not_modified(headers.get("If-None-Match"), headers.get("If-Modified-Since"), validators):
         return HttpResponse(status=304, headers=common)
     span = None
-    # Section 14.2: ranges are defined for GET alone.
+    # Section 14.2: ranges are defined only for GET.
     if request.method == "GET" and range_holds(headers.get("If-Range"), validators):
         try:
             span = span_asked(headers.get("Range"), stat.st_size)
@@ -96,7 +95,9 @@ async def _pieces(file: BinaryIO, span: Span) -> AsyncIterator[bytes]:
         while left:
             data = await asyncio.to_thread(os.pread, file.fileno(), min(PIECE, left), offset)
             if not data:
-                raise OSError(f"{file.name} ended {left} bytes early")  # cuts the connection: no short answer
+                raise OSError(
+                    f"{file.name} ended {left} bytes early"
+                )  # breaks the connection, so that the client notices
             left -= len(data)
             offset += len(data)
             yield data

@@ -1,4 +1,4 @@
-"""Addresses of the pages of episodes, and of the files they play."""
+"""URLs of the pages of episodes and their media."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings verified at leisure: a few at a time, those first that were not looked at for longest, round and round."""
+"""Periodic verification of recordings in small portions, those verified longest ago first."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from runtime.recording.verdict import Damage, IntegrityCheck
 log = logging.getLogger(__name__)
 
 AGAIN_AFTER = timedelta(days=30)
-OLD_AFTER = timedelta(hours=1)  # what was just recorded is verified when it is published
+OLD_AFTER = timedelta(hours=1)  # a new recording is verified at its publication
 LATE_AFTER = timedelta(days=1)
-MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # of one job: whatever is asked for meanwhile waits for its end
+MOST_EPISODES, MOST_BYTES = 100, 1 << 30  # limits per job, because other jobs wait meanwhile
 
 
 def request_scrub() -> Job | None:
-    """Have the worker verify what is due, once it has nothing else to do."""
+    """Queue the verification of due recordings if the workers are idle; return the job, else None."""
     at_work = Job.objects.filter(status__in=(JobStatus.QUEUED, JobStatus.RUNNING))
     if at_work.exists() or not _due().exists():
         return None
@@ -43,7 +43,7 @@ def request_scrub() -> Job | None:
 
 
 def scrub_due(work: JobContext) -> Mapping[str, Any]:
-    """Verify the next that are due, and remember each at once; what was found of how many."""
+    """Verify the next due recordings and store each result immediately; return the counts."""
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
     for uuid in _next():
@@ -63,7 +63,7 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
 
 
 def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
-    """Keep what was found of an episode of this lab, on the disk and in its row; as it then stands."""
+    """Store the result of a verification on disk and in the row; return it with changes known from the row."""
     row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
     verdict = compare_with_row(row, verdict) if row else verdict
     if verdict.state == "damaged":
@@ -80,7 +80,7 @@ def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
 
 
 def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
-    """A closed recording that lost its outcome, or has another one than that with which it was closed, is damaged."""
+    """Return the result as damaged if a closed recording lost its outcome, or has another one."""
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
     why = outcome_change(row, None if verdict.state == "open" else verdict.seal)
@@ -90,7 +90,7 @@ def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
 
 
 def _verify_folder(folder: Path) -> IntegrityCheck:
-    """A folder that has nothing left by which it is an episode is that of a closed one all the same."""
+    """Verify a folder; one that lacks manifest and outcome is damaged, because it belonged to a closed episode."""
     lost = [Damage(name, "is absent") for name in (MANIFEST, OUTCOME) if not (folder / name).exists()]
     if folder.is_dir() and len(lost) == 2 and not (folder / OUTCOME_COPY).exists():
         return IntegrityCheck(folder, "damaged", tuple(lost))
@@ -98,7 +98,7 @@ def _verify_folder(folder: Path) -> IntegrityCheck:
 
 
 def unverified() -> tuple[int, int]:
-    """Recordings that are damaged, and closed ones that were due to be verified more than a day ago."""
+    """Return the numbers of damaged recordings, and of closed ones overdue for verification by a day."""
     late = timezone.now() - LATE_AFTER
     never = Q(verified_at=None, created_at__lt=late - OLD_AFTER)
     closed = Episode.objects.filter(status__in=CLOSED, away_since=None)

@@ -1,4 +1,4 @@
-"""Videos of Replay in their two places: the folder of the preview, or the lab's store, by their digests."""
+"""Videos of Replay in their two places: preview folder, or the lab's store by digest."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaweb.object_stores import StoreError, compared, required_store, the_cache
 from runtime.core.sentences import Pattern
 from runtime.recording.files import write_atomic
 
-INDEX = "stored.json"  # in the folder of a preview: the digest of each camera's video
+INDEX = "stored.json"  # file in a preview folder with the digest of each camera's video
 TYPE = "video/mp4"
 _NO_INDEX = Pattern(
     "episodes.videos.no_index",
@@ -20,15 +20,15 @@ _NO_INDEX = Pattern(
 
 
 def video_address(uuid: UUID, camera: str) -> str:
-    """A signed address of a video that is in the store, good for five minutes; "" where we send it ourselves."""
+    """Return a signed URL of a stored video, valid for five minutes; "" if this process serves it itself."""
     digest = "" if preview_video(uuid, camera).is_file() else _stored(uuid).get(camera, "")
     return required_store().address(digest) if digest else ""
 
 
 def video_file(uuid: UUID, camera: str) -> Path:
-    """The video as a file, brought from the store where it is there; a path of no file where there is none.
+    """Return the video as a local file, fetched from the store if needed; a nonexistent path if there is none.
 
-    StoreError where the store does not give it.
+    Raises: StoreError if the store does not deliver it.
     """
     path = preview_video(uuid, camera)
     digest = "" if path.is_file() else _stored(uuid).get(camera, "")
@@ -36,7 +36,10 @@ def video_file(uuid: UUID, camera: str) -> Path:
 
 
 def put_videos(uuid: UUID) -> int:
-    """Put the videos of a preview into the store, read them back, then remove them here; how many. StoreError."""
+    """Copy the videos of a preview to the store, verify them, then delete the local ones; return their number.
+
+    Raises: StoreError.
+    """
     store = required_store()
     videos = sorted(preview_folder(uuid).glob("*.mp4"))
     found = {path.stem: store.put(path, TYPE) for path in videos}
@@ -52,7 +55,7 @@ def put_videos(uuid: UUID) -> int:
 
 
 def unstored() -> list[UUID]:
-    """Previews with videos that are not in the store; none where there is no store."""
+    """Return the previews with videos that are not in the store; [] without a store."""
     if the_store() is None:
         return []
     found = []

@@ -1,4 +1,4 @@
-"""Pages that play episodes, and the files they play."""
+"""Pages that play episodes, and the media they use."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ PER_PAGE = 50
 
 @require_GET
 def replay_list(request: HttpRequest) -> HttpResponseBase:
-    """All episodes, the newest first unless they are sorted in another way."""
+    """Show all episodes, by default newest first."""
     sight = visibility_for_request(request)
     listing = Listing(request.GET, listed.columns(sight), listed.filters(sight))
     found = selectors.episode_list(**listing.chosen, sight=sight)
@@ -84,7 +84,7 @@ def replay_list(request: HttpRequest) -> HttpResponseBase:
 
 @require_GET
 def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """One episode: cameras, robot and curves on one clock."""
+    """Show one episode: cameras, robot and curves on one clock."""
     episode = episode_get(uuid=uuid)
     stage = selectors.playback_stage(episode=episode)
     context = {
@@ -101,7 +101,7 @@ def replay(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def playback_stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Stage of an episode; tells a page that it can be played now."""
+    """Show the stage of an episode; make the page reload when it is ready."""
     episode = episode_get(uuid=uuid)
     found = selectors.playback_stage(episode=episode)
     answer = render(request, "episodes/stage.html", {"episode": episode, "stage": found})
@@ -111,7 +111,7 @@ def playback_stage(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 
 async def export(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
-    """The three streams as one table; POST has it made where it is not there."""
+    """Return the three action streams as one table; POST queues its creation."""
     episode = await _known(uuid)
     if request.method == "POST":
         return await sync_to_async(_export_asked)(request, episode)
@@ -127,7 +127,7 @@ def _export_asked(request: HttpRequest, episode: Episode) -> HttpResponse:
 
 
 def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """State of the table, as a part of the episode's page that looks again by itself."""
+    """Show the state of the table, as a fragment that polls."""
     episode = episode_get(uuid=uuid)
     context = {"episode": episode, "table": table_of(episode=episode)}
     return render(request, "episodes/table.html", context)
@@ -135,19 +135,19 @@ def table(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_POST
 def preview(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Ask for the videos anew."""
+    """Queue the preview again."""
     require_role(request.user, Role.OPERATOR)
     services.request_preview(episode=episode_get(uuid=uuid))
     return redirect("replay", uuid=uuid)
 
 
 def player() -> dict[str, Any]:
-    """Scripts that every page with a player needs, whatever it plays."""
+    """Return the scripts that every page with a player needs."""
     return {"viewer": static("meshcat/main.min.js"), "uplot": static("uplot/uPlot.esm.js")}
 
 
 def replay_config(episode: Episode) -> dict[str, Any]:
-    """Settings of an episode for the page's modules; a video's first picture is shown at its `start` [s]."""
+    """Return the settings of an episode for the page's modules; a video starts at its `start` [s]."""
     address = {
         name: reverse(f"episode-{name}", args=[episode.uuid])
         for name in ("curves", "geometry", "poses", "bench")
@@ -174,7 +174,7 @@ def replay_config(episode: Episode) -> dict[str, Any]:
 
 
 async def video(request: HttpRequest, uuid: UUID, camera: str) -> HttpResponseBase:
-    """The video of one camera, also in parts; of one that is in the store, where it is for the next five minutes."""
+    """Return the video of one camera, also in ranges; redirect to a signed URL if it is in the store."""
     await _known_camera(uuid, camera)
     if address := await asyncio.to_thread(video_address, uuid, camera):
         return HttpResponseRedirect(address)
@@ -182,13 +182,13 @@ async def video(request: HttpRequest, uuid: UUID, camera: str) -> HttpResponseBa
 
 
 async def sheet(request: HttpRequest, uuid: UUID, camera: str) -> HttpResponseBase:
-    """Small pictures of one camera, in the order of the rows."""
+    """Return the sheet of small images of one camera, in the order of rows."""
     await _known_camera(uuid, camera)
     return await file_answer(request, preview_sheet(uuid, camera), "image/jpeg")
 
 
 async def thumbnail(request: HttpRequest, uuid: UUID) -> HttpResponseBase:
-    """A picture from the middle of the episode."""
+    """Return an image from the middle of the episode."""
     await _known(uuid)
     return await file_answer(request, preview_folder(uuid) / THUMBNAIL, "image/jpeg")
 
@@ -201,7 +201,7 @@ async def _known(uuid: UUID) -> Episode:
 
 
 async def _known_camera(uuid: UUID, camera: str) -> None:
-    """NotFound where the row of the episode does not name it: no other name reaches the disk."""
+    """Raise NotFound unless the episode's row names the camera: no other name reaches the disk."""
     cameras = (await _known(uuid)).cameras
     if camera not in cameras:
         raise NotFound(_EPISODE_HAS_NO_CAMERA_HAS(uuid=uuid, camera=camera, cameras=", ".join(cameras)))
@@ -209,7 +209,7 @@ async def _known_camera(uuid: UUID, camera: str) -> None:
 
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Joint curves and events, as one message of evaweb.binary_frames."""
+    """Return joint curves and events as one message of evaweb.binary_frames."""
     episode, sight = episode_get(uuid=uuid), visibility_for_request(request)
     told = {
         "covered": sight.hides_episode(episode),
@@ -221,7 +221,7 @@ def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Geometry of the robot as it was then, for the 3D scene, as JSON."""
+    """Return the geometry of the robot with the groups recorded, for the 3D scene, as JSON."""
     episode_get(uuid=uuid)
     try:
         manifest = read_json(journal_folder(uuid) / "manifest.json")
@@ -234,14 +234,14 @@ def episode_geometry(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def episode_bench(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Where the things on a simulated bench lay, row by row as that changed, as JSON."""
+    """Return the positions of objects on a simulated bench, at rows where they changed, as JSON."""
     episode_get(uuid=uuid)
     return JsonResponse({"course": _readable(lambda: bench_course(journal_folder(uuid)))})
 
 
 @require_GET
 def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
+    """Return the poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
     episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:

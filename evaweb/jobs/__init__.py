@@ -1,1 +1,1 @@
-"""Work for the worker: rows that are claimed, done and swept."""
+"""Background jobs: rows that workers claim, execute and reclaim."""

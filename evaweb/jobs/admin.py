@@ -1,4 +1,4 @@
-"""Jobs in the admin pages: to look at, and to ask for anew."""
+"""Admin pages of jobs: list, and retry of failed ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evaweb.jobs.models import Job, JobStatus
 
 @admin.register(Job)
 class JobAdmin(admin.ModelAdmin):
-    """Rows are written by services alone."""
+    """Jobs; only services write the rows."""
 
     list_display = (
         "key",

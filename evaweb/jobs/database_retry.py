@@ -1,4 +1,4 @@
-"""Waits for a database that is locked or away."""
+"""Retry of transactions while the database is locked or unreachable."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ WAITS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 5.0, 5.0, 5.0)
 
 
 def retry_while_locked(action: Callable[[], _Result]) -> _Result:
-    """The result of `action`, tried again while the database is locked or away; its error after half a minute.
+    """Return the result of `action`; retry while the database is locked or unreachable, for about 30 s.
 
-    `action` must be a whole transaction, so that nothing of a failed attempt is left.
+    `action` must be a whole transaction, so that a failed attempt leaves nothing behind. Within an open transaction the
+    error is raised at once.
     """
     for wait in WAITS_S:
         try:

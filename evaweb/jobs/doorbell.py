@@ -1,4 +1,4 @@
-"""Tells workers that there is something to do; it may be lost, and nothing else is."""
+"""Notification of workers that a job is waiting; losing one is harmless, because workers also poll."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import logging
 
 log = logging.getLogger(__name__)
 
-TASK = "evaweb.jobs.work"  # by name: what it does asks for jobs itself
+TASK = "evaweb.jobs.work"  # sent by name: the task's module enqueues jobs itself, an import would be circular
 
 
 def notify_workers(queue: str) -> bool:
-    """Tell the broker; False where it did not take it: a worker finds the row when it next looks."""
-    from celery.exceptions import CeleryError  # here, for most programs of a lab never ring
+    """Notify the broker; return False if it did not accept: a worker finds the row at its next poll."""
+    from celery.exceptions import CeleryError  # imported late: most programs never notify
     from kombu.exceptions import KombuError
 
-    from evaweb.celery import app  # which makes the broker's folders
+    from evaweb.celery import app  # importing it creates the broker's folders
 
     try:
         app.send_task(TASK, (queue,), queue=queue, retry=False)

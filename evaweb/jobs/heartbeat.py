@@ -1,4 +1,4 @@
-"""A thread that shows signs of life while something else is at work."""
+"""Thread that sends heartbeats during a job."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Lapse:
-    """`then` is called once no beat has arrived for `after_s` seconds of this machine's clock, or one was refused."""
+    """Action `then` that runs once no heartbeat has reached the database for `after_s` [s], or one was rejected."""
 
     after_s: float
     then: Callable[[], None]
 
 
 class Heartbeat:
-    """Calls `beat` every `period_s` seconds until the block is left, or until it returns False.
+    """Context manager that calls `beat` every `period_s` [s] until the block ends or `beat` returns False.
 
-    It has its own connection to the database. A beat that fails is told to the log and the next one tried:
-    the job goes on until its `lapse`, and is swept where none arrives for too long.
+    It has its own database connection. A failed beat is logged and the next one tried; the job continues until its
+    `lapse`, and is reclaimed by others if no beat arrives for too long.
     """
 
     def __init__(self, beat: Callable[[], bool], period_s: float, lapse: Lapse | None = None) -> None:
@@ -49,7 +49,9 @@ class Heartbeat:
         lapsing = self._lapsing()
         try:
             while not self._over.wait(self._period):
-                later = self._lapsing()  # counted from before the database counts from
+                later = (
+                    self._lapsing()
+                )  # started before the beat, so that it ends before the database's deadline
                 arrived = self._attempt()
                 if arrived is None:
                     later.cancel()
@@ -65,7 +67,7 @@ class Heartbeat:
             connection.close()
 
     def _lapsing(self) -> threading.Timer:
-        """Runs where there is a lapse; whatever hangs here or in the database does not keep it."""
+        """Return a timer that runs the lapse (started if there is one); a hanging database cannot delay it."""
         lapse = self._lapse or Lapse(0.0, lambda: None)
         timer = threading.Timer(lapse.after_s, lapse.then)
         timer.daemon = True
@@ -74,7 +76,7 @@ class Heartbeat:
         return timer
 
     def _attempt(self) -> bool | None:
-        """What the beat returns; None where the database does not answer."""
+        """Return the result of the beat; None if the database does not respond."""
         try:
             return self._beat()
         except (DatabaseError, InterfaceError) as error:

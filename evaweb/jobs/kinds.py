@@ -1,4 +1,4 @@
-"""Kinds of jobs; apps declare theirs in a module `job_kinds`, this one knows none of them."""
+"""Registry of job kinds; apps declare theirs in a module `job_kinds`."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ Args = Mapping[str, Any]
 
 
 class Queue(StrEnum):
-    """What a machine must have to do a job, apart from the lab's data folder."""
+    """Resource that a machine must have for a job, besides the lab's data folder."""
 
-    CPU = "cpu"  # processors, and a disk that is fast enough for recordings
-    GPU = "gpu"  # an accelerator, or a way to the server that has it
-    STATION = "station"  # the deployment files of this lab's stations, and a way to their policy servers
+    CPU = "cpu"  # CPU time, and a disk that is fast enough for recordings
+    GPU = "gpu"  # an accelerator, or access to a server with one
+    STATION = "station"  # the deployment files of this lab's stations, and access to their policy servers
 
 
 @dataclass(frozen=True, slots=True)
 class JobContext:
-    """One job as its kind sees it: what is asked for, and how to say how far it is.
+    """Context of one job for the function of its kind: arguments and progress reports.
 
-    `hold` waits until no other job holds any of these names, and holds them instead of what this one held before.
+    `hold` waits until no other job holds any of the given names, and then holds them instead of its earlier ones.
     """
 
     args: Args
     report_progress: Callable[
         [str], None
-    ]  # at most 160 characters, best "... n of m"; raises TakenOver or Cancelled
-    hold: Callable[[Collection[str]], None] = lambda names: None  # raises as `tell` does
+    ]  # at most 160 characters, ideally "... n of m"; raises TakenOver or Cancelled
+    hold: Callable[[Collection[str]], None] = lambda names: None  # raises TakenOver or Cancelled
 
 
 Kind = Callable[[JobContext], Args]
-Least = Callable[[Args], Role]  # who may ask for such a job
+Least = Callable[[Args], Role]  # lowest role that may request a job with these args
 Chore = Callable[[], object]
 
 
@@ -46,12 +46,12 @@ def _operators(args: Args) -> Role:
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """A kind: what does it, who may ask for it, and what a worker needs for it."""
+    """Declaration of a kind: its function, the role that may request it, and the requirements for a worker."""
 
     does: Kind
     least: Least = _operators
     queue: Queue = Queue.CPU
-    folder: bool = True  # the lab's data folder
+    folder: bool = True  # needs the lab's data folder
 
 
 _kinds: dict[str, Declared] = {}
@@ -60,26 +60,29 @@ _starts: dict[str, Chore] = {}
 
 
 class TakenOver(Exception):
-    """Another worker has the job now: what is under way ends here, and nothing more is written."""
+    """Another worker has the job now: stop, and write nothing more."""
 
 
 class Cancelled(Exception):
-    """Somebody has asked for the end of the job: what is under way ends here."""
+    """A user has cancelled the job: stop."""
 
 
 class UnknownKind(EvaError):
-    """No app of this program does jobs of that kind."""
+    """No app has declared jobs of that kind."""
 
 
 def job_kind(
     name: str, least: Least = _operators, *, queue: Queue = Queue.CPU, folder: bool = True
 ) -> Callable[[Kind], Kind]:
-    """Declare a kind: a function that does it and returns its result as JSON.
+    """Declare a kind: decorate a function that does the job and returns its result as JSON.
 
-    It may be ended at any moment and done again, by several workers at once in the worst case: it must leave
-    the same as if it had been done once. What it raises is the error of the job, and it is tried again.
-    `least` is the role that may ask for one with such args. Workers that take `queue` do it, where there is `folder`
-    only those that have the lab's data folder: recordings, datasets and records are read and written in place.
+    It may be killed at any moment and run again, in the worst case by several workers at once: it must be idempotent.
+    An exception becomes the error of the job, which is retried.
+
+    Args:
+        least: Role that may request a job with the given args.
+        queue: Queue of workers that execute it.
+        folder: Whether it needs the lab's data folder, because it accesses recordings, datasets or records in place.
     """
 
     def declare(function: Kind) -> Kind:
@@ -90,12 +93,12 @@ def job_kind(
 
 
 def least_role(name: str, args: Args) -> Role:
-    """The role that may ask for such a job."""
+    """Return the lowest role that may request such a job."""
     return declared(name).least(args) if name in _kinds else Role.OPERATOR
 
 
 def periodic_task(name: str) -> Callable[[Chore], Chore]:
-    """Declare something cheap that workers of the lab's data folder that take `cpu` look after every few seconds."""
+    """Declare a cheap function that workers with the lab's data folder and queue `cpu` call every few seconds."""
 
     def declare(function: Chore) -> Chore:
         _chores[name] = function
@@ -105,7 +108,7 @@ def periodic_task(name: str) -> Callable[[Chore], Chore]:
 
 
 def startup_task(name: str) -> Callable[[Chore], Chore]:
-    """Declare what workers of the lab's data folder that take `cpu` do once, when they start."""
+    """Declare a function that workers with the lab's data folder and queue `cpu` call once when they start."""
 
     def declare(function: Chore) -> Chore:
         _starts[name] = function
@@ -115,7 +118,7 @@ def startup_task(name: str) -> Callable[[Chore], Chore]:
 
 
 def declared(name: str) -> Declared:
-    """The kind of that name; UnknownKind lists those there are."""
+    """Return the declaration of a kind. Raises: UnknownKind, which lists the declared ones."""
     if name not in _kinds:
         raise UnknownKind(
             f"no job of kind {name!r} is known; there are {', '.join(sorted(_kinds)) or 'none'}"
@@ -124,20 +127,20 @@ def declared(name: str) -> Declared:
 
 
 def kind_named(name: str) -> Kind:
-    """The function that does jobs of that kind; UnknownKind lists those there are."""
+    """Return the function that does jobs of that kind. Raises: UnknownKind."""
     return declared(name).does
 
 
 def without_folder() -> list[str]:
-    """Names of the kinds that do not need the lab's data folder."""
+    """Return the names of the kinds that do not need the lab's data folder."""
     return sorted(name for name, kind in _kinds.items() if not kind.folder)
 
 
 def periodic_tasks() -> Mapping[str, Chore]:
-    """All chores by name."""
+    """Return all periodic tasks by name."""
     return dict(_chores)
 
 
 def startup_tasks() -> Mapping[str, Chore]:
-    """All that is done once, by name."""
+    """Return all startup tasks by name."""
     return dict(_starts)

@@ -1,7 +1,7 @@
-"""A file per job that is being done, locked by the kernel for as long as its process lives.
+"""One lock file per running job, held by the kernel for as long as the worker's process lives.
 
-Two of one key never work on one disk at once, and a worker that was killed is known at once where that is certain:
-the lock is free, and it was this very kernel that kept it. Everything else is told by the database's time.
+Two jobs with the same key never run at the same time on one disk, and a killed worker is detected immediately if it is
+certain: its lock is free, and this same kernel granted it. Otherwise the database's times decide.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from uuid import UUID
 
 from django.conf import settings
 
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # another one with each start of a kernel
-_TRIES, _AGAIN_S = 20, 0.05  # a sweep looks at a lock for a moment
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # changes with each boot
+_TRIES, _AGAIN_S = 20, 0.05  # a check by another worker holds a lock for a moment
 
 
 class ClaimantState(Enum):
-    """State of the worker that claimed a job, by the job's lock."""
+    """State of the worker that claimed a job, as known from the job's lock."""
 
     ALIVE = "at work"
     ENDED = "ended without a word"
@@ -32,7 +32,7 @@ class ClaimantState(Enum):
 
 @contextmanager
 def exclusive_job(key: str, owner: UUID | None) -> Iterator[bool]:
-    """Keep the job of that key to oneself while it is done; False where another process is still at it."""
+    """Hold the lock of a job; yields False if another process holds it."""
     path = _path(key)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = _locked(path)
@@ -49,7 +49,7 @@ def exclusive_job(key: str, owner: UUID | None) -> Iterator[bool]:
 
 
 def claimant_state(key: str, owner: UUID | None) -> ClaimantState:
-    """State of `owner`, which has claimed the job of that key."""
+    """Return the state of `owner`, which has claimed the job with that key."""
     try:
         descriptor = os.open(_path(key), os.O_RDWR | os.O_CLOEXEC)
     except OSError:
@@ -67,12 +67,15 @@ def _path(key: str) -> Path:
 
 
 def _mark(owner: UUID | None) -> bytes:
-    """Owner of the lock, and its kernel: locks of another machine may not reach this one."""
+    """Return owner and kernel boot id of a lock: locks of another machine may not be visible on this one."""
     return f"{owner} {_BOOT_ID.read_text().strip()}".encode()
 
 
 def _locked(path: Path) -> int | None:
-    """The descriptor of the lock of the file that is at `path` now: it may have been removed meanwhile."""
+    """Lock the file at `path` and return its descriptor; None if it stays locked.
+
+    The file is compared after locking, because it may have been removed and created anew in between.
+    """
     for attempt in range(_TRIES):
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         if _taken(descriptor) and path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):

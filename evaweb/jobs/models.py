@@ -1,4 +1,4 @@
-"""Jobs: the row is the truth, the broker only a doorbell."""
+"""Jobs: the rows are authoritative, the broker is only a doorbell."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class JobStatus(models.TextChoices):
 
 
 class Job(models.Model):
-    """One piece of work; claimed by a conditional update, swept when its worker goes silent.
+    """One job; claimed by a conditional update, reclaimed when its worker goes silent.
 
-    `key` names what it is about, e.g. "publish:<uuid>": at most one job of a key waits at a time. All its times are
-    the database's: machines whose clocks differ work on the same rows.
+    `key` names its subject, e.g. "publish:<uuid>": at most one job per key is queued at a time. All times are the
+    database's, so that machines with different clocks can work on the same rows.
     """
 
     kind = models.CharField(max_length=32)
@@ -55,7 +55,7 @@ class Job(models.Model):
         indexes = [
             models.Index(fields=("status", "queue", "created_at")),
             models.Index(fields=("-finished_at",)),
-            models.Index(fields=("key", "id")),  # whether a failed one was asked for again since
+            models.Index(fields=("key", "id")),  # finds out whether a failed job was requested again
         ]
         constraints = [
             models.UniqueConstraint(
@@ -68,7 +68,7 @@ class Job(models.Model):
 
 
 class WorkerProcess(models.Model):
-    """A worker that runs: which queues it takes, and whether its data folder is the lab's. Times are the database's."""
+    """Running worker: the queues it serves, and whether its data folder is the lab's. Times are the database's."""
 
     id = models.UUIDField(primary_key=True, help_text="The owner that its jobs name.")
     host = models.CharField(max_length=255)
@@ -81,7 +81,7 @@ class WorkerProcess(models.Model):
 
 
 class LabFolder(models.Model):
-    """The data folder of the lab, by its `lab_id`: one row, written by the processes that serve the web."""
+    """Data folder of the lab, by its `lab_id`: one row, written by the processes that serve the web."""
 
     lab_id = models.CharField(max_length=32)
     host = models.CharField(max_length=255)
@@ -95,7 +95,7 @@ class LabFolder(models.Model):
 
 
 class Hold(models.Model):
-    """What no two jobs work on at once, and the one that does; worth nothing once that job is not its owner's."""
+    """Name on which no two jobs work at a time, and the job that holds it; void once that job has another owner."""
 
     what = models.CharField(max_length=1024, unique=True)
     job = models.ForeignKey(Job, on_delete=models.CASCADE, related_name="holds")

@@ -1,4 +1,4 @@
-"""Reads of jobs."""
+"""Queries on jobs."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _JOB_DOES_NOT_EXIST_THIS = Pattern(
 
 
 def jobs_ready(*, queues: Collection[str], folder: bool = True) -> QuerySet[Job]:
-    """Those that may be claimed, oldest first; one whose key is being worked on waits for that.
+    """Return the jobs that may be claimed, oldest first; a job waits while one with its key is running.
 
-    Without the lab's data `folder` only those that do not need it.
+    Without the lab's data `folder`, only kinds that do not need it.
     """
     same_running = Job.objects.filter(key=OuterRef("key"), status=JobStatus.RUNNING)
     return (
@@ -40,12 +40,12 @@ def jobs_ready(*, queues: Collection[str], folder: bool = True) -> QuerySet[Job]
 
 
 def job_newest(*, key: str) -> Job | None:
-    """The last job about `key`, whatever became of it."""
+    """Return the newest job of `key` in any state, None if there is none."""
     return Job.objects.filter(key=key).order_by("-created_at", "-pk").first()
 
 
 def job_get(*, id: int) -> Job:
-    """The job of that number; NotFound where there is none."""
+    """Return the job with that id. Raises: NotFound."""
     found = Job.objects.filter(pk=id).first()
     if found is None:
         raise NotFound(_JOB_DOES_NOT_EXIST_THIS(identity=id))
@@ -55,7 +55,7 @@ def job_get(*, id: int) -> Job:
 # --- how far they are ----------------------------------------------------------------------------------------
 
 _STEPS = re.compile(r"\b([0-9]+) of ([0-9]+)\b")
-_MEASURED = 20  # newest jobs of a kind
+_MEASURED = 20  # newest finished jobs of a kind from which its usual duration is taken
 _ORDER = Case(
     When(status=JobStatus.RUNNING, then=Value(0)),
     When(status=JobStatus.QUEUED, then=Value(1)),
@@ -67,16 +67,16 @@ _ORDER = Case(
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How far a running job is: the `fraction` that is done, and seconds that are left; None where nobody knows."""
+    """Progress of a running job: finished `fraction` and remaining time `left_s` [s]; None if unknown."""
 
     fraction: float | None = None
     left_s: float | None = None
 
 
 def jobs_listed(*, status: str = "", kind: str = "") -> QuerySet[Job]:
-    """Those that run, then those that wait, then those that failed and were not asked for again since.
+    """Return running, then queued, then failed jobs that were not requested again; newest first in each group.
 
-    With a `status` all of that one; the newest of each first.
+    With a `status`, all jobs in that state.
     """
     rows = Job.objects.select_related("cancelled_by").order_by(_ORDER, "-created_at", "-pk")
     if kind:
@@ -87,25 +87,29 @@ def jobs_listed(*, status: str = "", kind: str = "") -> QuerySet[Job]:
 
 
 def jobs_failed() -> QuerySet[Job]:
-    """Those that failed, were not cancelled, and were not asked for again since."""
+    """Return the jobs that failed, were not cancelled, and were not requested again."""
     return Job.objects.filter(status=JobStatus.FAILED, cancelled_by=None).exclude(_done_since())
 
 
 def _done_since() -> Q:
-    """Failed, and there is a newer one of the same key."""
+    """Match failed jobs with a newer job of the same key."""
     return Q(
         Q(status=JobStatus.FAILED), Exists(Job.objects.filter(key=OuterRef("key"), pk__gt=OuterRef("pk")))
     )
 
 
 def pace_of(job: Job, now: datetime | None = None) -> Pace:
-    """By the steps that it tells and the rate so far; where it tells none, by the time that the last ones took."""
+    """Estimate the progress of a running job.
+
+    From the steps that it reports ("n of m") and their rate so far; without them from the median duration of the last
+    jobs of its kind.
+    """
     if job.status != JobStatus.RUNNING or job.claimed_at is None:
         return Pace()
     took = max(0.0, ((now or timezone.now()) - job.claimed_at).total_seconds())
     steps = _STEPS.search(job.progress)
     if steps and 0 < int(steps[1]) <= int(steps[2]):
-        done, all_of_them = int(steps[1]) - 1, int(steps[2])  # the one that is named is under way
+        done, all_of_them = int(steps[1]) - 1, int(steps[2])  # step n itself is still running
         return Pace(done / all_of_them, took / done * (all_of_them - done) if done else None)
     usual = _usual_s(job.kind)
     return Pace(min(1.0, took / usual), max(0.0, usual - took)) if usual and took <= usual else Pace()

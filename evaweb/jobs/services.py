@@ -1,7 +1,7 @@
-"""Jobs: asked for, claimed, done, tried again, swept. The row is the truth; the process that updates it first has it.
+"""Services for jobs: enqueue, claim, execute, retry, reclaim. A conditional update of the row decides who has a job.
 
-Its owner is a process, by a uuid of its own. Times are the database's, in the statements that write and compare them:
-no clock of a worker decides about another one.
+The owner of a job is a process, identified by a random uuid. All times are the database's, in the statements that write
+and compare them, so that no worker's clock affects another's jobs.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ _JOB_THERE_NOTHING_CANCEL = Pattern(
 
 RETRY_AFTER_S = (2.0, 10.0, 60.0)
 MOST_ATTEMPTS = len(RETRY_AFTER_S) + 1
-MOST_DEATHS = 8  # of workers over one job, which is no fault of its own most of the time
-_LAPSES = 0.75  # of EVA_JOB_STALE_S, after which a worker that the database has not heard ends
+MOST_DEATHS = 8  # workers that may die over one job, mostly not through its fault
+_LAPSES = 0.75  # fraction of EVA_JOB_STALE_S without a heartbeat after which a worker exits
 _HOLD_AGAIN_S = 0.5
-_AGAIN_S = 5.0  # after which a job is looked at again that another process is still at
-OWNER = uuid4()  # this process
+_AGAIN_S = 5.0  # delay before a job is retried that another process still holds
+OWNER = uuid4()  # identity of this process
 
 _busy = threading.Lock()
 _ending = threading.Event()
@@ -60,9 +60,9 @@ _ending = threading.Event()
 
 
 def enqueue(*, kind: str, key: str, args: Args) -> Job:
-    """Ask for a job, in the queue of its kind; where one of that key waits already, it is that one, with these args.
+    """Queue a job; if one with that key is already queued, update its args and return it.
 
-    A job of that key which is running does not count: what it is about may have changed since it looked.
+    A running job with that key does not count: its subject may have changed since it read it.
     """
     queue = declared(kind).queue
     with transaction.atomic():
@@ -81,13 +81,13 @@ def _waiting(kind: str, key: str, args: Args, queue: str) -> Job:
         try:
             with transaction.atomic():
                 return Job.objects.create(kind=kind, key=key, args=dict(args), queue=queue)
-        except IntegrityError:  # somebody asked for the same just now
+        except IntegrityError:  # the same was requested concurrently
             continue
     raise RuntimeError(f"job {key} is claimed faster than it can be asked for")
 
 
 def retry_job(*, user: Any, job: Job) -> Job:
-    """Ask anew for what a failed job was about, by a user who may ask for it; Conflict where it has not failed."""
+    """Queue a failed job again. Raises: Conflict unless it has failed; NotAllowed if the user may not request it."""
     require_role(user, least_role(job.kind, job.args))
     if job.status != JobStatus.FAILED:
         raise Conflict(_JOB_ONLY_ONE_FAILED_TRIED(job=job.pk, key=job.key, status=job.get_status_display()))
@@ -96,7 +96,7 @@ def retry_job(*, user: Any, job: Job) -> Job:
 
 @transaction.atomic
 def cancel(*, user: Any, job: Job) -> Job:
-    """End a job, for good: at once where it waits, else at its next step. Operators; Conflict where it has ended."""
+    """Cancel a job: immediately if queued, else at its next step. Raises: Conflict if it has ended."""
     require_role(user, Role.OPERATOR)
     row = Job.objects.filter(pk=job.pk)
     waiting = row.filter(status=JobStatus.QUEUED)
@@ -119,7 +119,7 @@ def _cancelled_words(user: Any) -> str:
 
 
 def claim(*, queue: str, owner: UUID) -> Job | None:
-    """Take the oldest job that is ready and can be done here, None where there is none; of two workers one gets it."""
+    """Claim the oldest ready job that this process can do; None if there is none. Of two workers only one gets it."""
     folder = has_lab_folder()
     while (found := jobs_ready(queues=[queue], folder=folder).first()) is not None:
         taken = Job.objects.filter(pk=found.pk, status=JobStatus.QUEUED).update(
@@ -136,7 +136,7 @@ def claim(*, queue: str, owner: UUID) -> Job | None:
 
 
 def run_queue(queue: str) -> int:
-    """Do what is ready in `queue`, one job after the other; how many. None while this process is at work already."""
+    """Execute the ready jobs of `queue` one after the other and return their number; 0 if already executing."""
     if not _busy.acquire(blocking=False):
         return 0
     try:
@@ -150,7 +150,7 @@ def run_queue(queue: str) -> int:
 
 
 def _perform(job: Job) -> None:
-    """Do it and write down what came of it, while no other process on this disk does the same."""
+    """Execute a job and record its outcome, with a lock that excludes other processes on this disk."""
     log.info("job %s begins after %d errors and %d deaths", job.key, job.attempts, job.deaths)
     with ExitStack() as stack:
         ended: Callable[[], object]
@@ -164,7 +164,7 @@ def _perform(job: Job) -> None:
             return
         except Cancelled:
             ended = partial(_ended_if_cancelled, row=_ours(job))
-        except Exception as error:  # whatever a job raises is its own, never the worker's
+        except Exception as error:  # an exception fails the job, never the worker
             log.warning("job %s failed: %s", job.key, error, exc_info=True)
             ended = partial(job_failed, job=job, error=str(error) or type(error).__name__)
         retry_while_locked(ended)
@@ -172,14 +172,14 @@ def _perform(job: Job) -> None:
 
 def _result_of(job: Job) -> Args:
     stale_s = settings.EVA_JOB_STALE_S
-    # Where there may be workers of other machines, whose locks of files may not reach this one, a claim ends in time.
+    # File locks may not reach workers on other machines; there a claim must end before the database reclaims it.
     lapse = None if connection.vendor == "sqlite" else Lapse(stale_s * _LAPSES, partial(_lapsed, job))
     with Heartbeat(partial(heartbeat, job=job), stale_s / 6, lapse):
         return kind_named(job.kind)(JobContext(job.args, partial(_tell, job), partial(hold, job)))
 
 
 def _lapsed(job: Job) -> None:
-    """End this process: another one may be at work on the job by now, and a job may be ended at any moment."""
+    """Exit this process, because another worker may have claimed the job; every job can be killed at any moment."""
     log.error(
         "job %s is not known to be ours any more: this worker ends before another one does the same", job.key
     )
@@ -187,9 +187,9 @@ def _lapsed(job: Job) -> None:
 
 
 def hold(job: Job, names: Collection[str]) -> None:
-    """Wait until no other job that is being done holds any of `names`, and hold them until the job ends.
+    """Wait until no other running job holds any of `names`, then hold them until this job ends.
 
-    They replace what it held before, so that no two jobs wait for each other. Raises TakenOver or Cancelled.
+    They replace its earlier holds, so that two jobs cannot deadlock. Raises: TakenOver, Cancelled.
     """
     while (by := retry_while_locked(partial(_held_by_another, job, sorted(set(names))))) is not None:
         _tell(job, f"waits for another job at work on the same: {by}")
@@ -197,9 +197,9 @@ def hold(job: Job, names: Collection[str]) -> None:
 
 
 def _held_by_another(job: Job, names: Sequence[str]) -> str | None:
-    """The key of the job that holds one of the names; None once they are held by this one."""
+    """Hold the names if they are free and return None; else return the key of the job that holds one."""
     at_work = Hold.objects.filter(job__status=JobStatus.RUNNING, job__owner=F("owner"))
-    Hold.objects.filter(job=job).delete()  # also where it has to wait
+    Hold.objects.filter(job=job).delete()  # released even if it has to wait, so that jobs cannot deadlock
     try:
         with transaction.atomic():
             Hold.objects.filter(what__in=names).exclude(pk__in=at_work.values("pk")).delete()
@@ -222,12 +222,12 @@ def _tell(job: Job, progress: str) -> None:
 
 
 def heartbeat(*, job: Job) -> bool:
-    """A sign of life; False where the job is not this claim's any more."""
+    """Record a heartbeat of the job; return False if this claim has lost it."""
     return bool(_ours(job).update(seen_at=Now()))
 
 
 def job_done(*, job: Job, result: Args) -> bool:
-    """Keep the result; False where the job was swept meanwhile, and its new owner says how it ends."""
+    """Record the result; return False if the job was reclaimed meanwhile, and its new owner records the outcome."""
     done = _finish(job, status=JobStatus.DONE, result=dict(result), error="", progress="")
     if done:
         log.info("job %s is done: %s", job.key, dict(result))
@@ -235,7 +235,7 @@ def job_done(*, job: Job, result: Args) -> bool:
 
 
 def job_failed(*, job: Job, error: str) -> bool:
-    """Keep the error and let the job wait for its next attempt, or fail for good after the last one."""
+    """Record the error and queue the next attempt after a delay; fail the job for good after the last attempt."""
     attempts = job.attempts + 1
     if attempts >= MOST_ATTEMPTS:
         return _finish(job, status=JobStatus.FAILED, attempts=attempts, error=error)
@@ -244,7 +244,7 @@ def job_failed(*, job: Job, error: str) -> bool:
 
 
 def job_postponed(*, job: Job) -> bool:
-    """Look at it again in a few seconds: the process that it was taken from has not ended yet."""
+    """Queue the job again after a few seconds: the process that had it before has not ended yet."""
     why = "the worker that had it before is still at it: it is waited for; end that one if it hangs"
     log.warning("job %s: %s", job.key, why)
     return _requeue_row(_ours(job), progress=why, not_before=Now() + timedelta(seconds=_AGAIN_S))
@@ -258,12 +258,12 @@ def _finish(job: Job, **facts: Any) -> bool:
 
 
 def _ours(job: Job) -> QuerySet[Job]:
-    """The row as long as it is this claim's."""
+    """Return the row as a queryset, empty once the claim is lost."""
     return Job.objects.filter(pk=job.pk, status=JobStatus.RUNNING, owner=job.owner)
 
 
 def _ended_if_cancelled(row: QuerySet[Job]) -> bool:
-    """End it for good if somebody has asked for that."""
+    """Fail the job for good if a user has cancelled it; return True if so."""
     by = row.exclude(cancelled_by=None).select_related("cancelled_by").first()
     if by is None:
         return False
@@ -272,7 +272,7 @@ def _ended_if_cancelled(row: QuerySet[Job]) -> bool:
 
 
 def _requeue_row(row: QuerySet[Job], **facts: Any) -> bool:
-    """Let it wait again, unless it was cancelled; where a newer one of its key waits, that one is done instead."""
+    """Queue the job again unless it was cancelled; if a newer job of its key is queued, fail it in favour of that."""
     if _ended_if_cancelled(row):
         return True
     try:
@@ -287,9 +287,9 @@ def _requeue_row(row: QuerySet[Job], **facts: Any) -> bool:
 
 
 def reclaim_stale_jobs() -> int:
-    """Take jobs back from workers that have ended or show no sign of life; how many. Any process may do it at any time.
+    """Reclaim jobs of workers that have ended or send no heartbeat; return their number. Any process may call it.
 
-    One that is known to be at work keeps its job; one that is known to have ended is not waited for.
+    A worker known to be alive keeps its job; one known to have ended loses it immediately.
     """
     return sum(_reclaim(job) for job in Job.objects.filter(status=JobStatus.RUNNING))
 
@@ -307,18 +307,18 @@ def _reclaim(job: Job) -> bool:
         facts = {"status": JobStatus.FAILED, "finished_at": Now(), "error": f"{silence}: {hint}"}
         return bool(row.update(deaths=deaths, **facts))
     log.warning("job %s is taken back: %s", job.key, silence)
-    wait = (0.0, *RETRY_AFTER_S)[min(deaths - 1, len(RETRY_AFTER_S))]  # others have their turn meanwhile
-    # None is at once also for whoever looks within this millisecond.
+    wait = (0.0, *RETRY_AFTER_S)[min(deaths - 1, len(RETRY_AFTER_S))]  # lets other jobs run meanwhile
+    # None is ready immediately, Now() only after this instant.
     again = Now() + timedelta(seconds=wait) if wait else None
     return _requeue_row(row, deaths=deaths, error=silence, not_before=again)
 
 
 def requeue(*, owner: UUID) -> int:
-    """Let the jobs of a process that is about to end wait for another one; that is no death."""
+    """Requeue the running jobs of a worker that is shutting down, without counting a death; return their number."""
     mine = Job.objects.filter(status=JobStatus.RUNNING, owner=owner)
     return sum(_requeue_row(_ours(job)) for job in mine)
 
 
 def stop_claiming() -> None:
-    """Claim nothing any more in this process; what is being done goes on."""
+    """Claim no more jobs in this process; a running one continues."""
     _ending.set()

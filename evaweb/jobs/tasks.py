@@ -1,4 +1,4 @@
-"""Tasks that celery calls; each is one line."""
+"""Tasks that celery calls, one line each."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from evaweb.jobs.doorbell import TASK
 
 @app.task(name=TASK)
 def work(queue: str) -> None:
-    """The doorbell of a queue."""
+    """Execute the ready jobs of a queue."""
     services.run_queue(queue)

@@ -1,4 +1,4 @@
-"""The worker's process: celery for the doorbell, and a second look every few seconds for what it lost."""
+"""Worker process: celery for the doorbell, and a poll every few seconds in case a notification was lost."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ BROKER_AGAIN_S = 30.0
 
 
 def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
-    """Work until SIGTERM, SIGINT or, with `lifeline`, the end of standard input.
+    """Execute jobs until SIGTERM, SIGINT or, with `lifeline`, the end of standard input.
 
-    What is being done then is finished, or put back after EVA_WORKER_GRACE_S seconds.
+    A running job is finished then, or requeued after EVA_WORKER_GRACE_S [s].
     """
     os.nice(settings.EVA_WORKER_NICE)
     ending = _ending_by_signal()
@@ -62,7 +62,7 @@ def _ending_by_signal() -> threading.Event:
             return
         ending.set()
         services.stop_claiming()
-        celery_state.should_stop = 0  # where its own handlers would put it
+        celery_state.should_stop = 0  # as celery's own signal handler would set it
         threading.Thread(target=_put_back_later, name="grace", daemon=True).start()
 
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -71,13 +71,13 @@ def _ending_by_signal() -> threading.Event:
 
 
 def _put_back_later() -> None:
-    """End the process at the end of its grace; every kind of job can be ended at any moment and done again."""
+    """Requeue the job and exit at the end of the grace period; every job can be killed and run again."""
     threading.Event().wait(settings.EVA_WORKER_GRACE_S)
     try:
         count = retry_while_locked(lambda: services.requeue(owner=services.OWNER))
         log.warning("not done within %g s of grace: %d put back", settings.EVA_WORKER_GRACE_S, count)
     finally:
-        os._exit(0)  # the row tells the rest: a job that is not put back is swept
+        os._exit(0)  # a job that could not be requeued is reclaimed by others
 
 
 def _watch_input() -> None:
@@ -87,7 +87,7 @@ def _watch_input() -> None:
 
 
 def _answer_doorbell(queues: Sequence[str]) -> None:
-    """Celery in this thread until it is told to stop; it returns where its broker does not work."""
+    """Run celery in this thread until it is stopped; return early if the broker does not work."""
     worker = app.WorkController(
         pool="solo",
         concurrency=1,
@@ -101,7 +101,7 @@ def _answer_doorbell(queues: Sequence[str]) -> None:
 
 
 def _poll(queues: Sequence[str], ending: threading.Event) -> None:
-    """Sweep, look after the chores, and do what waits, whether or not a doorbell has rung."""
+    """Reclaim stale jobs, run periodic tasks, and execute ready jobs, without waiting for the doorbell."""
     _attempt(
         "list of workers",
         partial(retry_while_locked, partial(workers.worker_seen, owner=services.OWNER, queues=queues)),
@@ -126,10 +126,10 @@ def _poll(queues: Sequence[str], ending: threading.Event) -> None:
 
 
 def _attempt(name: str, action: Callable[[], object]) -> object:
-    """What it returns; None where it failed."""
+    """Return the result of `action`; None if it failed."""
     try:
         return action()
-    except Exception:  # of whatever kind: the next look is a few seconds away, and this thread must see it
+    except Exception:  # any error: this thread must reach the next poll
         log.exception("%s failed, again in %g s", name, LOOK_EVERY_S)
         connection.close()
         return None

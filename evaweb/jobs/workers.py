@@ -1,8 +1,8 @@
-"""Workers that run, and which jobs none of them can take.
+"""Registry of running workers, and jobs that none of them can execute.
 
-A worker takes the queues that it was started with. Most kinds work on the lab's data folder; one whose folder is
-another takes the rest alone. On SQLite there is one machine, whose folder that is. Elsewhere the web says which it is:
-a worker of another machine that believed its own, empty one would read the lab's recordings as missing.
+A worker serves the queues that it was started with. Most kinds need the lab's data folder; a worker with another folder
+executes only the other kinds. With SQLite there is one machine, whose folder it is. Otherwise the web declares it: a
+worker on another machine with its own, empty folder would report the lab's recordings as missing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _ANOTHER_FOLDER = Pattern(
 
 
 def has_lab_folder() -> bool:
-    """True if the data folder of this process is the lab's."""
+    """Return True if the data folder of this process is the lab's."""
     if connection.vendor == "sqlite":
         return True
     return LabFolder.objects.filter(pk=1, lab_id=settings.EVA_LAB_ID).exists()
@@ -56,7 +56,10 @@ def has_lab_folder() -> bool:
 
 @transaction.atomic
 def lab_folder_named() -> None:
-    """Say that the data folder of this process, which serves the web, is the lab's; EvaError while another's runs."""
+    """Declare the data folder of this process, which serves the web, as the lab's.
+
+    Raises: EvaError while a worker with another lab's folder is running.
+    """
     if connection.vendor == "sqlite":
         return
     host = socket.gethostname()
@@ -76,7 +79,7 @@ def lab_folder_named() -> None:
 
 
 def worker_seen(*, owner: UUID, queues: Sequence[str]) -> bool:
-    """A sign of life of the worker, which is in the list from its first one; True."""
+    """Record a heartbeat of the worker, which registers it; return True."""
     told = {
         "host": socket.gethostname(),
         "queues": list(queues),
@@ -88,7 +91,7 @@ def worker_seen(*, owner: UUID, queues: Sequence[str]) -> bool:
 
 
 def worker_ended(*, owner: UUID) -> None:
-    """It takes no more; those that were never heard of again leave the list with it."""
+    """Remove the worker from the registry, and those silent for a day."""
     gone = Q(pk=owner) | Q(seen_at__lt=Now() - timedelta(seconds=_FORGOTTEN_S))
     WorkerProcess.objects.filter(gone).delete()
 
@@ -102,30 +105,30 @@ def _running() -> QuerySet[WorkerProcess]:
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """What the workers that run can take."""
+    """Queues that the running workers serve."""
 
     queues: frozenset[str]
-    with_folder: frozenset[str]  # queues of those that have the lab's data folder
+    with_folder: frozenset[str]  # queues of workers with the lab's data folder
 
     def lacks(self, job: Job) -> str:
-        """Why no running worker can take a job that waits, as a sentence; "" where one can, or it does not wait."""
+        """Return why no running worker can execute a queued job, as a message; "" if one can or it is not queued."""
         return self.lacks_for(job.kind, job.queue) if job.status == JobStatus.QUEUED else ""
 
     def lacks_for(self, kind: str, queue: str) -> str:
-        """The same of a kind in a queue."""
+        """Return why no running worker can execute jobs of `kind` in `queue`; "" if one can."""
         if not self.queues:
             return NOBODY
         if queue not in self.queues:
             return NO_QUEUE(queue=queue)
         try:
             folder = declared(kind).folder
-        except UnknownKind:  # of another release: its worker knows it
+        except UnknownKind:  # declared by another release, whose worker may execute it
             return ""
         return NO_FOLDER(queue=queue) if folder and queue not in self.with_folder else ""
 
 
 def served() -> Served:
-    """By the workers that have been heard of within EVA_JOB_STALE_S."""
+    """Return the queues of workers that sent a heartbeat within EVA_JOB_STALE_S."""
     rows = list(_running().values_list("queues", "folder"))
     return Served(
         frozenset(queue for queues, _ in rows for queue in queues),
@@ -134,12 +137,12 @@ def served() -> Served:
 
 
 def waiting_for(job: Job) -> str:
-    """Why no running worker can take it, "" where one can."""
+    """Return why no running worker can execute the job, "" if one can."""
     return served().lacks(job) if job.status == JobStatus.QUEUED else ""
 
 
 def queue_names(given: str) -> list[str]:
-    """Queues as an option names them, each once, in their order; EvaError says which are allowed."""
+    """Return the distinct queues of an option. Raises: EvaError, which lists the allowed ones."""
     asked = {name.strip() for name in given.split(",") if name.strip()}
     if not asked or not asked <= set(Queue):
         raise EvaError(f"--queues {given!r:.120}: allowed: {', '.join(Queue)}, with commas between them")

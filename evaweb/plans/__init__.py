@@ -1,1 +1,1 @@
-"""Evaluations that are planned, frozen and carried out blind."""
+"""Evaluation plans: pre-registered, frozen and run blind."""

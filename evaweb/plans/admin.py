@@ -1,4 +1,4 @@
-"""Plans in the admin pages: drafts are edited there; what is done with a frozen one is on its own page."""
+"""Admin pages of plans: editing of drafts; frozen plans are managed on their own pages."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _FROZEN = (
 
 
 class PlanForm(forms.ModelForm):
-    """A draft."""
+    """Form of a draft."""
 
     strategy = Table(required=False, help_text=Plan._meta.get_field("strategy").help_text)
     look_after = Table(required=False, help_text=Plan._meta.get_field("look_after").help_text)
@@ -63,11 +63,11 @@ class PlanForm(forms.ModelForm):
         fields = _FROZEN
 
     def clean_strategy(self) -> Any:
-        """An empty field is no strategy of the plan's own."""
+        """Return None for an empty field: the plan has no strategy of its own."""
         return self.cleaned_data["strategy"] or None
 
     def clean_look_after(self) -> list[int]:
-        """An empty field is a look after every pair."""
+        """Return [] for an empty field: a look after every pair."""
         try:
             given = self.cleaned_data["look_after"]
             return [] if given in self.fields["look_after"].empty_values else looks_of(given)
@@ -76,10 +76,10 @@ class PlanForm(forms.ModelForm):
 
 
 class Conditions(forms.ModelMultipleChoiceField):
-    """Initial conditions of several scenes in one list: numbers alone would be those of any scene."""
+    """Choice of initial conditions of several scenes, labelled by scene and position."""
 
     def label_from_instance(self, obj: Any) -> str:
-        """Scene and position."""
+        """Return scene and position."""
         return f"{obj.scene}, {obj}"
 
 
@@ -93,7 +93,7 @@ class EventInline(ReadOnly, admin.TabularInline):
 
 
 class FileForm(forms.Form):
-    """A file to import."""
+    """Form for the import of a file."""
 
     file = forms.FileField(
         help_text="TOML with scenes, checkpoints and plans, as the export writes it; or an archive (zip) of it with "
@@ -101,7 +101,7 @@ class FileForm(forms.Form):
     )
 
     def clean_file(self) -> tuple[str, dict[str, bytes]]:
-        """Its text and its pictures."""
+        """Return the text and the pictures of the file."""
         given = self.cleaned_data["file"]
         if given.size > LARGEST:
             raise forms.ValidationError(f"{given.size} bytes; allowed: {LARGEST}")
@@ -148,20 +148,20 @@ class PlanAdmin(admin.ModelAdmin):
     def formfield_for_manytomany(
         self, db_field: Any, request: HttpRequest, **kwargs: Any
     ) -> forms.ModelMultipleChoiceField | None:
-        """Positions by scene and number."""
+        """Label positions by scene and number."""
         if db_field.name == "positions":
             kwargs |= {"form_class": Conditions, "queryset": Position.objects.select_related("scene")}
         return super().formfield_for_manytomany(db_field, request, **kwargs)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
-        """Names of fields that are only read: those that were frozen; the name is that of all versions."""
+        """Return the frozen fields; for a draft of a later version the name, shared by all versions."""
         if obj is None:
             return ()
         frozen = tuple("conditions" if name == "positions" else name for name in _FROZEN)
         return frozen if obj.state != PlanState.DRAFT else (("name",) if obj.version > 1 else ())
 
     def get_fieldsets(self, request: HttpRequest, obj: Plan | None = None) -> Any:
-        """Of what was frozen the positions with their scenes; a draft has its list to choose them from."""
+        """Show the positions of a frozen plan as text with their scenes; a draft has the selection list."""
         if obj is None or obj.state == PlanState.DRAFT:
             return self.fieldsets
         return [
@@ -174,26 +174,26 @@ class PlanAdmin(admin.ModelAdmin):
 
     @admin.display(description="positions")
     def conditions(self, plan: Plan) -> SafeString:
-        """Scene by scene, a line each."""
+        """Return the positions, one line per scene."""
         found = plan.positions.select_related("scene").order_by("scene__title", "number")
         scenes = groupby(found, key=lambda position: position.scene.title)
         lines = [(scene, "; ".join(map(str, positions))) for scene, positions in scenes]
         return format_html_join(mark_safe("<br>"), "{}: {}", lines) or mark_safe("–")
 
     def get_prepopulated_fields(self, request: HttpRequest, obj: Plan | None = None) -> dict[str, Any]:
-        """Only as long as the name can be chosen."""
+        """Derive the name from the title only for a new plan."""
         return {} if obj else dict(self.prepopulated_fields)
 
     def has_delete_permission(self, request: HttpRequest, obj: Plan | None = None) -> bool:
-        """Only of a draft on which nothing rests."""
+        """Allow deletion only of drafts without events."""
         return obj is not None and obj.state == PlanState.DRAFT and not obj.events.exists()
 
     def get_changeform_initial_data(self, request: HttpRequest) -> dict[str, Any]:
-        """The user who writes it owns it."""
+        """Preset the user as owner."""
         return {"owner": request.user.pk, **super().get_changeform_initial_data(request)}
 
     def get_urls(self) -> list[URLPattern]:
-        """With the import of a file, and the export of everything."""
+        """Add the import of a file and the export of everything."""
         view = self.admin_site.admin_view
         return [
             path("import/", view(self.import_file), name="plans_plan_import"),
@@ -202,7 +202,7 @@ class PlanAdmin(admin.ModelAdmin):
         ]
 
     def import_file(self, request: HttpRequest) -> HttpResponse:
-        """Take a file, or say what is wrong with it."""
+        """Import a file, or show its problems."""
         form = FileForm(request.POST or None, request.FILES or None)
         if request.method == "POST" and form.is_valid():
             text, pictures = form.cleaned_data["file"]
@@ -223,7 +223,7 @@ class PlanAdmin(admin.ModelAdmin):
         return render(request, "plans/admin_import.html", context)
 
     def export_all(self, request: HttpRequest) -> HttpResponse:
-        """Every scene, checkpoint and plan, each plan as it is newest; with ?pictures as an archive."""
+        """Export all scenes and checkpoints and the newest version of each plan; with ?pictures as an archive."""
         newest = {plan.name: plan for plan in Plan.objects.order_by("version")}
         everything: dict[str, Any] = {
             "scenes": list(Scene.objects.all()),
@@ -236,19 +236,19 @@ class PlanAdmin(admin.ModelAdmin):
 
     @admin.action(description="Export as TOML")
     def export(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
-        """Those chosen, with the scenes and checkpoints that they are made of."""
+        """Export the selected plans with their scenes and checkpoints."""
         plans = _newest(rows)
         return _download(export_toml(plans=plans), f"{_title(plans)}.toml")
 
     @admin.action(description="Export with reference pictures (zip)")
     def export_archive(self, request: HttpRequest, rows: QuerySet[Plan]) -> HttpResponse:
-        """The same with the reference pictures of their positions."""
+        """Export the selected plans as an archive with the reference pictures of their positions."""
         plans = _newest(rows)
         return _download(export_archive(plans=plans), f"{_title(plans)}.zip", "application/zip")
 
     @admin.display(description="trials")
     def trials(self, plan: Plan) -> str:
-        """Number of trials that are foreseen."""
+        """Return the number of scheduled trials."""
         n = plan.slots.count() or plan.positions.count() * plan.checkpoints.count() * plan.repetitions
         return str(n)
 

@@ -1,7 +1,7 @@
-"""The next trial: which slot of a plan a station gets, under which code; each handed out once, in the plan's order.
+"""Allocation of a plan's slots to stations: each is handed out in the plan's order, under a code.
 
-A block goes to one station whole, so that checkpoints are compared on the same robot at nearly the same time. A station
-finishes its block, repetitions of what did not count included, before it gets another.
+A block is allocated to one station as a whole, so that checkpoints are compared on the same robot at nearly the same
+time. A station finishes its block, including repetitions, before it gets another.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Number of trials that a plan foresees, of those that count already, and of attempts."""
+    """Numbers of slots, of slots that count already, and of attempts."""
 
     total: int
     counted: int
@@ -71,7 +71,7 @@ class Progress:
 
 
 def plan_progress(plan: Plan) -> Progress:
-    """Progress of a plan; it tells nothing of any checkpoint."""
+    """Return the progress of a plan, without revealing any checkpoint."""
     slots = _with_newest(plan.slots.all())
     counted = slots.filter(newest=TrialStatus.SCORED).count()
     return Progress(plan.slots.count(), counted, plan.handouts.count())
@@ -80,13 +80,14 @@ def plan_progress(plan: Plan) -> Progress:
 def allocate_trial(*, user: User, station: Station, plan: Plan) -> Handout:
     """Prepare the next trial of `plan` on `station`.
 
-    Conflict where nothing is left for it, its last trial is not finished, or scene or checkpoint are not as frozen;
-    NotAllowed for a user who has looked behind the blind.
+    Raises:
+        Conflict: No slot is left for the station, its last trial is unfinished, or scene or checkpoint have changed.
+        NotAllowed: The user has unblinded the plan.
     """
     require_role(user, Role.OPERATOR)
     _check(plan, user, station)
-    require_none_open(station)  # before anything is said of the design: then there is one answer
-    with transaction.atomic():  # kept also where no trial is handed out
+    require_none_open(station)  # before evaluating the design, so that the message reveals nothing about it
+    with transaction.atomic():  # committed even if no trial is handed out
         held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
         lapse_void_requests(Trial.objects.filter(handout__plan=held), user=user)
     end_plan_if_decided(user=user, plan=plan, asked=True)
@@ -127,7 +128,10 @@ def _allocate(user: User, station: Station, plan: Plan) -> Handout:
 
 @transaction.atomic
 def release_slots(*, user: User, plan: Plan, station: Station, reason: str) -> int:
-    """Take the slots that `station` has not begun from it, for others: a robot broke. How many it were."""
+    """Release the slots of `station` that are not started or must be repeated, for other stations.
+
+    Returns: Their number.
+    """
     require_role(user, Role.OPERATOR)
     held = Plan.objects.select_for_update(of=("self",)).get(pk=plan.pk)
     mine = _with_newest(held.slots.filter(station=station))
@@ -159,14 +163,14 @@ def _check_goes_on(plan: Plan) -> None:
     waits = open_void_requests(Trial.objects.filter(handout__plan=plan)).order_by("pk").first()
     ended = ended_at_an_ask(plan) or (crossed_while_waiting(plan, waits.at) if waits else "")
     if not ended and (found := findings_of(plan)) is not None and found.ended == "boundary":
-        ended = end_reason(plan, found)  # since this ask began
+        ended = end_reason(plan, found)  # crossed since this request began
     if ended:
         then = f"the void of trial {waits.trial_id} is answered" if waits else "its last trial is scored"
         raise Conflict(_HAS_ENDED_CLOSED_ONCE(plan=plan, ended_because=ended, then=then))
 
 
 def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
-    """The slot, and its newest attempt where there was one that does not count."""
+    """Return the slot for the station, and its newest attempt if there was one that does not count."""
     tried = without_dropped(plan.slots.all(), dropped_of(plan))
     slots = _with_newest(tried.select_related("scene", "position", "checkpoint").order_by("index"))
     for slot in slots.filter(station=station):
@@ -185,7 +189,7 @@ def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
 
 
 def _with_newest(slots):  # type: ignore[no-untyped-def]
-    """Each with the status of the attempt that counts, else of its newest one, as `newest`; None before the first."""
+    """Annotate slots with `newest`: status of the attempt that counts, else of the newest; None before any."""
     counts = Case(When(trial__status=TrialStatus.SCORED, then=0), default=1)
     attempts = Handout.objects.filter(slot=OuterRef("pk")).order_by(counts, "-number")
     newest = attempts.values("trial__status")[:1]
@@ -203,7 +207,7 @@ def _repeat_reason(before: Trial) -> str:
 
 
 def _check_unchanged(plan: Plan, slot: Slot) -> None:
-    """The scene and the checkpoints are those that were frozen: an edit meanwhile needs an amended plan."""
+    """Raise Conflict if schedule, scene or checkpoints differ from the frozen plan; edits need an amendment."""
     if slots_of(plan) != [unit.row for unit in units_of(plan)]:
         raise Conflict(_SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN(plan=plan))
     require_scene(plan, slot.scene)

@@ -1,10 +1,10 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 
 
 class PlansConfig(AppConfig):
-    """Evaluations that are planned, frozen and carried out blind."""
+    """Evaluation plans: pre-registered, frozen and run blind."""
 
     name = "evaweb.plans"
     default_auto_field = "django.db.models.BigAutoField"
@@ -12,7 +12,7 @@ class PlansConfig(AppConfig):
     def ready(self) -> None:
         from evaweb.append_only import protect
 
-        # They declare what is hidden from whom, what is asked before a trial of a plan runs, and what ends a plan.
+        # They register visibility rules, checks before a plan's trial runs, and the end of plans.
         from evaweb.plans import bench_checks as bench  # noqa: F401
         from evaweb.plans import blinding_rules as sight  # noqa: F401
         from evaweb.plans import (

@@ -1,6 +1,4 @@
-"""Checks before a trial of a plan runs: that each camera is the one it should be, and that the bench is laid
-out as its reference picture shows.
-"""
+"""Checks before a plan's trial runs: each camera is unchanged, and the bench matches its reference picture."""
 
 from __future__ import annotations
 
@@ -81,20 +79,20 @@ _YOU_HAVE_SEEN_RESULTS_OPERATOR = Pattern(
     "you have seen results of {plan}: an operator who is blind scores, corrects and voids its trials",
 )
 
-HOLDS = timedelta(hours=12)  # somebody's look at the cameras
-LOOK_HOLDS = timedelta(minutes=2)  # at the bench, before the run
+HOLDS = timedelta(hours=12)  # validity of a camera check
+LOOK_HOLDS = timedelta(minutes=2)  # validity of a layout record before the run
 
 
 # --- cameras -------------------------------------------------------------------------------------------------
 
 
 def cameras_of(station: Station) -> list[str]:
-    """The cameras of the station's robot."""
+    """Return the cameras of the station's robot."""
     return [str(camera) for camera in describe_robot(station.robot)["cameras"]]
 
 
 def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
-    """The look at the cameras that still holds for this user; None: they look at them before their next trial."""
+    """Return the user's camera check if it is still valid; None: they must confirm before their next trial."""
     newest = CameraCheck.objects.filter(station=station, by=user).first()
     if newest is None or newest.boot != station.boot or timezone.now() - newest.at > HOLDS:
         return None
@@ -103,9 +101,9 @@ def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
 
 @transaction.atomic
 def confirm_cameras(*, user: User, station: Station, first: bool = False) -> CameraCheck:
-    """Write down that each camera shows what its reference shows, with what it shows now.
+    """Record that each camera shows the same as its reference, with its current image and match.
 
-    `first`: where a camera has no reference yet, what it shows becomes it; without that Conflict names the camera.
+    `first`: create missing references from the current images. Raises: Conflict, which names cameras without reference.
     """
     require_role(user, Role.OPERATOR)
     cameras = cameras_of(station)
@@ -131,20 +129,22 @@ def confirm_cameras(*, user: User, station: Station, first: bool = False) -> Cam
 
 
 def references(*, station: Station, position: Position | None) -> dict[str, Reference]:
-    """The newest reference of each camera, at a position or, without one, at all."""
+    """Return the newest reference of each camera, at a position or, for None, of the camera itself."""
     rows = Reference.objects.filter(station=station, position=position).order_by("pk")
     return {row.camera: row for row in rows}
 
 
 @transaction.atomic
 def take_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
-    """Make what the cameras show now the references of a position, or of the cameras; others stay in the record.
+    """Make the current images the references of a position, or of the cameras; older ones stay in the record.
 
-    Regions that were drawn stay where they are on the picture. Conflict where a running plan judges by one of them.
+    Regions keep their place in the picture. Raises: Conflict if a running plan uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
     found = pictures.current_images(station, cameras_of(station))
-    Station.objects.select_for_update().get(pk=station.pk)  # regions are drawn on the newest alone
+    Station.objects.select_for_update().get(
+        pk=station.pk
+    )  # serializes with `save_regions`, which needs the newest reference
     before = references(station=station, position=position)
     for reference in before.values():
         _require_unjudged(reference)
@@ -163,10 +163,9 @@ def take_references(*, user: User, station: Station, position: Position | None) 
 
 @transaction.atomic
 def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
-    """Another reference with the same picture and these regions: [{"name", "x", "y", "width", "height"}, ...].
+    """Create a reference with the same picture and these regions: [{"name", "x", "y", "width", "height"}, ...].
 
-    Conflict where there is a newer one, or where a running plan with a least match has begun to judge by this camera's
-    reference: its gate does not change under it.
+    Raises: Conflict if there is a newer one, or a running plan with a least match has used this camera's reference.
     """
     require_role(user, Role.OPERATOR)
     found = regions.regions_of(drawn)
@@ -190,7 +189,7 @@ def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
 
 
 def _require_unjudged(reference: Reference) -> None:
-    """The gate of a running plan does not change under it."""
+    """Raise Conflict if a running plan has used the camera's reference as a gate, which must not change."""
     judged = Achieved.objects.filter(
         reference__station=reference.station_id,
         reference__position=reference.position_id,
@@ -207,7 +206,7 @@ def _require_unjudged(reference: Reference) -> None:
 
 
 def allocate_checked_trial(*, user: User, station: Station, plan: Plan) -> Handout:
-    """The next trial of a plan, for a user who has looked at the cameras; see evaweb.plans.allocation."""
+    """Allocate the next trial of a plan if the user has confirmed the cameras; see `allocation`."""
     require_role(user, Role.OPERATOR)
     if current_camera_check(user=user, station=station) is None:
         raise Conflict(_BEFORE_YOUR_FIRST_TRIAL_CONFIRM(name=station.name))
@@ -216,7 +215,7 @@ def allocate_checked_trial(*, user: User, station: Station, plan: Plan) -> Hando
 
 @dataclass(frozen=True, slots=True)
 class CameraMatch:
-    """What a camera shows of a bench now; `match` and `regions` as in Achieved, None and [] without a reference."""
+    """Current image of a camera; `match` and `regions` as in Achieved, None and [] without a reference."""
 
     camera: str
     jpeg: bytes
@@ -226,7 +225,7 @@ class CameraMatch:
 
     @property
     def worst(self) -> tuple[float, str] | None:
-        """The match that a gate is about, and what it is of, in words; None without a reference."""
+        """Lowest match, which the gate tests, and its description; None without a reference."""
         if self.regions:
             row = min(self.regions, key=lambda row: float(row["match"]))
             return row["match"], f"{self.camera}, {row['name']} {row['match']:.2f} ({row['words']})"
@@ -234,9 +233,9 @@ class CameraMatch:
 
 
 def current_matches(*, trial: Trial) -> list[CameraMatch]:
-    """What each camera with a reference of the trial's position shows now, before the run, and how well it matches.
+    """Return the current match of each camera that has a reference at the trial's position.
 
-    Nothing once it is not prepared any more: a page that asks again and again may be a moment late.
+    [] if the trial is not prepared any more, because a polling page may be a moment late.
     """
     if trial.status != TrialStatus.PREPARED:
         return []
@@ -262,9 +261,9 @@ def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> CameraMatch:
 
 
 def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
-    """Keep what the cameras show now, before the run, with how well it matches the position's references.
+    """Store the current images before the run, with their match to the position's references.
 
-    Conflict where a match is below the plan's least and there is no reason in `override`.
+    Raises: Conflict if a match is below the plan's least one and `override` has no reason.
     """
     require_role(user, Role.OPERATOR)
     why = clean_text("override", override, LONGEST_NOTE)
@@ -296,9 +295,9 @@ def _require_match(trial: Trial, seen: Sequence[CameraMatch], why: str) -> None:
 
 
 def _check_before(what: str, trial: Trial, user: Any) -> None:
-    """Check trials of plans before they run, or are taken out of the count.
+    """Check an action on a plan's trial (see `register_check`).
 
-    Within a transaction the plan is kept from others until its end: no reveal comes between the check and the act.
+    Within a transaction the plan is locked until its end, so that it cannot be revealed between check and action.
     """
     rows = Handout.objects.select_related("plan", "trial")
     if transaction.get_connection().in_atomic_block:
@@ -321,7 +320,7 @@ def _check_before(what: str, trial: Trial, user: Any) -> None:
         raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))
     if what in ("run", "judged"):
         require_scene(handout.plan, trial.scene)
-    if what == "prepared":  # asked for its set-up, then for its run
+    if what == "prepared":  # runs before set-up and before run
         require_checkpoints(handout.plan)
     judged = what in ("scored", "voided", "void answered")
     if judged and handout.plan.sealed and has_looked_at_the_same(handout.plan, user):
@@ -329,13 +328,16 @@ def _check_before(what: str, trial: Trial, user: Any) -> None:
 
 
 def _repeated(handout: Handout) -> bool:
-    """Whether another attempt counts in its place."""
+    """Whether another attempt counts in place of this one."""
     others = Handout.objects.filter(plan=handout.plan_id, slot=handout.slot_id).exclude(pk=handout.pk)
     return others.filter(trial__status=TrialStatus.SCORED).exists()
 
 
 def _of_two(trial: Trial) -> bool:
-    """A scored trial of a blind plan, or a failure by the plan: else it would be tried again instead."""
+    """Whether two operators must agree to a void: in a blind plan, or for a failure by the plan.
+
+    Otherwise an unwelcome trial could be repeated instead.
+    """
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     return handout is not None and (handout.plan.blind or fails_by(handout.plan, trial))
 

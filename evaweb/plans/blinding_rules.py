@@ -1,10 +1,10 @@
 """Rules of blind plans: which users may know the checkpoint of a trial.
 
-Before the reveal every user is blind who has not looked. Its owner and administrators may look, by an act that is
-recorded, as far as they do not run its trials: a user who has been handed one of them sees nothing, one who has looked
-is handed none. Which comes first decides, so that also the only user of a lab can do either, but not both.
+Until the reveal every user is blind who has not unblinded the plan. Its owner and administrators may unblind it, a
+recorded act, if they do not run its trials: a user who has been handed a trial cannot unblind, and an unblinded user
+gets no trials. The order decides, so that even the only user of a lab can do either, but not both.
 
-Where a plan is lost with the database, and its trials came back from the disk, every user is blind.
+If a plan is lost with the database, and its trials were restored from the disk, every user is blind.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from evaweb.trials.selectors import UNFINISHED
 
 
 def is_sealed_for(plan: Plan, user: Any) -> bool:
-    """True if the plan is sealed for this user; looking is not recorded by asking."""
+    """Return True if the plan is sealed for this user; asking this does not unblind."""
     return plan.sealed and not is_unblinded(plan, user)
 
 
 @transaction.atomic
 def record_unblinding(plan: Plan, user: Any) -> None:
-    """Record that this user sees what is sealed from now on; raise NotAllowed where they may not."""
+    """Record that the user unblinds the plan. Raises: NotAllowed if they may not."""
     held = Plan.objects.select_for_update(of=("self",)).select_related("owner").get(pk=plan.pk)
     if not held.sealed:
         return
@@ -47,30 +47,30 @@ def record_unblinding(plan: Plan, user: Any) -> None:
 
 
 def is_unblinded(plan: Plan, user: Any) -> bool:
-    """True if this user has seen what is sealed."""
+    """Return True if this user has unblinded the plan."""
     return Look.objects.filter(plan=plan, user=user).exists()
 
 
 def has_looked_at_the_same(plan: Plan, user: Any) -> bool:
-    """True if this user has seen what is, or was, sealed of any version of the plan, or of the same checkpoints."""
+    """Return True if this user has unblinded any version of the plan, or a plan with the same checkpoints."""
     looks = Look.objects.filter(user=user)
-    if not looks.exists():  # as it is of most, who are asked with every score
+    if not looks.exists():  # true for most users, and checked at every score
         return False
     beside = plans_beside(plan).values("pk")
     return looks.filter(Q(plan__name=plan.name) | Q(plan__in=beside)).exists()
 
 
 def can_unblind(plan: Plan, user: Any) -> bool:
-    """True if `look` would be granted, or was."""
+    """Return True if `record_unblinding` would succeed or is unnecessary."""
     return not plan.sealed or _why_not(plan, user) == ""
 
 
 def visibility_for(user: Any) -> Visibility:
-    """Sight of this user under the plans of now; see evaweb.blinding."""
+    """Return the user's Visibility under the current plans; see evaweb.blinding."""
     plans = Plan.objects.filter(blind=True, state__in=(PlanState.FROZEN, PlanState.CLOSED))
     if user.pk is not None:
         plans = plans.exclude(looks__user=user)
-    # Names as they were frozen too: recordings keep the name that a checkpoint had.
+    # Include the frozen names: recordings keep the name that a checkpoint had.
     found = list(plans.values_list("pk", "title", "version", "document__checkpoints"))
     lost = list(_lost_plans().values_list("pk", "name", "version"))
     if not (found or lost):
@@ -103,13 +103,13 @@ register_visibility_rule(visibility_for)
 
 
 def _lost_plans() -> QuerySet[Evaluation]:
-    """What plans made that are not in the database, and may have been blind: nobody can be asked who may know."""
+    """Return the evaluations of plans missing from the database; they count as blind, as nothing can unblind them."""
     return Evaluation.objects.filter(kind=Evaluation.Kind.PLAN, plan=None).exclude(trials=None).order_by("pk")
 
 
 @register_conclusion
 def lost_plan_notes() -> Iterator[str]:
-    """A sentence for each plan that is not in the database any more, though its trials are."""
+    """Yield a message for each plan that is missing from the database although its trials exist."""
     for row in _lost_plans().annotate(number=Count("trials")):
         yield (
             f"{row.number} trials are of plan {row}, which is not in the database: what tells which checkpoint they "

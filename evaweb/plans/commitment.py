@@ -1,7 +1,7 @@
-"""Concealment of checkpoints: a fresh code for every trial, and a commitment that nothing was changed after.
+"""Concealment of checkpoints: a new code for every trial, and a commitment to the schedule.
 
-Codes are of one trial each, because labels that stay are learned. The commitment is shown before the first trial; the
-reveal shows the key it was made with, from which anyone computes schedule, codes and commitment again.
+Codes are for one trial each, because operators would learn permanent labels. The commitment is published before the
+first trial; the reveal publishes its key, from which anyone can recompute schedule, codes and commitment.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _KEY_BYTES_ALLOWED = Pattern(
     "a key of {count} bytes; allowed: {key_bytes}",
 )
 
-_LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"  # without 0 and O, 1 and I: they are read aloud across a bench
+_LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"  # without 0, O, 1 and I, as codes are read aloud
 _LENGTH = 5
 
 
 def draw_codes(key: bytes, count: int) -> list[str]:
-    """`count` different codes, in the order of the trials; they say nothing of what they stand for."""
+    """Return `count` distinct codes in the order of the trials, independent of their checkpoints."""
     if count > len(_LETTERS) ** _LENGTH // 100:
         raise EvaError(_CODES_ALLOWED(count=count, count_2=len(_LETTERS) ** _LENGTH // 100))
     chance, found = SeededDraws(key, "codes"), dict[str, None]()
@@ -37,9 +37,9 @@ def draw_codes(key: bytes, count: int) -> list[str]:
 
 
 def make_commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
-    """Commitment shown before: HMAC-SHA-256 by the key of the plan's and its schedule's digests, in hex.
+    """Return the commitment: HMAC-SHA-256, by the key, of the plan's and the schedule's digest, in hexadecimal.
 
-    With a key of 256 bits it tells nothing of the schedule, and no second schedule has it.
+    With a key of 256 bits it reveals nothing about the schedule, and no other schedule matches it.
     """
     if len(key) != KEY_BYTES:
         raise EvaError(_KEY_BYTES_ALLOWED(count=len(key), key_bytes=KEY_BYTES))
@@ -47,10 +47,10 @@ def make_commitment(plan: str, units: Sequence[Unit], key: bytes) -> str:
 
 
 def schedule_digest(units: Sequence[Unit]) -> str:
-    """SHA-256 of the canonical form of the schedule."""
+    """Return the SHA-256 of the canonical form of the schedule."""
     return digest({"units": [unit.row for unit in units]})
 
 
 def verify_commitment(plan: str, units: Sequence[Unit], key: bytes, committed: str) -> bool:
-    """True if plan, schedule and key are those that were committed to."""
+    """Return True if plan, schedule and key match the commitment."""
     return hmac.compare_digest(make_commitment(plan, units, key), committed)

@@ -1,4 +1,4 @@
-"""What a run that did not end by itself counts as, by the plan: declared before the first trial, and held here."""
+"""Counting of runs that ended prematurely, as the plan declared before its first trial."""
 
 from __future__ import annotations
 
@@ -33,14 +33,15 @@ ENDS = {f"on_{name}": words for name, words in ENDINGS.items()}
 
 
 def ended_by(trial: Trial) -> str:
-    """Which of `ENDS` ended its run; "" where it ended by itself, or was stopped by the operator."""
+    """Return the key of `ENDS` that ended the trial's run; "" if it ended by itself or the operator stopped it."""
     end = end_of(trial.ended_by, trial.status, trial.reason, trial.episode and trial.episode.status)
     return f"on_{end}" if end else ""
 
 
 def end_of(kept: str | None, status: str, reason: str, recording: str | None) -> str:
-    """One of `ENDINGS`, or "": as it was `kept` when the run ended; of a trial from before it was kept, None, by its
-    status and reason and the status of its episode, None without one.
+    """Return one of `ENDINGS` or "": the stored value `kept`.
+
+    For trials that predate it (None), derived from status, reason and the status of the recording (None without one).
     """
     if kept is not None:
         return kept
@@ -49,7 +50,7 @@ def end_of(kept: str | None, status: str, reason: str, recording: str | None) ->
 
 
 def require_scored_first(plan: Plan, before: Trial | None) -> None:
-    """Conflict where the attempt before is a failure by the plan, and nobody has said so yet."""
+    """Raise Conflict if the previous attempt counts as a failure by the plan and is not scored yet."""
     if before is None or before.status != TrialStatus.INTERRUPTED:
         return
     if fails_by(plan, before):
@@ -57,8 +58,9 @@ def require_scored_first(plan: Plan, before: Trial | None) -> None:
 
 
 def fails_by(plan: Plan, trial: Trial) -> bool:
-    """Whether it is a failure by the plan, whatever is said of it: not where nothing of its run was recorded, which
-    nobody could score.
+    """Whether the trial is a failure by the plan, whatever its score.
+
+    Not if nothing of its run was recorded, because it could not be scored.
     """
     counts = getattr(plan, ended_by(trial) or "on_nothing", CountsAs.JUDGED)
     episode = trial.episode
@@ -67,7 +69,7 @@ def fails_by(plan: Plan, trial: Trial) -> bool:
 
 
 def declared_failures(plan: Plan) -> dict[int, str]:
-    """The trials that count as failures by the plan, whatever was reached, with what ended their runs in words."""
+    """Return the scored trials that are failures by the plan, with the cause of their end as text."""
     if all(getattr(plan, name) != CountsAs.FAILURE for name in ENDS):
         return {}
     rows = Trial.objects.filter(handout__plan=plan, status=TrialStatus.SCORED, episode__frames__gt=0)
@@ -88,7 +90,7 @@ def _judged(what: str, trial: Trial, user: Any) -> None:
     if handout is None or not end:
         return
     counts = getattr(handout.plan, end)
-    if what == "voided":  # before it has a score one operator alone voids: it would be tried again instead
+    if what == "voided":  # a single operator could void an unscored failure to have it repeated
         if trial.verdict_id is None and fails_by(handout.plan, trial):
             raise Conflict(_SCORE_IT_FIRST(trial=trial.pk, what=ENDS[end], plan=handout.plan))
         return

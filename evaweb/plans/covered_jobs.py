@@ -1,4 +1,4 @@
-"""Jobs as they are shown to somebody from whom a checkpoint is hidden."""
+"""Redaction of jobs for users from whom a checkpoint is hidden."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaweb.jobs.models import Job
 
 
 class Cover(Enum):
-    """What of a job is covered: nothing, its words (they may name a server), or also what it is about and when."""
+    """Hidden part of a job: nothing, its texts (which may name a server), or also its subject and times."""
 
     NOTHING = 0
     WORDS = 1
@@ -19,7 +19,11 @@ class Cover(Enum):
 
 
 def cover_of(job: Job, sight: Visibility) -> Cover:
-    """Of a recording that is not hidden nothing is covered, of a blind trial all, of other work its words."""
+    """Return how much of a job is hidden from this user.
+
+    All for a blind trial or plan; nothing for a visible recording, unless its texts name a hidden checkpoint; the texts
+    for everything else.
+    """
     if sight.sees_everything:
         return Cover.NOTHING
     if "uuid" in job.args:

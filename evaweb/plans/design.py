@@ -1,7 +1,7 @@
-"""The design of a plan's comparisons: as it is drafted, as it is frozen, and what it says of the trials there are.
+"""Design of a plan's comparisons: drafted, frozen, and applied to the trials so far.
 
-Blocks enter in the order of the schedule, never in that in which they were finished: the first one that lacks a scored
-trial of a compared checkpoint ends what is looked at. A station that is fast cannot choose what counts.
+Blocks are used in the order of the schedule, not of completion: the first block that lacks a scored trial of a compared
+checkpoint ends the data of the analysis. So a fast station cannot influence which trials count.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ ENDED = {
     "boundary": "a boundary of its design was crossed",
     "full": "all pairs of its comparison are made",
 }
-ENDED_EVENT = "ended"  # of a plan: an ask for its next trial found that, or its last trial
-CROSSED_EVENT = "crossed"  # of a plan: an ask found a boundary crossed while a void waited
-_SINCE_HOLM = 6  # the format of plans from which several comparisons with one test are decided step by step
-_ALL_KEPT = 7  # the format of plans from which a reveal keeps what counts also without a comparison
-_ENDS_NOTED = 6  # the format of plans from which every end that the server finds is such an event
+ENDED_EVENT = "ended"  # plan event: found at a request for the next trial, or at the last trial
+CROSSED_EVENT = "crossed"  # plan event: boundary found crossed at a request while a void request was open
+_SINCE_HOLM = 6  # plan format from which several comparisons with one test use Holm's step-down procedure
+_ALL_KEPT = 7  # plan format from which a reveal stores the result also without a comparison
+_ENDS_NOTED = 6  # plan format from which every end found by the server is recorded as an event
 Names = tuple[str, str]
 
 
 def planned(plan: Plan) -> list[Names]:
-    """The comparisons of a draft, by names; none where it asks for none."""
-    # An anchor is compared where it is named alone.
+    """Return the comparisons of a draft as pairs of names; [] if it has none."""
+    # An anchor is compared only if it is named.
     names = list(plan.checkpoints.filter(anchor=False).order_by("name").values_list("name", flat=True))
     if plan.comparing == Comparing.ALL:
         return list(combinations(names, 2))
@@ -67,20 +67,20 @@ def planned(plan: Plan) -> list[Names]:
 
 
 def compared(document: Mapping[str, Any]) -> list[Names]:
-    """The comparisons of a frozen plan, by names."""
+    """Return the comparisons of a frozen plan as pairs of names."""
     before = [document["comparison"]] if document.get("comparison") else []
     return [(first, second) for first, second in document.get("comparisons", before)]
 
 
 def arms_of(comparisons: Sequence[Names]) -> list[str]:
-    """The checkpoints that are compared, in the order of a design's arms."""
+    """Return the compared checkpoints in the order of the design's arms."""
     return list(dict.fromkeys(name for pair in comparisons for name in pair))
 
 
 def draft_design(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) -> Design | None:
-    """The design of a draft, computed now; None without a comparison. EvaError says what cannot be.
+    """Return the design of a draft, None without a comparison. Raises: EvaError if it is invalid.
 
-    `counts`: trials of both checkpoints after each block, where they are in random order.
+    `counts`: for random order, the numbers of trials of both checkpoints after each block.
     """
     said = _said(plan)
     if said is None:
@@ -92,7 +92,7 @@ def draft_design(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) ->
 
 
 def check_drafted(plan: Plan) -> None:
-    """EvaError says what of a draft's design cannot be; no boundary is computed."""
+    """Raise EvaError if the draft's design is invalid; cheap, as it computes no boundary."""
     said = _said(plan)
     try:
         if said is not None:
@@ -102,7 +102,7 @@ def check_drafted(plan: Plan) -> None:
 
 
 def _said(plan: Plan) -> dict[str, Any] | None:
-    """The design of a draft as `design` takes it; None without a comparison."""
+    """Return the arguments of `design` for a draft; None without a comparison."""
     comparisons = planned(plan)
     if not comparisons:
         return None
@@ -124,7 +124,7 @@ def _by_number(comparisons: Sequence[Names]) -> tuple[tuple[int, int], ...]:
 
 
 def frozen_design(document: Mapping[str, Any]) -> Design | None:
-    """The design of a frozen plan, also of one from before there were boundaries; None without a comparison."""
+    """Return the design of a frozen plan of any format; None without a comparison."""
     comparisons = compared(document)
     if not comparisons:
         return None
@@ -150,9 +150,8 @@ def frozen_design(document: Mapping[str, Any]) -> Design | None:
 class Tried:
     """Outcomes of the compared checkpoints, block by block as scheduled, up to the last block that a comparison uses.
 
-    `counted` is what counts; `at_first` as if no trial had been voided that had a score, nor were to be, and none
-    corrected: of each slot the first score. `again` says of each trial that counts whether an attempt before it was
-    thrown away unscored.
+    `counted` is what counts. `at_first` has the first score of each slot, as if no scored trial had been voided or
+    corrected. `again` tells for each counting trial whether an earlier attempt was discarded unscored.
     """
 
     counted: list[Block]
@@ -160,7 +159,7 @@ class Tried:
     again: list[list[bool]]
 
     def against(self, winner: int, loser: int) -> list[Block]:
-        """What counts, had each attempt that was thrown away unscored ended as badly for `winner` as it could."""
+        """Return `counted` with the worst case for `winner` wherever an attempt was discarded unscored."""
         worst = {winner: 0.0, loser: 1.0}
         return [
             tuple(
@@ -173,10 +172,10 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """An attempt of one of the compared checkpoints that was judged or broken off, of slot `slot` in block `block`.
+    """Scored or interrupted attempt of a compared checkpoint, of slot `slot` in block `block`.
 
-    `counts`: its score is the one that counts; `outcome` is that of its newest score and `first` of its first one
-    before what counts was kept, None where it has none. `attempt` is above 1 where one before it did not count.
+    `counts`: whether its score counts. `outcome` is that of its newest score, `first` that of its first score before
+    the result was stored; None without a score. `attempt` is above 1 if an earlier one did not count.
     """
 
     block: int
@@ -192,14 +191,14 @@ class Attempt:
 
 
 def attempts_of(plan: Plan) -> list[Attempt]:
-    """Those of a frozen plan's comparisons, in the order in which they were handed out; one query."""
+    """Return the attempts of a frozen plan's comparisons in the order of handout; one query."""
     document = plan.document or {}
     found = frozen_design(document)
     if found is None:
         return []
     value = "success" if found.outcome == SUCCESS else "score"
     given = Score.objects.filter(trial=OuterRef("trial"))
-    if plan.kept_at:  # what came later is no first score of the evaluation
+    if plan.kept_at:  # later scores do not belong to the evaluation
         given = given.filter(scored_at__lte=plan.kept_at)
     first = given.order_by("pk").values(value)[:1]
     rows = plan.handouts.filter(
@@ -231,7 +230,7 @@ def attempts_of(plan: Plan) -> list[Attempt]:
 
 
 def current_pairs(plan: Plan) -> Tried:
-    """The blocks of a frozen plan as they are now; none without a comparison. One query."""
+    """Return the current blocks of a frozen plan, empty without a comparison; one query."""
     document = plan.document or {}
     found = frozen_design(document) if document else None
     if found is None:
@@ -240,7 +239,7 @@ def current_pairs(plan: Plan) -> Tried:
 
 
 def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -> Tried:
-    """The blocks of these attempts, which are in the order in which they were handed out."""
+    """Return the blocks formed by these attempts, which must be in the order of handout."""
     counted: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     at_first: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     thrown: set[int] = set()
@@ -263,30 +262,30 @@ def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -
 
 
 def kept_blocks(plan: Plan) -> list[Block] | None:
-    """Those that the reveal kept; None before it."""
+    """Return the blocks stored by the reveal; None before it."""
     return blocks_kept(plan.at_reveal) if plan.at_reveal else None
 
 
 def blocks_kept(kept: Mapping[str, Any]) -> list[Block]:
-    """Those of `reveal_record`, also from before there were several comparisons, when it was pairs."""
+    """Return the blocks of a `reveal_record`, including old ones that stored pairs."""
     if "blocks" not in kept:
         return in_blocks([(one, other) for one, other in kept["pairs"]])
     return [tuple((arm, value) for arm, value in block) for block in kept["blocks"]]
 
 
 def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
-    """Whether they have the same trials, in whatever order a block lists its own: reveals of pairs did not keep it."""
+    """Return whether both have the same trials; order within a block is ignored, as old reveals did not store it."""
     return [sorted(block) for block in one] == [sorted(block) for block in other]
 
 
 def blocks_that_count(plan: Plan) -> list[Block]:
-    """Of a revealed plan those of its reveal, else those there are now."""
+    """Return the blocks of the reveal if there was one, else the current ones."""
     kept = kept_blocks(plan)
     return current_pairs(plan).counted if kept is None else kept
 
 
 def findings_of(plan: Plan) -> Findings | None:
-    """What the frozen design says: of a revealed plan as it stood at the reveal, else of the trials there are now."""
+    """Return the findings of the frozen design, at the reveal if there was one, else now; None without a comparison."""
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return None
@@ -294,10 +293,10 @@ def findings_of(plan: Plan) -> Findings | None:
 
 
 def dropped_of(plan: Plan) -> dict[str, int]:
-    """The checkpoints of a running plan that are tried no more, and after how many blocks, by its own rule.
+    """Return the checkpoints that a running plan's rule has dropped, and after how many blocks.
 
-    A trial that is repeated counts as it was scored until its repetition is: were it open, those that had been left out
-    would come next, and the operator would know which checkpoint they are of.
+    A trial that is being repeated counts with its score until its repetition is scored. If it counted as missing, a
+    drop could be undone, the omitted trials would come next, and the operator would recognise their checkpoint.
     """
     found = frozen_design(plan.document) if plan.document else None
     if found is None or not found.drops:
@@ -313,27 +312,28 @@ def dropped_of(plan: Plan) -> dict[str, int]:
 
 
 def end_reason(plan: Plan, found: Findings) -> str:
-    """Reason why a design has ended, which tells nothing of any checkpoint."""
+    """Return why a design has ended, without revealing any checkpoint."""
     planned = frozen_design(plan.document or {})
     return f"{ENDED[found.ended]}, after {found.at} {planned.unit if planned else 'pairs'}"
 
 
 def ended_at_an_ask(plan: Plan) -> str:
-    """Why the plan ended: found when a next trial was asked for, or at its last one; "" where neither was."""
+    """Return why the plan ended, as found at a request for a trial or at its last one; "" if it has not."""
     told = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
     return told or ""
 
 
 def crossed_while_waiting(plan: Plan, since: datetime) -> str:
-    """Why the plan would have ended, as an ask found after a void was asked for; "" where none did."""
+    """Return why the plan would have ended, as found since a void was requested; "" if it would not."""
     told = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
     return told or ""
 
 
 def visible_close_reason(plan: Plan, sealed: bool) -> str:
-    """Why it was closed; of a plan that is `sealed` for the reader only what the server itself says.
+    """Return why the plan was closed; if it is `sealed` for the reader, only a reason by the server.
 
-    Since format 6 the server has noted that: a reason of the owner's that begins like it stays the owner's.
+    Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not confused
+    with them.
     """
     if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
         own = any(plan.closed_because.startswith(f"{words}, after ") for words in ENDED.values())
@@ -346,14 +346,14 @@ _told_of: list[Callable[[Plan], dict[str, Any]]] = []
 
 
 def declare_kept(told: Callable[[Plan], dict[str, Any]]) -> None:
-    """`told` says what else is kept at a reveal."""
+    """Register a function that returns further data to store at a reveal."""
     _told_of.append(told)
 
 
 def reveal_record(plan: Plan) -> dict[str, Any] | None:
-    """What is kept with its digest: the blocks that count, the sums of each checkpoint, and what was declared.
+    """Return the data stored at a reveal with its digest: counting blocks, sums per checkpoint, registered data.
 
-    What is corrected later makes no other headline.
+    Later corrections do not change the plan's headline. None for a plan without a comparison before format 7.
     """
     document = plan.document or {}
     if frozen_design(document) is None and document.get("format", 1) < _ALL_KEPT:
@@ -365,14 +365,14 @@ def reveal_record(plan: Plan) -> dict[str, Any] | None:
 
 
 def recorded_so_far(plan: Plan) -> Hashable:
-    """Another value whenever anything was tried, scored, corrected or voided since."""
+    """Return a fingerprint that changes whenever a trial, score, correction or void is added."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     found = trials.aggregate(n=Count("pk"), changed=Max("changed_at"), scores=Count("scores", distinct=True))
     return tuple(found.values())
 
 
 def counted_now(plan: Plan) -> dict[str, Any]:
-    """The blocks that count, and the sums of each checkpoint."""
+    """Return the counting blocks, and the sums of each checkpoint."""
     return {
         "blocks": [[list(trial) for trial in block] for block in current_pairs(plan).counted]
         if frozen_design(plan.document or {}) is not None
@@ -382,7 +382,7 @@ def counted_now(plan: Plan) -> dict[str, Any]:
 
 
 def _sums(plan: Plan) -> list[dict[str, Any]]:
-    """Of each checkpoint the trials that count, successes and mean score, in the order of the document."""
+    """Return by checkpoint the counting trials, successes and mean score, in the order of the document."""
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by("number")
     found: dict[str, list[tuple[bool, float]]] = defaultdict(list)
     for name, success, score in rows.values_list(
@@ -402,7 +402,7 @@ def _sums(plan: Plan) -> list[dict[str, Any]]:
 
 
 def looks_of(given: Any) -> list[int]:
-    """Pairs after which a design is looked at; EvaError where `given` is no list of rising numbers."""
+    """Return the numbers of pairs after which looks take place. Raises: EvaError unless they are increasing."""
     numbers = isinstance(given, list) and all(
         isinstance(at, int) and not isinstance(at, bool) for at in given
     )

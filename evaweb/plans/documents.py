@@ -1,4 +1,4 @@
-"""The frozen form of a plan: all that its trials depend on, whatever becomes of scenes and checkpoints later."""
+"""Frozen form of a plan: everything that its trials depend on, independent of later changes."""
 
 from __future__ import annotations
 
@@ -44,15 +44,18 @@ _CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
     "plans.allocation.checkpoint_renamed_since_frozen",
     "a checkpoint of {plan} was renamed since it was frozen: give it its old name back",
 )
-# 2 had no outcome, margin, looks or boundary; 3 one "comparison" at most, of paired blocks; 4 was scored by its scenes
-# as they were then; reveals of 5 kept neither caveats nor the digest of the record,
-# those of 6 nothing of a plan without a comparison.
+# Format 2 had no outcome, margin, looks or boundary; 3 at most one "comparison", of paired blocks; 4 was scored by the
+# scenes as they were at the time; reveals of 5 stored neither caveats nor the digest of the record, those of 6 nothing
+# for a plan without a comparison.
 FORMAT = 7
-_DRAWN_BY_ITSELF = 6  # the order within a block, from this format on
+_DRAWN_BY_ITSELF = 6  # format from which the order within each block is drawn independently
 
 
 def document_of(plan: Plan, key: bytes) -> dict[str, Any]:
-    """All that is frozen of a draft, in plain JSON; `key` draws the schedule."""
+    """Return the frozen form of a draft as plain JSON; `key` draws the schedule.
+
+    Raises: UnevenError if the drawn random order does not fit the design; EvaError if the design is invalid.
+    """
     positions: dict[Scene, list[Position]] = defaultdict(list)
     for position in plan.positions.select_related("scene").order_by("scene__name", "number"):
         positions[position.scene].append(position)
@@ -99,7 +102,7 @@ def _design(plan: Plan, document: dict[str, Any], key: bytes) -> dict[str, Any]:
 
 
 class UnevenError(EvaError):
-    """A random order whose numbers of trials the design has no room for; another key draws another one."""
+    """A random order whose numbers of trials do not fit the design; another key draws another order."""
 
 
 def _check_counts(made: tuple[int, int], *, bounded: bool) -> None:
@@ -115,7 +118,7 @@ def _check_counts(made: tuple[int, int], *, bounded: bool) -> None:
 
 
 def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
-    """A scene with those of its positions that are used, and all its milestones."""
+    """Return a scene with the given positions and all its milestones as plain JSON."""
     return {
         "name": scene.name,
         "title": scene.title,
@@ -143,9 +146,10 @@ def scene_of(scene: Scene, positions: list[Position]) -> dict[str, Any]:
 
 
 def require_checkpoints(plan: Plan) -> None:
-    """Conflict where one of the plan's checkpoints is not as it was frozen, or is switched off.
+    """Raise Conflict if any of the plan's checkpoints differs from its frozen form or is deactivated.
 
-    All of them, whichever the trial is of, and not which one: else switching one off would tell what comes next.
+    All are checked, whichever the trial uses, and the message does not name it: otherwise deactivating one would reveal
+    which checkpoint comes next.
     """
     there = {row.name: row for row in plan.checkpoints.all()}
     for row in (plan.document or {})["checkpoints"]:
@@ -159,7 +163,10 @@ def require_checkpoints(plan: Plan) -> None:
 
 
 def require_scene(plan: Plan, scene: Scene) -> None:
-    """Conflict, with what differs, where the scene is not as the plan froze it: success would be something else."""
+    """Raise Conflict, with the differences, if the scene differs from its frozen form.
+
+    Success could then mean something else.
+    """
     frozen = next((row for row in (plan.document or {})["scenes"] if row["name"] == scene.name), None)
     if frozen is None:
         raise Conflict(_SCENE_RENAMED_SINCE_FROZEN(plan=plan))
@@ -171,7 +178,7 @@ def require_scene(plan: Plan, scene: Scene) -> None:
 
 
 def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
-    """Each value that is another one now, in words."""
+    """Yield each changed value as text."""
     for key, value in frozen.items():
         if not isinstance(value, list):
             if value != now.get(key):
@@ -191,7 +198,7 @@ def _differences(frozen: dict[str, Any], now: dict[str, Any]) -> Iterator[str]:
 
 
 def checkpoint_of(checkpoint: Checkpoint) -> dict[str, Any]:
-    """A checkpoint: how it is reached; digest, recipe and strategy where it has them, and whether it is an anchor."""
+    """Return a checkpoint as plain JSON: name, description, policy, and the optional fields that are set."""
     named = {name: getattr(checkpoint, name) for name in ("digest", "recipe", "strategy", "anchor")}
     return {
         "name": checkpoint.name,
@@ -202,7 +209,7 @@ def checkpoint_of(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def conditions_of(document: dict[str, Any]) -> list[Condition]:
-    """The initial conditions of a frozen plan."""
+    """Return the initial conditions of a frozen plan."""
     return [
         Condition(scene["name"], position["number"])
         for scene in document["scenes"]
@@ -211,7 +218,7 @@ def conditions_of(document: dict[str, Any]) -> list[Condition]:
 
 
 def units_of(plan: Plan) -> list[Unit]:
-    """The schedule of a frozen plan, drawn by its key."""
+    """Return the schedule of a frozen plan, drawn from its key."""
     return _units(plan.document or {}, bytes(plan.key or b""))
 
 

@@ -1,4 +1,4 @@
-"""What stands in the way of freezing a draft, and what should be thought of, each with the step that mends it."""
+"""Checks of a draft: problems that prevent freezing, and remarks, each with the step of the form that fixes it."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from evaweb.statistics.difference import barnard
 from evaweb.trials.models import Milestone, Scene
 from evaweb.trials.tables import TRUTHS, check_strategy
 
-_ENOUGH = 20  # pairs, of which all won by one checkpoint tell at any alpha that a plan may have
+_ENOUGH = 20  # pairs that, if all are won by one checkpoint, are significant at any alpha allowed
 
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """A sentence about a draft, and the step of its page at which that is changed."""
+    """Message about a draft, and the step of its page at which that is changed."""
 
     step: str
     text: str
 
 
 def problems(plan: Plan) -> Iterator[Remark]:
-    """What a freeze refuses; only the order of a random schedule, which the freeze draws, is not known before."""
+    """Yield everything that prevents freezing, except an unsuitable random order, which freezing draws."""
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     if not plan.positions.exists():
         yield Remark("conditions", f"{plan} has no position: choose initial conditions")
@@ -45,10 +45,10 @@ def problems(plan: Plan) -> Iterator[Remark]:
 
 
 def _served(plan: Plan) -> Iterator[Remark]:
-    """Strategies that stations would refuse, or of which two would be in force."""
+    """Yield strategies that stations would refuse, and conflicts between those of plan and checkpoints."""
     try:
         check_strategy(plan.strategy)
-    except ValidationError as error:  # of a draft from before it was checked
+    except ValidationError as error:  # the draft predates this validation
         yield Remark("design", f"strategy: {'; '.join(error.messages)}")
     own = [str(row) for row in plan.checkpoints.filter(strategy__isnull=False)]
     if plan.strategy is not None and own:
@@ -58,7 +58,7 @@ def _served(plan: Plan) -> Iterator[Remark]:
 
 
 def covered(plan: Plan, sight: Visibility) -> Callable[[str], str]:
-    """Sentences about a draft as they are said to somebody, without the names of checkpoints hidden from them."""
+    """Return a function that replaces names of hidden checkpoints in messages for this user."""
     rows = [*plan.checkpoints.filter(pk__in=sight.checkpoints), *filter(None, (plan.first, plan.second))]
     names = sorted({row.name for row in rows if row.pk in sight.checkpoints}, key=len, reverse=True)
 
@@ -130,7 +130,7 @@ def _comparisons(plan: Plan, chosen: set[int]) -> Iterator[Remark]:
 
 
 def _finds_nothing(plan: Plan) -> str:
-    """Sentence where not even the clearest outcome of all trials would be significant, "" where one can be."""
+    """Return a message if even the clearest outcome of all trials could not be significant, else ""."""
     n, comparisons = plan.positions.count() * plan.repetitions, len(planned(plan))
     if (
         not (comparisons and 0 < n <= _ENOUGH)
@@ -149,7 +149,7 @@ def _finds_nothing(plan: Plan) -> str:
 
 
 def thoughts(plan: Plan) -> Iterator[Remark]:
-    """What is allowed, and what a reader of the result will ask about."""
+    """Yield remarks on allowed choices that a reader of the result may question."""
     if not plan.question.strip():
         yield Remark(
             "question", "No question is written down: a result is then an answer to whatever is asked later."

@@ -1,4 +1,4 @@
-"""A draft as it is typed: fields of text as values, and a sentence for each that is none."""
+"""Form of a draft: typed text to values, with a message for each invalid field."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _POINTS = 100
 def read(
     given: QueryDict, *, hidden: Collection[int], unseen: int, owners: bool
 ) -> tuple[Values, dict[str, str]]:
-    """Values of a form, and what is wrong with the other fields, by their names.
+    """Return the values of the valid fields, and messages for the invalid ones by name.
 
-    `hidden` checkpoints, by id, cannot be chosen; the draft has `unseen` of them. `owners`: the owner can be chosen.
+    `hidden` checkpoints (ids) cannot be chosen; the draft has `unseen` of them. `owners`: whether the owner is a field.
     """
     form = _Draft(given)
     form.unseen = unseen
@@ -48,7 +48,7 @@ def _plain(value: Any) -> Any:
 
 
 def _of(name: str, **more: Any) -> Any:
-    """The field that a form of the model has."""
+    """Return the form field that the model defines."""
     field: Any = Plan._meta.get_field(name)
     return field.formfield(validators=field.validators, **more)
 
@@ -89,15 +89,15 @@ class _Draft(forms.Form):
     on_timeout = _of("on_timeout")
 
     def clean_question(self) -> str:
-        """Lines end as they do in files of plans, whatever a browser makes of them."""
+        """Normalize line ends to those of plan files."""
         return str(self.cleaned_data["question"]).replace("\r\n", "\n")
 
     def clean_second_rater_share(self) -> float:
-        """Percent, as a share."""
+        """Convert percent to a fraction."""
         return round(float(self.cleaned_data["second_rater_share"]) / _POINTS, 6)
 
     def clean_margin(self) -> float | None:
-        """Points, as a share; none where the question is whether two differ."""
+        """Convert percentage points to a fraction; None if the question is whether two differ."""
         given = self.cleaned_data["margin"]
         if self.cleaned_data.get("kind") != "margin":
             return None
@@ -106,7 +106,7 @@ class _Draft(forms.Form):
         return round(float(given) / _POINTS, 6)
 
     def clean_look_after(self) -> list[int]:
-        """Whole numbers with commas between them; none: a look after every pair."""
+        """Return comma-separated integers; [] for a look after every pair."""
         words = self.cleaned_data["look_after"].replace(",", " ").split()
         try:
             return looks_of([int(word) if _is_number(word) else word for word in words])
@@ -114,7 +114,7 @@ class _Draft(forms.Form):
             raise forms.ValidationError("Allowed: rising numbers of pairs, such as 20, 40, 60.") from None
 
     def clean(self) -> dict[str, Any]:
-        """Control and challenger are checkpoints of the plan that the comparisons name, or nothing."""
+        """Clear control and challenger unless they are checkpoints of the plan that its comparisons name."""
         found = self.cleaned_data
         named = {Comparing.ALL: (), Comparing.CONTROL: ("control",)}.get(
             found.get("comparing"), ("control", "challenger")
@@ -124,5 +124,5 @@ class _Draft(forms.Form):
             if found.get(name) not in chosen or name not in named:
                 found[name] = ""
         if found.get("challenger") == found.get("control") or len(chosen) - 1 + self.unseen == 2:
-            found["challenger"] = ""  # of two checkpoints it is the other one
+            found["challenger"] = ""  # with two checkpoints the challenger is implied
         return found

@@ -1,8 +1,8 @@
-"""A draft as plain values, by field: what a person has before them, what they changed of it, what a change makes of it.
+"""A plan's draft as plain values by field, and the merging of concurrent edits.
 
-Two people may have the same draft open. Each sends what they were shown with what they typed: a field that both changed
-is a conflict that names both values, and is not written. Checkpoints that are hidden from a person are not among the
-values, and stay what they are.
+Two users may edit one draft at a time. Each form sends the values it was loaded with and the typed ones: a field that
+both changed is a conflict and is not written. Checkpoints hidden from a user are not among the values, and stay
+unchanged.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from evaweb.canonical import digest
 from evaweb.plans.models import Comparing, Plan
 from evaweb.trials.models import Checkpoint
 
-HIDDEN = "hidden"  # stands for a checkpoint that the person is not told
+HIDDEN = "hidden"  # placeholder for a checkpoint hidden from the user
 _PLAIN = (
     *("title", "question", "comparing", "stopping", "repetitions", "alpha", "look_after", "drop_arms"),
     *("allocation", "outcome", "margin", "blind", "second_rater_share", "match_gate"),
@@ -29,17 +29,17 @@ Roles = tuple[int | None, int | None]
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """A draft after a change: its values, and the fields that were not written because somebody else changed them."""
+    """Draft after an edit: its values, and the fields not written because another user changed them."""
 
     now: Values
     conflicts: tuple[str, ...]
 
 
 def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
-    """Everything of the draft that the plan's pages edit, as far as it is not hidden.
+    """Return the values of the draft that its pages edit, without hidden ones.
 
-    `control` is the checkpoint with which others are compared, `challenger` the one that is compared with it where that
-    is one of several: with two checkpoints it is the other one.
+    `control` is the checkpoint with which others are compared; `challenger` the one compared with it, if there are more
+    than two checkpoints (with two it is the other one).
     """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     control, challenger = _roles(plan)
@@ -57,14 +57,14 @@ def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
 
 
 def digest_of(values: Values) -> str:
-    """Name of the draft as a person has it before them."""
+    """Return the digest that identifies the draft as a user sees it."""
     return digest(values)
 
 
 def merged(
     now: Values, was: Mapping[str, Any], wanted: Values, keep: Collection[str]
 ) -> tuple[Values, list[str]]:
-    """The fields to be written, and those that somebody else changed too; `keep`: written all the same."""
+    """Return the fields to write, and the conflicting fields; those in `keep` are written in spite of a conflict."""
     written, conflicts = {}, []
     for name, value in wanted.items():
         if name not in now or value == now[name]:
@@ -77,8 +77,8 @@ def merged(
 
 
 def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
-    """Make the draft what `values` say; it is not saved, but for the lists of positions, stations and checkpoints."""
-    roles = _roles(plan)  # under the meaning that they had: `comparing` may be among what changes
+    """Set the draft's fields to `values`; only positions, stations and checkpoints are saved."""
+    roles = _roles(plan)  # read before the change: their meaning depends on `comparing`
     for name in values.keys() & set(_PLAIN):
         setattr(plan, name, values[name])
     plan.owner_id = values["owner"]
@@ -91,7 +91,7 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
 
 
 def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None:
-    """The comparison's first and second of control and challenger; `roles` are those before the change."""
+    """Set the comparison's first and second from control and challenger; `roles` are those before the change."""
     control, challenger = roles
     control = control if values["control"] == HIDDEN else _number(values["control"])
     challenger = challenger if values["challenger"] == HIDDEN else _number(values["challenger"])
@@ -104,7 +104,7 @@ def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None
     elif plan.comparing == Comparing.CONTROL:
         first, second = control, None
     elif control is None or challenger is None:
-        first, second = None, control  # said, and refused by the checks until both are
+        first, second = None, control  # keeps the control; the checks refuse the plan until both are chosen
     else:
         first, second = challenger, control
     rows = Checkpoint.objects.in_bulk([pk for pk in (first, second) if pk])
@@ -113,7 +113,7 @@ def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None
 
 
 def _roles(plan: Plan) -> Roles:
-    """Control and challenger of a draft, by id."""
+    """Return control and challenger of a draft by id."""
     if plan.comparing == Comparing.CONTROL:
         return plan.first_id, None
     return plan.second_id, plan.first_id

@@ -1,14 +1,14 @@
-"""Scenes, checkpoints and plans as TOML: what one lab wrote down, another reads.
+"""Import and export of scenes, checkpoints and plans as TOML, for exchange between labs.
 
     [[scene]]       name, title, instruction, criterion, layout, time_limit_s, ordered, failure_required
     [[scene.position]]   number, label, description, bench
     [[scene.milestone]]  order, text, points, required, time_limit_s, truth
     [[checkpoint]]  name, description, policy, digest, parent (a name), recipe, tags, strategy, anchor
     [[plan]]        name, title, question, positions (scene and number each), checkpoints, repetitions, ...
-    [[reference]]   which picture a camera's reference at a position is; see .references
+    [[reference]]   picture of a camera at a position; see `references`
 
-What is there already under the same name is left where it is the same, changed where no trial was made with it, and
-refused, with the differences, where one was. All of a file is taken, or nothing.
+An existing object of the same name is left unchanged if equal, changed if no trial uses it, and otherwise the file is
+refused with the differences. A file is imported as a whole, or not at all.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def export_toml(
     checkpoints: list[Checkpoint] | None = None,
     plans: list[Plan] | None = None,
 ) -> str:
-    """A file with these, and with the scenes and checkpoints that the plans are made of."""
+    """Return a TOML file with these objects, and the scenes and checkpoints that the plans use."""
     return _written(scenes, checkpoints, plans)[0]
 
 
@@ -84,7 +84,7 @@ def export_archive(
     checkpoints: list[Checkpoint] | None = None,
     plans: list[Plan] | None = None,
 ) -> bytes:
-    """The same as an archive, with the reference pictures of the positions."""
+    """Return an archive of `export_toml` with the reference pictures of the positions."""
     text, references = _written(scenes, checkpoints, plans)
     return packed(text, "lab.toml", references)
 
@@ -112,7 +112,7 @@ def _written(
 
 def _scene_table(scene: Scene) -> dict[str, Any]:
     table = scene_of(scene, list(scene.positions.order_by("number")))
-    table["failure_required"] = scene.failure_required  # what is asked of raters: no part of a frozen plan
+    table["failure_required"] = scene.failure_required  # a rule for raters, not part of a frozen plan
     table["position"], table["milestone"] = table.pop("positions"), table.pop("milestones")
     return table
 
@@ -131,7 +131,7 @@ def _checkpoint_table(checkpoint: Checkpoint) -> dict[str, Any]:
 
 
 def _generation(checkpoint: Checkpoint) -> tuple[int, str]:
-    """In this order every checkpoint comes after the one that it was trained on from."""
+    """Return a sort key that places every checkpoint after its parent."""
     return len(checkpoint.lineage), checkpoint.name
 
 
@@ -165,7 +165,7 @@ def _plan_table(plan: Plan) -> dict[str, Any]:
 
 
 def _without_none(value: Any) -> Any:
-    """TOML has no null: what is not set is not written."""
+    """Remove None values, because TOML has no null."""
     if isinstance(value, Mapping):
         return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
     if isinstance(value, list):
@@ -177,9 +177,9 @@ def _without_none(value: Any) -> Any:
 
 
 def import_file(*, user: User, text: str, pictures: Mapping[str, bytes] | None = None) -> list[str]:
-    """Take a file; what was done, a line each. EvaError or Conflict names what cannot be, and nothing is taken then.
+    """Import a file and return a message per object. Raises: EvaError or Conflict; nothing is imported then.
 
-    `pictures`: those of an archive, by the names that references have in the text.
+    `pictures`: content of an archive, by the names that references use.
     """
     require_role(user, Role.ADMIN)
     given = _read(text)

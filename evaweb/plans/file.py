@@ -1,4 +1,4 @@
-"""Format of a file of scenes, checkpoints, plans and references; see .exchange for what is done with it."""
+"""Format of a TOML file with scenes, checkpoints, plans and references; see `exchange` for import and export."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _Name = Annotated[str, Field(min_length=1, max_length=120)]
 
 
 class Table(BaseModel):
-    """A table of the file; keys that it does not know are refused."""
+    """Table of the file; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class PositionTable(Table):
-    """A position of a scene."""
+    """Position of a scene."""
 
     number: int = Field(ge=0, lt=2**15)
     label: str = ""
@@ -27,7 +27,7 @@ class PositionTable(Table):
 
 
 class MilestoneTable(Table):
-    """A milestone of a scene."""
+    """Milestone of a scene."""
 
     order: int = Field(ge=0, lt=2**15)
     text: str = Field(min_length=1, max_length=200)
@@ -38,7 +38,7 @@ class MilestoneTable(Table):
 
 
 class SceneTable(Table):
-    """A scene with its positions and milestones."""
+    """Scene with its positions and milestones."""
 
     name: _Name
     title: _Name
@@ -53,7 +53,7 @@ class SceneTable(Table):
 
 
 class CheckpointTable(Table):
-    """A checkpoint, and which it was trained on from."""
+    """Checkpoint with its parent in training."""
 
     name: _Name
     description: str = ""
@@ -67,14 +67,14 @@ class CheckpointTable(Table):
 
 
 class PlaceTable(Table):
-    """A position by its scene."""
+    """Position identified by scene and number."""
 
     scene: str
     number: int
 
 
 class PlanTable(Table):
-    """A plan: what its draft becomes."""
+    """Plan, which becomes a draft."""
 
     name: _Name
     title: _Name
@@ -102,7 +102,7 @@ class PlanTable(Table):
 
 
 class ReferenceTable(Table):
-    """Which picture a camera's reference at a position is."""
+    """Reference picture of a camera at a position."""
 
     scene: str = Field(max_length=60)
     position: int = Field(ge=0, lt=2**15)
@@ -113,7 +113,7 @@ class ReferenceTable(Table):
 
 
 class File(Table):
-    """All of a file."""
+    """Whole file."""
 
     scene: list[SceneTable] = []
     checkpoint: list[CheckpointTable] = []

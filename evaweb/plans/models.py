@@ -1,4 +1,4 @@
-"""Plans, the trials that they foresee, who was handed which, and who looked."""
+"""Plans, their slots, handouts, unblindings and camera checks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PlanState(models.TextChoices):
 
 
 class StoppingRule(models.TextChoices):
-    """Design of a plan's comparison: when it is looked at, and what ends it; see evaweb.statistics.designs."""
+    """Design of a plan's comparison: times of its looks, and stopping rule; see evaweb.statistics.designs."""
 
     NONE = "none", "fixed: all trials are made, one test at the end"
     EVIDENCE = "evidence", "anytime: an e-process, looked at after every pair"
@@ -35,7 +35,7 @@ class StoppingRule(models.TextChoices):
 
 
 class PrimaryOutcome(models.TextChoices):
-    """What the comparison is about."""
+    """Compared quantity."""
 
     SUCCESS = "success", "success"
     SCORE = "score", "score (partial credit)"
@@ -57,7 +57,7 @@ class Comparing(models.TextChoices):
 
 
 class CountsAs(models.TextChoices):
-    """What a run counts as that did not end by itself."""
+    """How a run that ended prematurely counts."""
 
     JUDGED = "judged", "judged: the operator scores it, or has it repeated"
     FAILURE = "failure", "a failure of its checkpoint"
@@ -65,17 +65,17 @@ class CountsAs(models.TextChoices):
 
 
 class TimeCountsAs(models.TextChoices):
-    """The same of a run that its time limit ended, which is whole."""
+    """How a run that ended at its time limit counts; such a run is complete."""
 
     JUDGED = "judged", "judged: by what was reached"
     FAILURE = "failure", "a failure of its checkpoint"
 
 
 class Plan(models.Model):
-    """One version of an evaluation: while a draft it is edited, frozen it is a document that nobody changes.
+    """One version of an evaluation: editable as a draft, immutable once frozen.
 
-    `document` and its `digest` are the frozen form. `key` is the secret that schedule, codes and commitment are made
-    of, until the reveal.
+    `document` and its `digest` are the frozen form. `key` is the secret from which schedule, codes and commitment are
+    derived, until the reveal.
     """
 
     name = models.SlugField(max_length=60, help_text="Of all its versions; in addresses and exports.")
@@ -271,17 +271,17 @@ class Plan(models.Model):
 
     @property
     def kept_at(self) -> datetime | None:
-        """When what counts was kept: at the reveal, of a plan that is not blind at its close; None before."""
+        """When the result was stored: at the reveal, or at the close of an open plan; None before."""
         return datetime.fromisoformat(self.at_reveal["at"]) if self.at_reveal else self.revealed_at
 
     @property
     def sealed(self) -> bool:
-        """Whether which checkpoint ran is still a secret."""
+        """Whether the checkpoints of its trials are still secret."""
         return self.blind and self.state in (PlanState.FROZEN, PlanState.CLOSED)
 
 
 class Slot(models.Model):
-    """One trial that a plan foresees, in the order in which they are handed out."""
+    """Scheduled trial of a plan, in order of handout."""
 
     plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="slots")
     index = models.PositiveIntegerField()
@@ -315,7 +315,7 @@ class Slot(models.Model):
 
 
 class Handout(models.Model):
-    """A trial as it was handed out: for which slot, under which code. Each attempt is a handout of its own."""
+    """Trial as handed out: its slot and code. Each attempt has its own handout."""
 
     plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="handouts")
     number = models.PositiveIntegerField(help_text="In the order in which they were handed out, from 1.")
@@ -340,7 +340,7 @@ class Handout(models.Model):
 
 
 class Look(models.Model):
-    """Somebody saw what is sealed: from then on they run none of the plan's trials."""
+    """Unblinding of a plan by a user, who can run none of its trials from then on."""
 
     plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="looks")
     user = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.PROTECT, related_name="+")
@@ -357,7 +357,7 @@ class Look(models.Model):
 
 
 class PlanEvent(models.Model):
-    """What was done with a plan, by whom and why: never changed, never removed."""
+    """Record of an action on a plan with user and reason; append-only."""
 
     plan = models.ForeignKey(Plan, on_delete=models.PROTECT, related_name="events")
     at = models.DateTimeField(auto_now_add=True)
@@ -375,10 +375,10 @@ class PlanEvent(models.Model):
 
 
 class Reference(models.Model):
-    """What a camera of a station shows of a position as it should lie; without a position what the camera shows at all.
+    """Reference picture of a camera: of a position as laid out, or without a position of the camera's view.
 
-    The newest of a camera and position counts. `picture` names a file: see evaweb.plans.pictures. `regions` are where
-    its objects lie: see evaweb.plans.regions; others are another row with the same picture.
+    The newest per camera and position counts. `picture` names a file: see evaweb.plans.pictures. `regions` are around
+    objects: see evaweb.plans.regions; changed regions are a new row with the same picture.
     """
 
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="references")
@@ -402,11 +402,11 @@ class Reference(models.Model):
 
 
 class Achieved(models.Model):
-    """What a camera showed when a trial's run was asked for, and how well that matches the reference there was.
+    """Image of a camera before a trial's run, and its match to the reference at that time.
 
-    `match` is evaweb.plans.pictures.image_match, of the whole picture; `regions` what
-    evaweb.plans.regions.match_regions found in each of the reference's, which count in its place where there are
-    any. `override`: why a lower one than the plan's least was accepted.
+    `match` is evaweb.plans.pictures.image_match of the whole picture; `regions` is the result of
+    evaweb.plans.regions.match_regions, which counts instead if the reference has regions. `override`: why a match
+    below the plan's least one was accepted.
     """
 
     trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="achieved")
@@ -431,9 +431,9 @@ class Achieved(models.Model):
 
 
 class CameraCheck(models.Model):
-    """Somebody confirmed that each camera of a station shows what its reference shows.
+    """Confirmation by a user that each camera of a station shows the same as its reference.
 
-    It holds for them until the station is started anew or half a day is over. `seen`: camera -> {"picture",
+    Valid for that user until the station restarts or half a day has passed. `seen`: camera -> {"picture",
     "reference", "match"}.
     """
 

@@ -1,6 +1,6 @@
-"""Current pictures of a station's cameras, the match of two pictures, and the pictures that are kept.
+"""Current images of a station's cameras, the match of two images, and stored pictures.
 
-A picture is kept in DATA/pictures under the SHA-256 of its bytes: it is never changed, and the same one is there once.
+A picture is stored in DATA/pictures under the SHA-256 of its bytes: it never changes, and equal ones are stored once.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ _PICTURE_X_PIXELS_ALLOWED_X = Pattern(
 WIDTH, HEIGHT = (
     64,
     48,
-)  # to which both pictures are brought before they are compared; static/console/trial/match.js does too
+)  # size at which pictures are compared; the same in static/console/trial/match.js
 _TURN_S = 0.1
 
 
 def current_images(station: Station, cameras: Iterable[str], patience_s: float = 3.0) -> dict[str, bytes]:
-    """A JPEG of each of `cameras` as it is published now; Conflict names those that show nothing."""
+    """Return a current JPEG of each camera. Raises: Conflict, which names cameras without an image in `patience_s`."""
     wanted = set(cameras)
     found: dict[str, bytes] = {}
     until = time.monotonic() + patience_s
@@ -71,9 +71,9 @@ def current_images(station: Station, cameras: Iterable[str], patience_s: float =
 
 
 def image_match(one: bytes, other: bytes) -> float:
-    """Match of two JPEGs: correlation of their grey values at 64 x 48, from 1, the same, to 0, and below 0.
+    """Return the correlation of two JPEGs' grey values at 64 x 48: 1 if identical, 0 or below if unrelated.
 
-    Brightness and contrast as a whole do not count. 0 where one of them is of one grey.
+    Overall brightness and contrast have no influence. 0 if either image is uniform.
     """
     a, b = _grey(one), _grey(other)
     spread = float(np.linalg.norm(a) * np.linalg.norm(b))
@@ -81,7 +81,7 @@ def image_match(one: bytes, other: bytes) -> float:
 
 
 def store_image(jpeg: bytes) -> str:
-    """Put the picture on the disk, and return its name."""
+    """Store the picture, synced to disk, and return its name."""
     name = hashlib.sha256(jpeg).hexdigest()
     path = _path(name)
     if not path.exists():
@@ -96,7 +96,7 @@ def store_image(jpeg: bytes) -> str:
 
 
 def load_image(name: str) -> bytes:
-    """The picture of that name; NotFound where it is not on this disk."""
+    """Return the stored picture. Raises: NotFound if it is not on this disk."""
     try:
         return _path(name).read_bytes()
     except FileNotFoundError:
@@ -104,7 +104,7 @@ def load_image(name: str) -> bytes:
 
 
 def has_image(name: str) -> bool:
-    """True if the picture of that name is on this disk."""
+    """Return True if the picture is on this disk."""
     return _path(name).is_file()
 
 
@@ -113,7 +113,7 @@ def _path(name: str) -> Path:
 
 
 def decoded(jpeg: bytes, colorspace: str) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """The pixels [H, W, channels]; EvaError where it is no JPEG, or so large that it is not decoded."""
+    """Return the pixels [H, W, channels]. Raises: EvaError for an invalid JPEG or one that is too large to decode."""
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(jpeg)
         if height * width > MOST_PIXELS:
@@ -129,12 +129,12 @@ def decoded(jpeg: bytes, colorspace: str) -> np.ndarray[tuple[int, ...], np.dtyp
 def brought(
     picture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], height: int, width: int
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """The picture at another size, no larger; each pixel is the mean of those that it stands for."""
+    """Return the picture downscaled to [height, width, channels] by area averaging."""
     rows = np.linspace(0, picture.shape[0], height + 1).round().astype(int)
     columns = np.linspace(0, picture.shape[1], width + 1).round().astype(int)
     bands = np.stack(
         [picture[first:end].sum(axis=0) for first, end in pairwise(rows)]
-    )  # of a whole one no copy
+    )  # avoids a copy of the whole picture
     sums = np.add.reduceat(bands, columns[:-1], axis=1)
     small: np.ndarray[tuple[int, ...], np.dtype[np.float64]] = (
         sums / np.outer(np.diff(rows), np.diff(columns))[..., None]
@@ -143,7 +143,7 @@ def brought(
 
 
 def _grey(jpeg: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Grey values at 64 x 48 around their mean."""
+    """Return the grey values at 64 x 48 minus their mean."""
     picture = decoded(jpeg, "GRAY")
     if picture.shape[0] < HEIGHT or picture.shape[1] < WIDTH:
         raise EvaError(

@@ -1,8 +1,9 @@
-"""Reference pictures of positions in files that labs exchange: which they are in the TOML, they themselves beside it.
+"""Exchange of reference pictures between labs: table in the TOML, picture files in an archive.
 
     [[reference]]  scene, position, station, camera, picture (the SHA-256 of the JPEG, and its name), regions
 
-An archive (zip) has the TOML and pictures/<SHA-256>.jpg. What cameras show at all is of one lab's benches: that stays.
+An archive (zip) contains the TOML and pictures/<SHA-256>.jpg. References of cameras without a position belong to one
+lab's benches and are not exported.
 """
 
 from __future__ import annotations
@@ -61,10 +62,10 @@ _REFERENCE_POSITION_SCENE_DOES_NOT = Pattern(
     "reference: position {position} of scene {scene!r:.60} does not exist",
 )
 
-LARGEST_TEXT = 2_000_000  # bytes of the TOML
+LARGEST_TEXT = 2_000_000  # size of the TOML [bytes]
 LARGEST_PICTURE = 10_000_000
-LARGEST = 400_000_000  # bytes of a file that is imported, and of all that is packed in it
-_MOST = 20_000  # pictures
+LARGEST = 400_000_000  # size of an imported file, and of its unpacked content [bytes]
+_MOST = 20_000  # pictures in an archive
 _PICTURE = re.compile(r"pictures/([0-9a-f]{64})\.jpg")
 
 
@@ -72,7 +73,7 @@ _PICTURE = re.compile(r"pictures/([0-9a-f]{64})\.jpg")
 
 
 def reference_tables(scenes: Iterable[Scene]) -> list[dict[str, Any]]:
-    """The newest of each camera at each position of these."""
+    """Return the newest reference of each camera at each position of these scenes."""
     rows = Reference.objects.filter(position__scene__in=list(scenes)).select_related(
         "position__scene", "station"
     )
@@ -93,7 +94,7 @@ def reference_tables(scenes: Iterable[Scene]) -> list[dict[str, Any]]:
 
 
 def packed(text: str, name: str, references: Iterable[Mapping[str, Any]]) -> bytes:
-    """An archive of the TOML, as `name`, with those of the pictures that are on this disk."""
+    """Return an archive with the TOML as `name`, and the referenced pictures that are on this disk."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, text)
@@ -101,12 +102,12 @@ def packed(text: str, name: str, references: Iterable[Mapping[str, Any]]) -> byt
             try:
                 jpeg = pictures.load_image(picture)
             except NotFound:
-                continue  # whoever imports the archive is told which it has not
+                continue  # the import reports missing pictures
             archive.writestr(f"pictures/{picture}.jpg", jpeg, zipfile.ZIP_STORED)
     return content.getvalue()
 
 
-_DAMAGED = (  # what the ways of packing say of bytes that are not theirs
+_DAMAGED = (  # exceptions of zip and its compression methods for invalid data
     *(
         zipfile.BadZipFile,
         zipfile.LargeZipFile,
@@ -123,7 +124,7 @@ _DAMAGED = (  # what the ways of packing say of bytes that are not theirs
 
 
 def unpacked(content: bytes) -> tuple[str, dict[str, bytes]]:
-    """The TOML of a file that is TOML or an archive, and the pictures by name; EvaError says what is wrong with it."""
+    """Return text and pictures (by name) of a TOML file or archive. Raises: EvaError if it is invalid."""
     if not content.startswith(b"PK"):
         return _text(content, "the file"), {}
     try:
@@ -159,7 +160,7 @@ def _of(archive: zipfile.ZipFile) -> tuple[str, dict[str, bytes]]:
 
 
 def _read(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, most: int) -> bytes:
-    with archive.open(entry) as file:  # what an entry says of its size may be wrong
+    with archive.open(entry) as file:  # the declared size of an entry may be wrong
         content = file.read(most + 1)
     if len(content) > most:
         raise EvaError(_HAS_MORE_THAN_BYTES_WHICH(filename=entry.filename, most=most))
@@ -176,7 +177,7 @@ def _text(content: bytes, name: str) -> str:
 
 
 def take_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
-    """Keep the pictures and make them references where this lab has none of its own; a line for each scene."""
+    """Store the pictures, and make them references if this lab has none; return a message per scene."""
     told: dict[str, Counter[str]] = {}
     for row in rows:
         told.setdefault(row["scene"], Counter())[_taken(row, found, user)] += 1
@@ -200,7 +201,7 @@ def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> st
     jpeg = found.get(row["picture"])
     if ours is not None:
         if jpeg is not None:
-            pictures.store_image(jpeg)  # its file may have been lost
+            pictures.store_image(jpeg)  # restores a lost file
         return "the same"
     if jpeg is None and not pictures.has_image(row["picture"]):
         return "left out, because the file lacks their pictures: import the archive"

@@ -1,9 +1,9 @@
-"""Regions of a reference picture, drawn where an object lies, and how well a picture matches the reference in each.
+"""Regions of a reference picture around objects, and the match of a live picture in each.
 
-A region's match is a normalised cross-correlation of the three colours at the camera's own resolution, but no more
-than 640 pixels wide: the best one within TOLERANCE of where the region was drawn. Both pictures are brought to details
-of 5 to 33 pixels before, which leaves out noise of the sensor, and light that changes over the bench. Brightness does
-not count, nor contrast between half and twice; beyond that the match falls: a trace of an object is none.
+A region's match is a normalised cross-correlation of the three colours at the camera's own resolution, but at most 640
+pixels wide: the best within TOLERANCE of the drawn place. Both pictures are band-passed first to details of 5 to 33
+pixels, which removes sensor noise and slowly varying light. Brightness has no influence, nor has contrast between half
+and double; beyond that the match decreases, so that a faint trace of an object does not match.
 """
 
 from __future__ import annotations
@@ -36,14 +36,16 @@ _REGION_HAS_NO_PIXEL_PICTURE = Pattern(
     "the reference is",
 )
 
-MOST = 12  # of one picture
-WIDEST = 640  # pixels of a picture that is compared
-TOLERANCE = 4  # pixels of these: what a camera gives way, far less than an object that was laid elsewhere
-REACH = 40  # pixels of these: how far an object that lies elsewhere is looked for
-_LEAST = 8  # pixels of a region's side
-_SEEN = 0.75  # match at another place from which the object is said to lie there
-_FLAT = 1.5  # grey levels of spread below which a picture shows nothing
-_FINE, _COARSE = 2, 16  # pixels to each side: means over these are what is left of noise, and of light
+MOST = 12  # regions per picture
+WIDEST = 640  # width at which pictures are compared [px]
+TOLERANCE = (
+    4  # allowed displacement [px at WIDEST]: movement of a camera, far less than of a misplaced object
+)
+REACH = 40  # search radius for a displaced object [px at WIDEST]
+_LEAST = 8  # smallest side of a region [px]
+_SEEN = 0.75  # match at which a displaced object counts as recognised
+_FLAT = 1.5  # spread below which a region is uniform [grey levels]
+_FINE, _COARSE = 2, 16  # half widths of the two averaging windows of the band-pass [px]
 
 _Pixels = np.ndarray[tuple[int, ...], np.dtype[Any]]
 _Share = Annotated[float, Field(ge=0, le=1)]
@@ -71,7 +73,7 @@ _REGIONS = TypeAdapter(Annotated[list[Region], Field(max_length=MOST)])
 
 
 def regions_of(given: Any) -> list[Region]:
-    """The regions of plain values, each name once; EvaError names what is wrong with which."""
+    """Return the validated regions with distinct names. Raises: EvaError with the first problem."""
     try:
         found = _REGIONS.validate_python(given)
     except ValidationError as error:
@@ -86,7 +88,7 @@ def regions_of(given: Any) -> list[Region]:
 
 
 def check_sizes(found: list[Region], jpeg: bytes) -> None:
-    """EvaError where a region is too small on this picture, or shows nothing that could be recognised."""
+    """Raise EvaError if a region is too small on this picture, or too uniform to be recognised."""
     picture = _to_common_size([decoded(jpeg, "RGB")])[0]
     for region in found:
         top, left, bottom, right = _box(region, picture)
@@ -101,11 +103,11 @@ def check_sizes(found: list[Region], jpeg: bytes) -> None:
 
 
 def match_regions(found: list[Region], reference: bytes, now: bytes) -> list[dict[str, Any]]:
-    """Of each region {"name", "at", "match", "dx", "dy", "words"}; dx and dy are None where its object is not seen.
+    """Return for each region {"name", "at", "match", "dx", "dy", "words"}.
 
-    `at` is the region, [x, y, width, height] as shares; `match` goes from 1, the same, to 0; `dx` to the right and `dy`
-    down say by how many pixels of the live picture the object lies elsewhere, `words` the same in words. EvaError where
-    the live picture is so small that a region has no pixel.
+    `at` is the region, [x, y, width, height] as fractions; `match` ranges from 1 (identical) to 0; `dx` (to the right)
+    and `dy` (down) are the displacement of the object in pixels of the live picture, None if it is not recognised;
+    `words` is the same as text. Raises: EvaError if the live picture is so small that a region has no pixel.
     """
     live = decoded(now, "RGB")
     before, after = _to_common_size([decoded(reference, "RGB"), live])
@@ -137,7 +139,7 @@ def _found(region: Region, before: _Pixels, after: _Pixels, scale: tuple[float, 
     right, below = int(across[column]), int(down[row])
     seen = (
         places[row, column] >= _SEEN and max(abs(right), abs(below)) < REACH
-    )  # at the end it goes on rising
+    )  # a maximum at the edge of the search area is not a peak
     dx, dy = round(right * scale[0]), round(below * scale[1])
     return {
         "match": round(float(np.clip(near.max(), 0, 1)), 4),
@@ -154,7 +156,7 @@ def _words(dx: int, dy: int) -> str:
 
 
 def _correlations(wanted: _Pixels, around: _Pixels) -> _Pixels:
-    """Match of `wanted` with each place of `around` at which all of it lies inside."""
+    """Return the match of `wanted` at each position of `around` where it fits entirely."""
     height, width, _ = wanted.shape
     shape = around.shape[:2]
     centred = wanted - wanted.mean(axis=(0, 1))
@@ -172,7 +174,7 @@ def _correlations(wanted: _Pixels, around: _Pixels) -> _Pixels:
 
 
 def _sums(values: _Pixels, height: int, width: int) -> _Pixels:
-    """Sums of the values in each window of this size."""
+    """Return the sums of the values in each window of this size."""
     total = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0), (0, 0)))
     inside: _Pixels = (
         total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
@@ -185,7 +187,7 @@ def _spread(values: _Pixels) -> float:
 
 
 def _box(region: Region, picture: _Pixels) -> tuple[int, int, int, int]:
-    """First row and column, and those after the last."""
+    """Return first row and column, and the ones after the last."""
     height, width = picture.shape[:2]
     return (
         round(region.y * height),
@@ -196,7 +198,7 @@ def _box(region: Region, picture: _Pixels) -> tuple[int, int, int, int]:
 
 
 def _to_common_size(pictures: list[_Pixels]) -> list[_Pixels]:
-    """The pictures at the size of the smallest, no wider than WIDEST."""
+    """Scale the pictures to the size of the smallest, at most WIDEST wide."""
     height = min(picture.shape[0] for picture in pictures)
     width = min(picture.shape[1] for picture in pictures)
     if width > WIDEST:
@@ -208,7 +210,7 @@ def _to_common_size(pictures: list[_Pixels]) -> list[_Pixels]:
 
 
 def _band_passed(picture: _Pixels, box: tuple[int, int, int, int]) -> _Pixels:
-    """What is between fine and coarse in the box of the picture, with what lies around it in view."""
+    """Return the band-passed box of the picture, filtered with the surrounding pixels."""
     top, left, bottom, right = box
     wide = (top - _COARSE, left - _COARSE, bottom + _COARSE, right + _COARSE)
     first_row, first_column, last_row, last_column = _inside(wide, picture)
@@ -229,5 +231,5 @@ def _means(values: _Pixels, side: int) -> _Pixels:
 
 
 def _inside(box: tuple[int, int, int, int], picture: _Pixels) -> tuple[int, int, int, int]:
-    """What of the box lies inside the picture."""
+    """Return the box clipped to the picture."""
     return max(0, box[0]), max(0, box[1]), min(picture.shape[0], box[2]), min(picture.shape[1], box[3])

@@ -1,7 +1,7 @@
-"""The reveal of a plan on the disk: a database that is put back does not make it undone.
+"""Reveals of plans on disk, so that a restored database backup cannot undo them.
 
-DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first line counts, whatever came later. Its
-`at_reveal` has who revealed, and the commitment and key of then: a plan that is frozen again has others.
+DATA/reveals/UUID.jsonl, named by the first half of the plan's digest. The first line counts, whatever follows. Its
+`at_reveal` has the user, commitment and key at that time: a plan that is frozen again has others.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class RevealLine(Line):
-    """A reveal: what of the plan's comparison counts from then on."""
+    """Reveal of a plan, with the result that counts from then on."""
 
     kind: Literal["reveal"] = "reveal"
     name: str
@@ -36,14 +36,16 @@ REVEALS: Journal[RevealLine] = Journal("reveals", RevealLine)
 
 
 def first_reveal(plan: Plan) -> RevealLine | None:
-    """The first reveal of a frozen plan, of whatever database; None before it."""
+    """Return the first reveal of a frozen plan, whichever database wrote it; None before it."""
     lines = REVEALS.read(_file(plan), log.warning)
     return next((line for line in lines if line.digest == plan.digest), None)
 
 
 def write_reveal(plan: Plan, user: User, at: datetime) -> None:
-    """Write down a reveal, or the close of a plan that is not blind, that is about to be saved, and complete its
-    `at_reveal`. Raises NotKept."""
+    """Write a reveal, or the close of an open plan, before its row is saved, and complete its `at_reveal`.
+
+    Raises: NotWritten.
+    """
     by = user.get_username()
     if plan.at_reveal is not None:
         key = bytes(plan.key or b"").hex()

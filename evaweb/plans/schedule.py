@@ -1,12 +1,12 @@
-"""The order of the trials of a plan: blocks at one initial condition each, at random and balanced.
+"""Order of a plan's trials: blocks at one initial condition each, randomised and balanced.
 
-Paired: every checkpoint is tried once in a block, one after the other, so that each comparison is made under the same
-condition at nearly the same time (Kress-Gazit et al. 2024). Rounds go through all conditions before any is repeated.
-The order within a block is drawn for each by itself: what ran before says nothing of it. (Plans of format 5 and before
-took rows of Latin squares, by which one recognised trial told of blocks to come.)
+Paired: a block tries every checkpoint once in succession, so that each comparison is made under the same condition at
+nearly the same time (Kress-Gazit et al. 2024). Rounds cover all conditions before any is repeated. The order within
+each block is drawn independently, so that earlier blocks reveal nothing about it. (Plans up to format 5 used rows of
+Latin squares, in which one recognised trial revealed parts of later blocks.)
 
-Random: a block has two trials, each of one of two checkpoints by a fair coin, but where one is `IMBALANCE` trials ahead
-at that condition the other comes (the big stick design, Soares and Wu 1983): what was determines little of what comes.
+Random: a block has two trials, each of one of two checkpoints by a fair coin, except that a checkpoint `IMBALANCE`
+trials behind at that condition comes next (the big stick design, Soares and Wu 1983), so few trials are predictable.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ _CHECKPOINTS_X_CONDITIONS_X_REPETITIONS = Pattern(
     "allowed: {most}",
 )
 
-MOST = 20_000  # trials of one plan: more is a mistake in the form
+MOST = 20_000  # trials per plan; more is a mistake in the form
 IMBALANCE = (
-    3  # trials by which one of two checkpoints may be ahead at a condition: one of six trials is determined
+    3  # greatest lead of one checkpoint at a condition [trials]; with 3, one of six trials is determined
 )
 PAIRED, RANDOM = "paired", "random"
-_LEAST = 5  # blocks in random order: fewer may well have one checkpoint alone
+_LEAST = 5  # least number of blocks in random order; fewer may contain only one checkpoint
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One initial condition: a position of a scene, by their names in the plan."""
+    """Initial condition: a position of a scene, by their names in the plan."""
 
     scene: str
     position: int
@@ -60,7 +60,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One trial to be made: the `index`-th of the plan, `place` within its block, `repetition` from 1."""
+    """Scheduled trial: the `index`-th of the plan, at `place` within its block, `repetition` from 1."""
 
     index: int
     block: int
@@ -71,7 +71,7 @@ class Unit:
 
     @property
     def row(self) -> list[Any]:
-        """As it is committed to: index, block, checkpoint, scene, position, repetition."""
+        """Row for the commitment: index, block, checkpoint, scene, position, repetition."""
         where = self.condition
         return [self.index, self.block, self.checkpoint, where.scene, where.position, self.repetition]
 
@@ -85,9 +85,9 @@ def schedule(
     allocation: str = PAIRED,
     latin: bool = False,
 ) -> list[Unit]:
-    """All trials of a plan in the order in which they are handed out; the same for the same plan and key.
+    """Return all trials of a plan in order of handout; deterministic for a plan and key.
 
-    `latin`: of a plan of format 5 or before.
+    `latin`: use the scheme of plans up to format 5.
     """
     check_schedule(checkpoints, conditions, repetitions, allocation)
     units: list[Unit] = []
@@ -98,7 +98,7 @@ def schedule(
         for condition in SeededDraws(key, f"conditions/{repetition}").shuffled(list(conditions)):
             there = next(orders) if allocation == PAIRED else [drawn.next(condition) for _ in range(2)]
             for place, checkpoint in enumerate(there):
-                # Where a block may have two of one checkpoint its number must not say so.
+                # The number must not reveal that a block has one checkpoint twice.
                 number = repetition if allocation == PAIRED else 2 * repetition - 1 + place
                 units.append(Unit(len(units), block, place, checkpoint, condition, number))
             block += 1
@@ -106,22 +106,22 @@ def schedule(
 
 
 class _Coins:
-    """Draws one of two checkpoints, trial by trial."""
+    """Random allocation of two checkpoints, trial by trial."""
 
     def __init__(self, checkpoints: list[str], chance: SeededDraws) -> None:
         self._checkpoints, self._chance = checkpoints, chance
         self._ahead: dict[Condition, int] = {}
 
     def next(self, condition: Condition) -> str:
-        """The checkpoint of the next trial at a condition."""
-        ahead = self._ahead.get(condition, 0)  # by how many trials the first one is
+        """Return the checkpoint of the next trial at a condition."""
+        ahead = self._ahead.get(condition, 0)  # lead of the first checkpoint
         second = ahead == IMBALANCE or (ahead > -IMBALANCE and self._chance.below(2) == 1)
         self._ahead[condition] = ahead + (-1 if second else 1)
         return self._checkpoints[second]
 
 
 def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, int]]:
-    """Trials of two checkpoints after each block."""
+    """Return the numbers of trials of two checkpoints after each block."""
     found: list[tuple[int, int]] = []
     for unit in units:
         if unit.block == len(found):
@@ -132,13 +132,13 @@ def counts_of(units: Sequence[Unit], names: Sequence[str]) -> list[tuple[int, in
 
 
 def _orders(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
-    """Orders of the checkpoints, block by block, each drawn by itself."""
+    """Yield an independently drawn order of the checkpoints for each block."""
     while True:
         yield chance.shuffled(checkpoints)
 
 
 def foretold(checkpoints: int, allocation: str) -> str:
-    """What an operator who recognises every checkpoint knows beforehand, whatever is hidden from them."""
+    """Return which trials an operator who recognises every checkpoint can predict, in spite of blinding."""
     share = checkpoints if allocation == PAIRED else 2 * IMBALANCE
     which = (
         "the last trial of each block"
@@ -149,7 +149,7 @@ def foretold(checkpoints: int, allocation: str) -> str:
 
 
 def _latin(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
-    """Orders of the checkpoints, block by block: rows of Latin squares, each drawn anew."""
+    """Yield an order of the checkpoints for each block: rows of randomly drawn Latin squares."""
     k = len(checkpoints)
     while True:
         names = chance.shuffled(checkpoints)
@@ -160,7 +160,7 @@ def _latin(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
 def check_schedule(
     checkpoints: Sequence[str], conditions: Sequence[Condition], repetitions: int, allocation: str
 ) -> None:
-    """EvaError says why there can be no schedule of these."""
+    """Raise EvaError if there can be no schedule with these parameters."""
     for what, items in (("checkpoint", checkpoints), ("condition", conditions)):
         if not items:
             raise EvaError(_NO_PLAN_NEEDS_AT_LEAST(what=what))

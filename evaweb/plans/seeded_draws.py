@@ -1,7 +1,7 @@
-"""Draws that anyone can repeat: HMAC-SHA-256 of a secret key and the name of what is drawn.
+"""Reproducible random draws: HMAC-SHA-256 of a secret key and the name of the drawn quantity.
 
-Not a library's generator, because a schedule has to come out the same after years, in another version, and in the
-reviewer's own program.
+Not a library's generator, because a schedule must be reproducible after years, with other versions, and by a reviewer's
+own program.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ T = TypeVar("T")
 
 
 def new_key() -> bytes:
-    """256 bits from the operating system."""
+    """Return 256 random bits from the operating system."""
     return secrets.token_bytes(KEY_BYTES)
 
 
 class SeededDraws:
-    """A sequence of draws by `key`, for what `name` says; the same for both, independent of all others."""
+    """Sequence of draws determined by `key` and `name`, independent of sequences with other names."""
 
     def __init__(self, key: bytes, name: str) -> None:
         self._key = key
@@ -30,7 +30,7 @@ class SeededDraws:
         self._drawn = 0
 
     def below(self, n: int) -> int:
-        """A whole number from 0 to `n` - 1, each equally likely: 64 bits, drawn again where they would favour some."""
+        """Return an integer from 0 to `n` - 1, uniformly: 64 bits, redrawn if they would introduce a bias."""
         fair = 2**64 - 2**64 % n
         while True:
             message = f"{self._name}/{self._drawn}".encode()
@@ -40,7 +40,7 @@ class SeededDraws:
                 return drawn % n
 
     def shuffled(self, items: Sequence[T]) -> list[T]:
-        """`items` in an order of which each is equally likely (Fisher and Yates, from the end)."""
+        """Return `items` in a uniformly random order (Fisher-Yates, from the end)."""
         found = list(items)
         for i in range(len(found) - 1, 0, -1):
             j = self.below(i + 1)

@@ -1,4 +1,4 @@
-"""Reads of plans."""
+"""Queries on plans."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NO_SUCH_REFERENCE = Pattern(
 
 
 def plan_list(*, user: Any) -> QuerySet[Plan]:
-    """All versions of all plans; drafts are their owners' and administrators', for they name checkpoints."""
+    """Return all versions of all plans; drafts only for their owners and administrators, as they name checkpoints."""
     rows = Plan.objects.select_related("owner", "first", "second").prefetch_related("stations")
     if role_of(user) is Role.ADMIN:
         return rows
@@ -35,7 +35,7 @@ def plan_list(*, user: Any) -> QuerySet[Plan]:
 
 
 def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
-    """That version, or the newest that is no draft; NotFound lists what there is."""
+    """Return that version, or the newest that is not a draft. Raises: NotFound, which lists the existing plans."""
     rows = plan_list(user=user).filter(name=name).order_by("-version")
     frozen = rows.exclude(state=PlanState.DRAFT)
     found = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()
@@ -46,9 +46,9 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
 
 
 def plans_beside(plan: Plan) -> QuerySet[Plan]:
-    """Other plans, by another name, that were frozen with two of its checkpoints or more: they tell of the same.
+    """Return frozen plans by another name that share at least two checkpoints: their results reveal the same.
 
-    A copy of a checkpoint is the same: of the same weights, or else asked at the same server, served in the same way.
+    A copy of a checkpoint counts as the same: equal weights (or, without digest, the same server) and strategy.
     """
     rows = Checkpoint.objects.values_list("pk", "digest", "policy", "strategy")
     what = {
@@ -66,31 +66,31 @@ def plans_beside(plan: Plan) -> QuerySet[Plan]:
 
 
 def plans_open(*, station: Station) -> list[Plan]:
-    """Those of which trials are handed out at this station."""
+    """Return the plans whose trials can be handed out at this station."""
     rows = Plan.objects.filter(state=PlanState.FROZEN).select_related("owner")
     return list(rows.filter(Q(stations=None) | Q(stations=station)).distinct().order_by("title", "-version"))
 
 
 def remaining(plan: Plan, dropped: Mapping[str, int] | None = None) -> int:
-    """Number of trials that a plan foresees and that do not count yet, without those of `dropped` checkpoints."""
+    """Return the number of slots that do not count yet, without those of `dropped` checkpoints."""
     counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
     return without_dropped(plan.slots.exclude(pk__in=counted), dropped or {}).count()
 
 
 def without_dropped(slots: QuerySet[Slot], dropped: Mapping[str, int]) -> QuerySet[Slot]:
-    """Slots but for those of checkpoints in blocks after which they are tried no more."""
+    """Exclude slots of dropped checkpoints from the block on at which they were dropped."""
     for name, at in dropped.items():
         slots = slots.exclude(checkpoint__name=name, block__gte=at)
     return slots
 
 
 def handout_of(*, trial: Trial) -> Handout | None:
-    """Handout of a trial, None for one of no plan."""
+    """Return the handout of a trial, None for a trial outside any plan."""
     return Handout.objects.select_related("plan", "slot").filter(trial=trial).first()
 
 
 def reference_get(*, id: int) -> Reference:
-    """That reference picture of a camera."""
+    """Return the reference picture with that id. Raises: NotFound."""
     rows = Reference.objects.select_related("station", "position__scene", "by")
     found = rows.filter(pk=id).first() if 0 < id < 2**63 else None
     if found is None:

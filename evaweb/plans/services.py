@@ -1,4 +1,4 @@
-"""Actions on plans: draft, change, freeze, amend, close, reveal."""
+"""Services for plans: draft, edit, freeze, amend, close, reveal."""
 
 from __future__ import annotations
 
@@ -104,8 +104,11 @@ _NO_REASON = Pattern(
     "reason is empty: {when} only with a reason that others can read",
 )
 
-_DRAWN = ("stopping.counts", "stopping.boundary")  # of a schedule in random order they tell what comes next
-_DRAWS = 200  # of a schedule, until its design has room for it
+_DRAWN = (
+    "stopping.counts",
+    "stopping.boundary",
+)  # hidden differences: with random order they reveal the schedule
+_DRAWS = 200  # schedules drawn until one fits the design
 _COPIED = (
     "name",
     "title",
@@ -132,9 +135,9 @@ _COPIED = (
 @once_more
 @transaction.atomic
 def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> Plan:
-    """A new draft of the user's; its name is made of the title. Administrators alone.
+    """Create a draft owned by the user, with a name derived from the title; administrators only.
 
-    `design`: values of further fields of the plan. EvaError names a field that cannot be so.
+    `design`: values of further fields. Raises: EvaError, which names an invalid field.
     """
     require_drafter(user)
     plan = Plan(name=_free_name(title), title=title.strip(), question=question.strip(), owner=user, **design)
@@ -144,13 +147,13 @@ def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> 
 
 
 def require_drafter(user: User) -> None:
-    """NotAllowed for users who make no plans: a frozen one hides its checkpoints, and what they did before."""
+    """Raise NotAllowed unless the user may create plans: a frozen blind plan hides its checkpoints from all."""
     if role_of(user) is not Role.ADMIN:
         raise NotAllowed(_ADMINISTRATORS_MAKE_PLANS)
 
 
 def require_editor(plan: Plan, user: User) -> None:
-    """NotAllowed for users who may not write this draft, Conflict where it is none any more."""
+    """Raise NotAllowed if the user may not edit this draft, Conflict if it is not a draft any more."""
     _require_owner(plan, user)
     if plan.state != PlanState.DRAFT:
         raise Conflict(_NO_DRAFT_TO_EDIT(plan=plan, state=plan.get_state_display()))
@@ -161,9 +164,9 @@ def require_editor(plan: Plan, user: User) -> None:
 def plan_change(
     *, user: User, plan: Plan, was: Mapping[str, Any], wanted: Values, keep: Collection[str] = ()
 ) -> Changed:
-    """Write what a user changed of a draft: the fields that are `wanted` otherwise than the user `was` shown them.
+    """Write a user's edits of a draft: fields whose `wanted` value differs from the one the user `was` shown.
 
-    What somebody else changed meanwhile stays as it is and is named, unless it is among those to `keep`.
+    Fields that another user changed meanwhile stay unchanged and are reported, unless they are in `keep`.
     """
     held = _lock_plan(plan)
     require_editor(held, user)
@@ -190,7 +193,7 @@ def _keep(plan: Plan) -> None:
 
 
 def _free_name(title: str) -> str:
-    """A name for addresses that no plan has; "new" is the address at which plans begin."""
+    """Return an unused name for URLs; "new" is reserved for the page that creates plans."""
     stem = slugify(title)[:50].strip("-") or "plan"
     taken = {*Plan.objects.filter(name__startswith=stem).values_list("name", flat=True), "new"}
     names = (stem, *(f"{stem}-{number}" for number in range(2, len(taken) + 3)))
@@ -198,7 +201,7 @@ def _free_name(title: str) -> str:
 
 
 def _log(plan: Plan, user: User, what: int, text: str) -> None:
-    """In administration's history of the plan; the same thing said once, however often a draft is saved."""
+    """Add a line to the plan's history in the admin pages; consecutive identical lines are written once."""
     rows = LogEntry.objects.filter(
         content_type=ContentType.objects.get_for_model(Plan), object_id=str(plan.pk)
     )
@@ -208,17 +211,18 @@ def _log(plan: Plan, user: User, what: int, text: str) -> None:
 
 
 def freeze_plan(*, user: User, plan: Plan, seen: str = "") -> Plan:
-    """Make a draft a document that never changes, with its schedule and commitment; trials can be handed out then.
+    """Turn a draft into an immutable document with schedule and commitment, so that trials can be handed out.
 
-    `seen`: the digest of the draft as the user has it before them; Conflict where it is another one by now.
-    Where the database was lost and trials of such a plan came back from the disk, they are its own, and it is closed at
-    once: their schedule and codes are gone. Administrators alone.
+    `seen`: digest of the draft as the user sees it. Raises: Conflict if it has changed since.
+
+    If the database was lost and trials of such a plan were restored from the disk, they are assigned to it, and it is
+    closed at once, because their schedule and codes are lost; administrators only.
     """
     _require_owner(plan, user)
     if plan.state != PlanState.DRAFT:
         raise _no_draft(plan)
     _check(plan, user)
-    key = _drawn(plan)  # before anything is locked: a boundary takes seconds, and is then known
+    key = _drawn(plan)  # before locking: computing a boundary takes seconds, and is cached then
     return _frozen(user, plan, key, seen)
 
 
@@ -227,13 +231,13 @@ def _no_draft(plan: Plan) -> Conflict:
 
 
 def _drawn(plan: Plan) -> bytes:
-    """A key whose order the plan's design has room for."""
+    """Return a key whose random order fits the plan's design."""
     for _ in range(_DRAWS):
         key = new_key()
         with suppress(UnevenError):
             document_of(plan, key)
             return key
-    document_of(plan, key)  # which says what is wrong with it
+    document_of(plan, key)  # raises the error with its explanation
     return key
 
 
@@ -256,9 +260,7 @@ def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
         defaults={"kind": Evaluation.Kind.PLAN, "description": held.title},
     )
     if not new:
-        require_role(
-            user, Role.ADMIN
-        )  # with it trials can be revealed of a plan that may have been another one's
+        require_role(user, Role.ADMIN)  # it can reveal trials of a plan that another user may have owned
     held.state, held.frozen_at = PlanState.FROZEN, timezone.now()
     held.save()
     _create_slots(held, units)
@@ -279,7 +281,7 @@ def _frozen(user: User, plan: Plan, key: bytes, seen: str) -> Plan:
 @once_more
 @transaction.atomic
 def amend_plan(*, user: User, plan: Plan, reason: str) -> Plan:
-    """A draft of the next version, as the frozen one is now; that one goes on until the new one is frozen."""
+    """Create a draft of the next version from the frozen one, which continues until the new one is frozen."""
     held = _lock_plan(plan)
     _require_owner(held, user)
     why = _reason(reason, "a plan is amended")
@@ -306,7 +308,7 @@ def amend_plan(*, user: User, plan: Plan, reason: str) -> Plan:
 
 @transaction.atomic
 def close_plan(*, user: User, plan: Plan, reason: str) -> Plan:
-    """Hand out no more trials. What is prepared, running or not yet scored is finished first."""
+    """Close a plan: no more trials are handed out. Raises: Conflict while trials are unfinished."""
     held = _lock_plan(plan)
     _require_owner(held, user)
     why = _reason(reason, "a plan is closed")
@@ -318,7 +320,7 @@ def close_plan(*, user: User, plan: Plan, reason: str) -> Plan:
 
 
 def reveal_plan(*, user: User, plan: Plan) -> Plan:
-    """Say which checkpoint was which, once and for all, and with it the key of the commitment."""
+    """Reveal the plan permanently: publish the checkpoint of each trial and the key of the commitment."""
     fresh = Plan.objects.select_related("owner").get(pk=plan.pk)
     _require_owner(fresh, user)
     ready = None
@@ -326,7 +328,7 @@ def reveal_plan(*, user: User, plan: Plan) -> Plan:
         ready = (
             recorded_so_far(fresh),
             reveal_record(fresh),
-        )  # it may take seconds: before anything is locked
+        )  # before locking, as it may take seconds
     return _revealed(user, plan, ready)
 
 
@@ -367,12 +369,12 @@ def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | No
 
 @transaction.atomic
 def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
-    """Close a running plan whose design has ended, as soon as none of its trials is unfinished and no void waits.
+    """Close a running plan whose design has ended, if no trial of it is unfinished and no void is requested.
 
-    With trials left, it ends where the next one is `asked` for: a score that was mistyped can be corrected until then,
-    and corrected to and fro it does not tell at once which trial is of which checkpoint. A boundary that an ask finds
-    crossed is kept, whatever is corrected later: else each ask would tell what a correction moved.
-    The reason says that a boundary was crossed or that all pairs are made: never for which checkpoint.
+    With trials left, it ends only when the next one is requested (`asked`): until then a mistyped score can be
+    corrected, and switching a score back and forth does not reveal which trial is of which checkpoint. A crossed
+    boundary found at a request is recorded whatever is corrected later; otherwise each request would reveal the effect
+    of a correction. The reason states that a boundary was crossed or all pairs are made, never for which checkpoint.
     """
     held = _lock_plan(plan)
     found = findings_of(held) if held.state == PlanState.FROZEN else None
@@ -380,7 +382,7 @@ def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
         return
     ended, waits = ended_at_an_ask(held), open_void_requests(_trials(held)).exists()
     if asked and not ended and found.ended == "boundary":
-        # A void that is refused puts its trial back: until it is answered, the answer stays what it was.
+        # A refused void restores its trial; until it is answered, the result must not change.
         ended = "" if waits else end_reason(held, found)
         _note(held, user, CROSSED_EVENT if waits else ENDED_EVENT, end_reason(held, found))
     if not (ended or found.ended) or waits or _unfinished(held):
@@ -407,7 +409,7 @@ def _trials(plan: Plan) -> QuerySet[Trial]:
 
 
 def _unfinished(plan: Plan) -> list[Trial]:
-    """Trials that are under way or yet to be scored: of those that were broken off, failures by the plan."""
+    """Return trials that are running or to be scored, including interrupted ones that the plan counts as failures."""
     states = (*OPEN_STATES, TrialStatus.ENDED, TrialStatus.INTERRUPTED)
     rows = Trial.objects.filter(handout__plan=plan, status__in=states, verdict=None)
     return [
@@ -433,12 +435,12 @@ def _close(plan: Plan, user: User, why: str) -> None:
     plan.state, plan.closed_at, plan.closed_because = PlanState.CLOSED, timezone.now(), why
     plan.save()
     _note(plan, user, "closed", why)
-    if not plan.blind:  # everybody has seen it: no reveal is needed, and none may ever come
+    if not plan.blind:  # an open plan may never be revealed, so its result is stored now
         transaction.on_commit(partial(_keep_at_close, plan, user), robust=True)
 
 
 def _keep_at_close(plan: Plan, user: User) -> None:
-    """Keep what counts of a plan that is not blind; worked out before anything is locked, which may take seconds."""
+    """Store the result of an open plan at its close; computed before locking, as that may take seconds."""
     while True:
         fresh = Plan.objects.get(pk=plan.pk)
         at, found = recorded_so_far(fresh), reveal_record(fresh)
@@ -449,7 +451,7 @@ def _keep_at_close(plan: Plan, user: User) -> None:
             if held.at_reveal is not None or held.state != PlanState.CLOSED or held.closed_at is None:
                 return
             if recorded_so_far(held) != at:
-                continue  # somebody has corrected a score meanwhile
+                continue  # a score was corrected meanwhile
             before = reveals.first_reveal(held)
             held.at_reveal = before.at_reveal if before else found
             if before is None:
@@ -459,14 +461,14 @@ def _keep_at_close(plan: Plan, user: User) -> None:
 
 
 def _check(plan: Plan, user: User) -> None:
-    """Check a plan before this user freezes it; EvaError says what is missing."""
+    """Raise EvaError with the first problem that prevents freezing, without names hidden from this user."""
     found = next(problems(plan), None)
     if found is not None:
         raise EvaError(covered(plan, visibility_for_user(user))(found.text))
 
 
 def slots_of(plan: Plan) -> list[list[Any]]:
-    """The schedule as the database has it, as `Unit.row` says it."""
+    """Return the schedule stored in the database, in the form of `Unit.row`."""
     named = ("index", "block", "checkpoint__name", "scene__name", "position__number", "repetition")
     return [list(row) for row in plan.slots.order_by("index").values_list(*named)]
 

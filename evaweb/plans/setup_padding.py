@@ -1,7 +1,7 @@
-"""Least duration of a blind trial's set-up, so that a watch does not tell which checkpoint it is of.
+"""Least durations of a blind trial's set-up stages, so that timing does not reveal its checkpoint.
 
-The stages that wait for the policy last as long as they lately did with the slowest of the plan's checkpoints at this
-station, and up to a quarter longer, drawn by the plan's key: the slowest is not the one that overruns.
+The stages that wait for the policy are extended to the longest recent duration among the plan's checkpoints at this
+station, plus up to a quarter drawn from the plan's key, so that the slowest checkpoint is not the one that overruns.
 """
 
 from __future__ import annotations
@@ -13,15 +13,18 @@ from evaweb.plans.seeded_draws import SeededDraws
 from evaweb.trials.models import Trial
 from evaweb.trials.station_commands import register_min_stage_times
 
-NEWEST = 5  # set-ups of a checkpoint that count: the first of a server may have compiled for a minute
+NEWEST = 5  # recent set-ups per checkpoint that count; a server's first one may include a minute of compiling
 LONGER = 1.25
 MOST_S = 300.0
 _STAGES = ("connect_s", "warm_up_s")
-_FINE = 10_000  # different lengths
+_FINE = 10_000  # number of different extensions
 
 
 def min_stage_times(trial: Trial) -> Mapping[str, float] | None:
-    """Of each stage of the trial's set-up [s]; None where nothing is blind, or nothing is known yet."""
+    """Return the least duration of each stage of the trial's set-up [s].
+
+    None if the trial is not of a blind plan, or no durations are known yet.
+    """
     handout = Handout.objects.select_related("plan").filter(trial=trial).first()
     if handout is None or not handout.plan.sealed:
         return None

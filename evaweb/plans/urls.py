@@ -1,4 +1,4 @@
-"""Addresses of the pictures of plans; the converter is that of evaweb.stations."""
+"""URLs of the pictures of plans; evaweb.stations defines the `digest` converter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures that are kept: references, and how benches were laid out."""
+"""Pages of stored pictures: references, and benches before runs."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from evaweb.roles import Role, role_of
 
 @require_safe
 def picture(request: HttpRequest, name: str) -> HttpResponse:
-    """One of them."""
+    """Return a stored picture."""
     return HttpResponse(load_image(name), content_type="image/jpeg")
 
 
 @require_safe
 def reference(request: HttpRequest, id: int) -> HttpResponse:
-    """A reference picture with its regions, which operators draw there; links lead to those of the other cameras."""
+    """Show a reference picture with its regions, which operators can draw, and links to the other cameras."""
     found = reference_get(id=id)
     newest = references(station=found.station, position=found.position)
     context = {

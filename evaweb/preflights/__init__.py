@@ -1,1 +1,1 @@
-"""Preflights of checkpoints: their policy servers asked without a robot, and what was found."""
+"""Preflights of checkpoints: queries of their policy servers without a robot, and the reports."""

@@ -1,4 +1,4 @@
-"""The preflight of a checkpoint on its page of administration; preflights themselves are only read there."""
+"""Preflight on a checkpoint's admin page; preflights themselves are read-only records."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ admin.site.unregister(Checkpoint)
 
 @admin.register(Checkpoint)
 class PreflightedCheckpointAdmin(CheckpointAdmin):
-    """A trained policy, and whether its server can be used."""
+    """Trained policies, with the preflight of their servers."""
 
     change_form_template = "preflights/checkpoint.html"
 
     def get_urls(self) -> list[URLPattern]:
-        """With the address that begins a preflight."""
+        """Add the URL that starts a preflight."""
         own = self.admin_site.admin_view(self.preflight_view)
         return [path("<path:object_id>/preflight/", own, name="checkpoint_preflight"), *super().get_urls()]
 
     def preflight_view(self, request: HttpRequest, object_id: str) -> HttpResponse:
-        """Begin one by POST, then back to the checkpoint, where its result appears."""
+        """Start a preflight on POST, and return to the checkpoint's page, which shows its result."""
         if request.method != "POST":
             return HttpResponseNotAllowed(["POST"])
         try:
@@ -49,7 +49,7 @@ class PreflightedCheckpointAdmin(CheckpointAdmin):
         return HttpResponseRedirect(f"{back}#preflight")
 
     def change_view(self, request: HttpRequest, object_id: str, *given: Any, **named: Any) -> HttpResponse:
-        """With the newest preflight."""
+        """Add the newest preflight to the page."""
         extra = named.pop("extra_context", None) or {}
         checkpoint = Checkpoint.objects.filter(pk=object_id).first() if object_id.isdecimal() else None
         row = preflight_newest(checkpoint=checkpoint) if checkpoint else None
@@ -61,7 +61,7 @@ class PreflightedCheckpointAdmin(CheckpointAdmin):
 
 @admin.register(Preflight)
 class PreflightAdmin(admin.ModelAdmin):
-    """Every preflight that was asked for; they may be removed, alone or with their checkpoint."""
+    """All preflights; they may be deleted, alone or with their checkpoint."""
 
     list_display = ("asked_at", "checkpoint", "station", "by", "status", "verdict", "user")
     list_filter = ("status", "checkpoint", "station", "by")
@@ -69,9 +69,9 @@ class PreflightAdmin(admin.ModelAdmin):
     date_hierarchy = "asked_at"
 
     def has_add_permission(self, request: HttpRequest) -> bool:
-        """Never: they are asked for."""
+        """Return False: preflights are started on the checkpoint's page."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Preflight | None = None) -> bool:
-        """Never: what was found was found."""
+        """Return False: results are not edited."""
         return False

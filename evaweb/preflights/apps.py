@@ -1,10 +1,10 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 
 
 class PreflightsConfig(AppConfig):
-    """Preflights of checkpoints, asked for and kept."""
+    """Preflights of checkpoints."""
 
     name = "evaweb.preflights"
     default_auto_field = "django.db.models.BigAutoField"

@@ -1,7 +1,7 @@
-"""Parts of a preflight that a user is shown: the one place that pages and REST ask.
+"""Visible parts of a preflight, for pages and REST.
 
-Addresses, times, sizes and names tell which checkpoint a server has. They are for operators and administrators, but
-for none from whom a blind plan hides what it hands out.
+Addresses, times, sizes and names reveal a server's checkpoint. They are shown to operators and administrators, except
+users from whom a blind plan hides the checkpoint.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from evaweb.preflights.models import Preflight
 from evaweb.roles import Role, role_of
 from evaweb.trials.models import Checkpoint
 
-_TOLD = ("verdict", "stage", "advice", "ok")  # of a report, to everybody
+_TOLD = ("verdict", "stage", "advice", "ok")  # keys of a report that everybody may see
 
 
 @dataclass(frozen=True, slots=True)
 class VisiblePreflight:
-    """A preflight as one user sees it: `report` and `reason` without what `hidden` says is kept back and why."""
+    """Preflight as one user may see it; `hidden` is the reason why `report` and `reason` are reduced, or ""."""
 
     row: Preflight
     report: dict[str, Any] | None
@@ -28,7 +28,7 @@ class VisiblePreflight:
 
 
 def visible_preflight(row: Preflight, user: Any) -> VisiblePreflight:
-    """The preflight as this user may see it."""
+    """Return the preflight as this user may see it."""
     why = hidden_reason(row.checkpoint, user)
     if not why:
         return VisiblePreflight(row, row.report, row.reason, "")
@@ -37,7 +37,7 @@ def visible_preflight(row: Preflight, user: Any) -> VisiblePreflight:
 
 
 def hidden_reason(checkpoint: Checkpoint, user: Any) -> str:
-    """Why a user is shown nothing but the verdict, "" where they are shown everything."""
+    """Return why the user sees only the outcome, "" if everything."""
     if role_of(user) is Role.VIEWER:
         return "addresses and times are shown to operators"
     seen = visibility_for_user(user)

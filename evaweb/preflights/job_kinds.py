@@ -1,4 +1,4 @@
-"""The job of a preflight whose station does not run."""
+"""Job of a preflight whose station is not running."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ LONGEST_S = 3600.0
 
 @job_kind("preflight", queue=Queue.STATION, folder=False)
 def preflight(work: JobContext) -> Mapping[str, Any]:
-    """Ask the checkpoint's server by the deployment file of the station; args: preflight."""
+    """Query the checkpoint's server with the station's deployment file; args: preflight."""
     row: Preflight = preflight_get(id=work.args["preflight"])
     from runtime.station.preflight_child import (
         run_preflight,
-    )  # web processes know this kind too, and never do it
+    )  # imported late: web processes import this module but never run the job
 
     if row.status != PreflightStatus.RUNNING:
         return {"verdict": row.verdict}

@@ -1,4 +1,4 @@
-"""Preflights: who asked which checkpoint's server through what, and what was found."""
+"""Preflights: checkpoint, station, user and report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class PreflightStatus(models.TextChoices):
 
 
 class Verdict(models.TextChoices):
-    """What a report can find, in the runtime's own words, with a label for people."""
+    """Outcomes of a report, as in the runtime, with labels."""
 
     OK = "ok", "usable"
     MISCONFIGURED = "misconfigured", "the configuration is wrong"
@@ -41,7 +41,7 @@ class Verdict(models.TextChoices):
 
 
 class Preflight(models.Model):
-    """One preflight of a checkpoint; the newest one is what is known of it now."""
+    """Preflight of a checkpoint; the newest is its current state."""
 
     class By(models.TextChoices):
         STATION = "station", "the station"
@@ -76,7 +76,7 @@ class Preflight(models.Model):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """The tables that go on top of the station's deployment."""
+        """Tables that override the station's deployment."""
         served = {"strategy": self.checkpoint.strategy} if self.checkpoint.strategy else {}
         return {"policy": self.policy, **served}
 
@@ -85,20 +85,20 @@ class Preflight(models.Model):
 
     @property
     def verdict(self) -> str:
-        """What the report found, "" where there is none."""
+        """Outcome of the report, "" without a report."""
         report: dict[str, Any] = self.report or {}
         return str(report.get("verdict", ""))
 
     @property
     def label(self) -> str:
-        """The verdict in words; where it stands without one."""
+        """Outcome as text; the status without a report."""
         if self.verdict in Verdict.values:
             return str(Verdict(self.verdict).label)
         return self.verdict or str(PreflightStatus(self.status).label)
 
     @property
     def tone(self) -> str:
-        """Its colour, by the name the style sheets have for it."""
+        """Colour name of the style sheets."""
         if self.status == PreflightStatus.RUNNING:
             return "ok"
         return "active" if self.verdict == Verdict.OK else "warn" if not self.verdict else "danger"

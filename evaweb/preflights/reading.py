@@ -1,4 +1,4 @@
-"""A report in the words and numbers of a page."""
+"""Report of a preflight as texts of a page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MARKS = {"done": "✓", "failed": "✕", "waiting": "·"}
 
 @dataclass(frozen=True, slots=True)
 class StageRow:
-    """One stage: "done", "failed" or "waiting", and the mark that says so."""
+    """Stage with its state "done", "failed" or "waiting", and the mark that shows it."""
 
     name: str
     state: str
@@ -22,7 +22,7 @@ class StageRow:
 
 @dataclass(frozen=True, slots=True)
 class ReportView:
-    """Texts of the page; empty texts and lists are left out there."""
+    """Texts of the page; empty texts and lists are not shown."""
 
     ok: bool
     stages: tuple[StageRow, ...]
@@ -37,7 +37,7 @@ class ReportView:
 
 
 def time_since(moment: datetime, now: datetime) -> str:
-    """Time since `moment`, in its largest unit."""
+    """Return the time since `moment` in its largest unit."""
     seconds = max(0.0, (now - moment).total_seconds())
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= length:
@@ -46,7 +46,7 @@ def time_since(moment: datetime, now: datetime) -> str:
 
 
 def view_report(report: Mapping[str, Any] | None) -> ReportView | None:
-    """The report, also one of which a part is kept back; None for none."""
+    """Return the texts of a complete or redacted report; None without a report."""
     if report is None:
         return None
     return ReportView(
@@ -86,6 +86,6 @@ def _rows(chunk: Any) -> str:
 
 
 def _call(call: Mapping[str, Any]) -> tuple[str, str]:
-    """Its name, and how long it took with what is to be said of it."""
+    """Return the name of a call, and its duration with a note."""
     how = str(call["note"]) if call.get("note") else "" if call["ok"] else "failed"
     return str(call["name"]), _ms(call["ms"]) + (f" ({how})" if how else "")

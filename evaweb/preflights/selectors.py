@@ -1,4 +1,4 @@
-"""Reads of preflights."""
+"""Queries on preflights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PREFLIGHT_DOES_NOT_EXIST = Pattern(
 def preflight_list(
     *, checkpoint: Checkpoint | None = None, sight: Visibility = FULL_VISIBILITY
 ) -> QuerySet[Preflight]:
-    """The newest first, of one checkpoint or of all; none of hidden ones, whose names they have."""
+    """Return the preflights of one checkpoint or of all, newest first, without those of hidden checkpoints."""
     rows: QuerySet[Preflight] = sight.filter_visible(
         Preflight.objects.select_related("checkpoint", "station", "user")
     )
@@ -29,7 +29,7 @@ def preflight_list(
 
 
 def preflight_get(*, id: UUID | str, sight: Visibility = FULL_VISIBILITY) -> Preflight:
-    """That one; NotFound."""
+    """Return the preflight with that id. Raises: NotFound."""
     found = preflight_list(sight=sight).filter(pk=id).first()
     if found is None:
         raise NotFound(_PREFLIGHT_DOES_NOT_EXIST(identity=id))
@@ -37,5 +37,5 @@ def preflight_get(*, id: UUID | str, sight: Visibility = FULL_VISIBILITY) -> Pre
 
 
 def preflight_newest(*, checkpoint: Checkpoint) -> Preflight | None:
-    """Newest preflight of a checkpoint, None where it was never asked."""
+    """Return the newest preflight of a checkpoint, None if there is none."""
     return preflight_list(checkpoint=checkpoint).first()

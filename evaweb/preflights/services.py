@@ -1,7 +1,7 @@
-"""Preflights are asked for at a station; where it does not run, of the worker of its machine.
+"""Services for preflights: run by a station, or by a worker with the deployment file if the station is not running.
 
-The station's process is where the server has to be reached from: it has the keys, the tunnels and the deployment. It
-flies one at a time, never while it is at work, and keeps the report until it is fetched.
+The station's process has the keys, the tunnels and the deployment, and reaches the server the way a run would. It runs
+one preflight at a time, never during other work, and stores the report until it is fetched.
 """
 
 from __future__ import annotations
@@ -53,20 +53,24 @@ _DEPLOYMENT_FILE_NOT_KNOWN_HERE = Pattern(
     "preflights.services.deployment_file_not_known_here",
     "{gone}; its deployment file is not known here, so the worker cannot ask in its place",
 )
-_LOOK_S = 0.5  # how long another station may take to say which server it uses
-_UNTOLD = timedelta(hours=1)  # after which one is over of which nobody said how long it may take
+_LOOK_S = 0.5  # longest wait for another station's report on its server
+_UNTOLD = timedelta(hours=1)  # time limit of a preflight without a known duration
 
 
 def start_preflight(*, user: Any, checkpoint: Checkpoint, station: Station | None = None) -> Preflight:
-    """Begin a preflight with the deployment of `station`, None: the first that can; its row, which is under way.
+    """Start a preflight with the deployment of `station` (None: the first suitable one) and return its row.
 
-    Never within a transaction. Raises NotAllowed, Conflict where the station or the server is at work, StationGone
-    where neither the station runs nor its deployment file is known.
+    Never call it within a transaction.
+
+    Raises:
+        NotAllowed: The user is not an operator.
+        Conflict: The station or the server is busy, or a blind trial is running.
+        StationGone: The station is not running and its deployment file is unknown.
     """
     require_role(user, Role.OPERATOR)
     if hidden := sorted(
         visibility_for_user(user).busy_stations
-    ):  # whichever server it is: an answer would tell
+    ):  # for any server, as its response would reveal the one in use
         raise Conflict(_BLIND_TRIAL_UNDER_WAY(stations=", ".join(hidden)))
     chosen = station or _first_station()
     row = Preflight(checkpoint=checkpoint, station=chosen, user=user, policy=checkpoint.policy)
@@ -81,7 +85,7 @@ def start_preflight(*, user: Any, checkpoint: Checkpoint, station: Station | Non
 
 
 def refresh_preflight(*, row: Preflight) -> Preflight:
-    """Find out how it went, if not yet known; leaves it as it is while it is under way, or cannot be known."""
+    """Update the row of a running preflight from its station or job; unchanged while the result is unknown."""
     if row.status != PreflightStatus.RUNNING:
         return row
     if row.by == Preflight.By.WORKER:
@@ -103,14 +107,14 @@ def refresh_preflight(*, row: Preflight) -> Preflight:
 
 
 def refresh_preflights(*, station: Station) -> int:
-    """Find out how those of a station went that were not looked at; how many are over now."""
+    """Update the running preflights of a station; return the number of finished ones."""
     rows = Preflight.objects.filter(station=station, status=PreflightStatus.RUNNING)
     settled = [refresh_preflight(row=row) for row in rows.select_related("station", "checkpoint")]
     return sum(row.status != PreflightStatus.RUNNING for row in settled)
 
 
 def finish_preflight(*, row: Preflight, report: dict[str, Any] | None = None, reason: str = "") -> Preflight:
-    """Keep what was found, or why there is nothing; the first that says so has said it."""
+    """Store the report, or the reason why there is none; only the first result counts."""
     status = PreflightStatus.LOST if report is None else PreflightStatus.DONE
     facts = {
         "status": status,
@@ -124,7 +128,7 @@ def finish_preflight(*, row: Preflight, report: dict[str, Any] | None = None, re
 
 
 def _first_station() -> Station:
-    """The first one that runs and is not at work, else the first whose deployment is known."""
+    """Return the first station that runs and is idle, else the first with a known deployment."""
     stations = list(station_list())
     for station in stations:
         try:
@@ -139,7 +143,7 @@ def _first_station() -> Station:
 
 
 def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
-    """The server that a preflight there would ask; "" where the table does not fit, which the report will say."""
+    """Return the server that a preflight would query; "" if the table is invalid, which the report explains."""
     args = {"policy": checkpoint.policy}
     asked = Command(str(uuid4()), "policy_server", args, role=Role.OPERATOR, vouched=list(TABLES))
     ack = connection_to(station.name).request(asked)
@@ -147,7 +151,7 @@ def _server_of_station(station: Station, checkpoint: Checkpoint) -> str:
 
 
 def _require_free(server: str, besides: Station) -> None:
-    """No other station may be at work with the same server: its answers would come late, or be another's."""
+    """Raise Conflict if another station is using the server, because answers could be late or mixed up."""
     if not server:
         return
     for other in station_list(all_of_them=True).exclude(pk=besides.pk):
@@ -163,7 +167,7 @@ def _require_free(server: str, besides: Station) -> None:
 
 
 def _start_at_station(row: Preflight) -> Preflight:
-    """A row first, so that whatever the station begins is known."""
+    """Start the preflight at the station; the row is written first, so that nothing runs unrecorded."""
     row.by = Preflight.By.STATION
     row.save(force_insert=True)
     checkpoint = {"id": row.checkpoint_id, "name": row.checkpoint.name}
@@ -174,7 +178,7 @@ def _start_at_station(row: Preflight) -> Preflight:
     try:
         ack = connection_to(row.station.name).request(command)
     except NoAnswer:
-        return row  # it may have begun: whoever looks next finds out
+        return row  # it may have started: the next refresh finds out
     except StationGone:
         row.delete()
         raise
@@ -187,7 +191,7 @@ def _start_at_station(row: Preflight) -> Preflight:
 
 
 def _start_by_worker(row: Preflight, gone: StationGone) -> Preflight:
-    """By the worker, with the deployment file of the station that does not run."""
+    """Queue the preflight for a worker, with the deployment file of the station that is not running."""
     file = row.station.deployment
     if not file:
         raise StationGone(_DEPLOYMENT_FILE_NOT_KNOWN_HERE(gone=gone))
@@ -195,7 +199,7 @@ def _start_by_worker(row: Preflight, gone: StationGone) -> Preflight:
         resolved = deployment.apply_changes(deployment.load(Path(file)), row.changes, "the checkpoint")
         _require_free(server_address(resolved.deployment), row.station)
     except ConfigurationError as error:
-        log.info("%s: %s", row, error)  # what the report will say
+        log.info("%s: %s", row, error)  # the report will contain it
     row.by = Preflight.By.WORKER
     with transaction.atomic():
         row.save(force_insert=True)
@@ -213,7 +217,7 @@ def _settled_by_job(row: Preflight) -> Preflight:
 
 
 def lacks(*, row: Preflight) -> str:
-    """Why no running worker can take the job of one that runs; "" where one can, or a station does it."""
+    """Return why no running worker can execute a queued preflight; "" if one can or a station runs it."""
     if (row.status, row.by) != (PreflightStatus.RUNNING, Preflight.By.WORKER):
         return ""
     job = job_newest(key=_key(row))

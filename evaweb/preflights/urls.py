@@ -1,4 +1,4 @@
-"""Addresses of the pages of preflights."""
+"""URLs of the pages of preflights."""
 
 from __future__ import annotations
 

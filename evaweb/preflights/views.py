@@ -1,4 +1,4 @@
-"""One preflight, as a fragment of another page or as a page of its own."""
+"""Page and fragment of a preflight."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from evaweb.trials.selectors import checkpoint_get
 
 @require_GET
 def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
-    """A preflight: its progress, or its result."""
+    """Show a preflight: its progress, or its result."""
     row = services.refresh_preflight(row=preflight_get(id=id, sight=visibility_for_request(request)))
     fragment = request.headers.get("HX-Request")
     return render(request, f"preflights/{'result' if fragment else 'page'}.html", context(row, request.user))
@@ -29,7 +29,7 @@ def preflight(request: HttpRequest, id: UUID) -> HttpResponse:
 
 @require_GET
 def newest(request: HttpRequest) -> HttpResponse:
-    """Newest preflight of the checkpoint that the address names, or a page that says there is none."""
+    """Show the newest preflight of the checkpoint in the URL, or that there is none."""
     checkpoint = checkpoint_get(name=request.GET.get("checkpoint", ""), sight=visibility_for_request(request))
     row = preflight_newest(checkpoint=checkpoint)
     if row is None:
@@ -39,7 +39,7 @@ def newest(request: HttpRequest) -> HttpResponse:
 
 
 def context(row: Preflight, user: Any) -> dict[str, Any]:
-    """Context of the template of a result."""
+    """Return the template context of a result."""
     seen = visible_preflight(row, user)
     return {
         "preflight": row,

@@ -1,1 +1,1 @@
-"""Reviews of episodes: what the automatic checks found, what people say of them, and which parts they mark."""
+"""Reviews of episodes: automatic quality checks, verdicts and notes of people, annotated segments, tags."""

@@ -1,4 +1,4 @@
-"""Reviews in the admin pages: to look at, rows are written by services alone, after the disk; labels to be edited."""
+"""Admin pages of reviews: read-only, as services write the rows after the disk; segment labels can be edited."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 
 
 class _Kept(admin.ModelAdmin):
-    """Nothing is added, changed or removed here."""
+    """Base of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -24,7 +24,7 @@ class _Kept(admin.ModelAdmin):
 
 @admin.register(Review)
 class ReviewAdmin(_Kept):
-    """Verdicts of people on episodes."""
+    """Verdicts and notes on episodes."""
 
     list_display = ("episode", "verdict", "note", "reviewer", "at")
     list_filter = ("verdict", "reviewer")
@@ -34,7 +34,7 @@ class ReviewAdmin(_Kept):
 
 @admin.register(Segment)
 class SegmentAdmin(_Kept):
-    """Annotated parts."""
+    """Annotated segments."""
 
     list_display = ("episode", "first", "last", "label", "milestone", "annotator", "at")
     list_filter = ("annotator",)
@@ -44,7 +44,7 @@ class SegmentAdmin(_Kept):
 
 @admin.register(Standing)
 class StandingAdmin(_Kept):
-    """Findings of the checks, and the verdict that counts."""
+    """Results of the checks, and the verdict that counts."""
 
     list_display = ("episode", "worst", "flags", "checked_at", "review")
     list_filter = ("worst", "clean")
@@ -54,7 +54,7 @@ class StandingAdmin(_Kept):
 
 @admin.register(SegmentLabel)
 class SegmentLabelAdmin(LabelledRows, admin.ModelAdmin):
-    """The vocabulary of parts, offered in Replay in this order."""
+    """Vocabulary of segments, offered in Replay in this order."""
 
     list_display = ("words", "colour", "key", "order", "active")
     list_editable = ("colour", "key", "order", "active")

@@ -1,4 +1,4 @@
-"""Side files of an episode for its dataset: verdicts and annotations, a line each."""
+"""Sidecar files of an episode in its dataset: reviews and annotations, one per line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 def review_lines(uuid: UUID) -> dict[str, Sequence[AnyReview]]:
-    """Verdicts and annotations of the episode, by kind of side file."""
+    """Return reviews and annotations of the episode, by kind of sidecar file."""
     lines = REVIEWS.read(uuid, log.warning)
     return {
         "reviews": [line for line in lines if isinstance(line, ReviewLine)],
@@ -25,7 +25,7 @@ def review_lines(uuid: UUID) -> dict[str, Sequence[AnyReview]]:
 
 @register_sidecar_writer
 def write_review_sidecars(uuid: UUID, folder: Path) -> Mapping[str, Path]:
-    """The files of that, in `folder`; none of a kind of which nothing is said."""
+    """Write the sidecar files to `folder` and return them by kind; empty kinds have no file."""
     made = {}
     for kind, said in review_lines(uuid).items():
         if said:

@@ -1,4 +1,4 @@
-"""Places of an episode's report and reviews in the data folder."""
+"""Paths of quality reports and their settings in the data folder."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from evaweb.episodes.folders import data_dir
 
 
 def report_file(uuid: UUID) -> Path:
-    """File of the checks' report on an episode."""
+    """Return the file of an episode's quality report."""
     return data_dir() / "quality" / f"{uuid}.json"
 
 
 def bounds_file() -> Path:
-    """Other bounds of the checks than the usual ones, for all episodes of this lab."""
+    """Return the file with this lab's own bounds for quality checks of all episodes."""
     return data_dir() / "quality.toml"

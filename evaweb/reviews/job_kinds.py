@@ -1,4 +1,4 @@
-"""The jobs of reviews: checks of episodes, what is said of them beside the dataset; and the search for both."""
+"""Jobs of reviews: quality checks, and sidecars in datasets; and the periodic tasks that queue them."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from runtime.quality.report import Report
     from runtime.quality.settings import QualitySettings
 
-AT_ONCE = 20  # asked for in one look
+AT_ONCE = 20  # jobs queued per call of a periodic task
 
 
 @job_kind("quality")
 def quality(work: JobContext) -> Mapping[str, Any]:
-    """Look the episode through and keep the report; args: uuid."""
-    # Web processes know this kind too, and never do it.
+    """Check an episode and store the report; args: uuid."""
+    # Imported late: web processes import this module but never run the job.
     from runtime.quality.settings import QualitySettings, read_settings
 
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
@@ -50,7 +50,10 @@ def quality(work: JobContext) -> Mapping[str, Any]:
 
 
 def _inspected(episode: Episode, settings: QualitySettings) -> Report:
-    """One that was imported is judged as its dataset has it: its folder has other times, and pictures coded again."""
+    """Return the quality report of an episode.
+
+    An imported one is checked in its dataset: its folder has other times, and re-encoded images.
+    """
     from runtime.datasets.identities import uuids_of
     from runtime.quality.inspection import check_dataset_episode, check_episode
 
@@ -68,7 +71,7 @@ def _inspected(episode: Episode, settings: QualitySettings) -> Report:
 
 @job_kind("sides")
 def write_sidecars_job(work: JobContext) -> Mapping[str, Any]:
-    """Put verdicts and annotations beside the published episode; args: uuid."""
+    """Attach reviews and annotations to the published episode; args: uuid."""
     episode = Episode.objects.get(uuid=UUID(work.args["uuid"]))
     if episode.dataset_index is None:
         return {"attached": False, "why": "it is in no dataset"}
@@ -84,7 +87,7 @@ def write_sidecars_job(work: JobContext) -> Mapping[str, Any]:
 
 @periodic_task("episodes to be checked")
 def find_unchecked_episodes() -> int:
-    """Episodes that were closed, here or elsewhere, since the last look."""
+    """Queue checks of newly closed episodes."""
     found = list(selectors.unchecked_episodes()[:AT_ONCE])
     for episode in found:
         services.request_quality_check(episode=episode)
@@ -93,11 +96,11 @@ def find_unchecked_episodes() -> int:
 
 @periodic_task("reviews to be published")
 def find_outdated_sidecars() -> int:
-    """Published episodes of which something was said since, or that were published after it was said."""
+    """Queue updates of published episodes with newer reviews, or reviews older than the publication."""
     found = list(selectors.outdated_episodes()[:AT_ONCE])
     for standing in found:
         with transaction.atomic():
-            # Asked for once, however it ends: a job that failed is there to be seen and to be tried again.
+            # Requested once, whatever its outcome: a failed job remains visible and can be retried.
             upto = max(standing.changed_at, standing.episode.published_at)
             Standing.objects.filter(pk=standing.pk).update(attached_at=upto)
             uuid = str(standing.episode_id)

@@ -1,4 +1,4 @@
-"""What is said of an episode: by the checks, by people, and of its parts. The disk is the authority of all three."""
+"""Reviews, segments and check results of episodes; the disk is authoritative for all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from evaweb.names import check_name
 
 
 class Verdict(models.TextChoices):
-    """What a reviewer says; a note leaves the verdict as it is."""
+    """Verdict of a review; a note leaves the episode's verdict unchanged."""
 
     PASS = "pass", "pass"
     FAIL = "fail", "fail"
@@ -27,7 +27,7 @@ DECIDES = (Verdict.PASS, Verdict.FAIL)
 
 
 class Review(models.Model):
-    """What one person said of an episode at one time; the newest pass or fail counts, all are kept."""
+    """Review of an episode by one person; the newest pass or fail counts, all are stored."""
 
     uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
     episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="reviews")
@@ -48,7 +48,7 @@ class Review(models.Model):
 
 
 class Segment(models.Model):
-    """A part of an episode as one annotator sees it: frames `first` to `last`, both included."""
+    """Annotated part of an episode: frames `first` to `last`, inclusive."""
 
     uuid = models.UUIDField(primary_key=True, default=uuid.uuid4, editable=False)
     episode = models.ForeignKey(Episode, on_delete=models.PROTECT, related_name="segments")
@@ -72,13 +72,13 @@ class Segment(models.Model):
 
 
 LABEL_KEYS = "1234567890abdhjkmqstwyz"
-"""Keys that mark a part in Replay: those that do nothing else there."""
+"""Keys that can mark a segment in Replay: those without another function there."""
 
 
 class SegmentLabel(models.Model):
-    """A word of the lab's vocabulary for parts of an episode, with the colour and key that it has in Replay.
+    """Label of the lab's vocabulary for segments, with its colour and key in Replay.
 
-    Segments keep the words, not the label: what becomes of a label changes nothing that was marked.
+    Segments store the words instead of a reference: changes of a label do not affect them.
     """
 
     class Colour(models.TextChoices):
@@ -130,7 +130,7 @@ class SegmentLabel(models.Model):
 
 
 class Severity(models.TextChoices):
-    """The worst that the checks found in an episode."""
+    """Highest severity among the findings of the checks."""
 
     NOTHING = "", "clean"
     INFO = "info", "clean, with remarks"
@@ -139,7 +139,7 @@ class Severity(models.TextChoices):
 
 
 class Standing(models.Model):
-    """Where an episode stands: the checks asked for and done, the verdict that counts, what its dataset has of it."""
+    """Summary of an episode's reviews: checks requested and done, verdict that counts, publication of sidecars."""
 
     episode = models.OneToOneField(
         Episode, on_delete=models.CASCADE, primary_key=True, related_name="standing"

@@ -1,4 +1,4 @@
-"""The lines of DATA/reviews/<uuid>.jsonl: verdicts and notes, and the parts of an episode."""
+"""Lines of DATA/reviews/<uuid>.jsonl: verdicts, notes, segments and tags."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class ReviewLine(Line):
-    """A verdict, or a note."""
+    """Verdict or note."""
 
     kind: Literal["review"] = "review"
     uuid: UUID
@@ -26,7 +26,7 @@ class ReviewLine(Line):
 
 
 class SegmentLine(Line):
-    """A part of the episode as it was from then on."""
+    """Segment as it is from then on."""
 
     kind: Literal["segment"] = "segment"
     uuid: UUID
@@ -46,7 +46,7 @@ class SegmentLine(Line):
 
 
 class RemovalLine(Line):
-    """A part that somebody took away again."""
+    """Removal of a segment."""
 
     kind: Literal["segment_removed"] = "segment_removed"
     uuid: UUID
@@ -55,7 +55,7 @@ class RemovalLine(Line):
 
 
 class TagLine(Line):
-    """A tag that the episode has from then on."""
+    """Tag added to the episode."""
 
     kind: Literal["tag"] = "tag"
     uuid: UUID
@@ -65,7 +65,7 @@ class TagLine(Line):
 
 
 class UntagLine(Line):
-    """A tag that somebody took off again."""
+    """Removal of a tag."""
 
     kind: Literal["tag_removed"] = "tag_removed"
     uuid: UUID
@@ -78,7 +78,7 @@ REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, Remova
 
 
 def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
-    """The tags that are left after all lines, of two of the same words the first."""
+    """Return the tags after all lines; of two with the same words the first."""
     found: dict[UUID, TagLine] = {}
     for line in lines:
         if isinstance(line, TagLine):
@@ -89,7 +89,7 @@ def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
 
 
 def segments_of(lines: Sequence[AnyReview]) -> list[SegmentLine]:
-    """The segments that stand after all lines, in the order of their frames."""
+    """Return the segments after all lines, sorted by frames."""
     found: dict[UUID, SegmentLine] = {}
     for line in lines:
         if isinstance(line, SegmentLine):

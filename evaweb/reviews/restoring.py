@@ -1,4 +1,4 @@
-"""Reviews, annotations and reports that the database has lost, made again from the disk."""
+"""Restoring of lost reviews, annotations and reports from the disk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from runtime.recording.files import RecordingError
 
 @register_restorer
 def restore(kept: RestorableRun) -> int:
-    """Make the rows of an episode's reviews and segments, and of its report, that are not there; how many."""
+    """Restore the missing rows of an episode's reviews, segments, tags and report; return their number."""
     episode = Episode.objects.filter(uuid=kept.uuid).first()
     if episode is None:
         return 0
@@ -38,7 +38,7 @@ def restore(kept: RestorableRun) -> int:
 
 
 def _checked(episode: Episode) -> None:
-    """The row of a report that lies on the disk."""
+    """Restore the row of a report on disk."""
     path = report_file(episode.uuid)
     if not path.exists() or Standing.objects.filter(episode=episode).exclude(checked_at=None).exists():
         return
@@ -62,9 +62,9 @@ def _reviews(episode: Episode, lines: Sequence[ReviewLine]) -> int:
 
 
 def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
-    """Bring the rows up to what the lines say; a segment is as its newest line.
+    """Update the rows from the lines; a segment is as its newest line.
 
-    Where lines were left out they may have said otherwise: rows are only added.
+    If lines were skipped (not `whole`), rows are only added, because the missing lines may have changed others.
     """
     wanted = {line.uuid: line for line in segments_of(lines)}
     changed = 0
@@ -87,7 +87,7 @@ def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> i
 
 
 def _tags(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
-    """Bring the rows up to what the lines say; where lines were left out, rows are only added."""
+    """Update the rows from the lines; if lines were skipped, rows are only added."""
     wanted = tags_of(lines)
     gone = Tag.objects.filter(episode=episode).exclude(pk__in=[line.uuid for line in wanted])
     changed = gone.delete()[0] if whole else 0

@@ -1,4 +1,4 @@
-"""Reads of what is said of episodes."""
+"""Queries on reviews."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _judges: list[Judges] = []
 
 
 def get_standing(*, episode: Episode) -> Standing:
-    """Standing of the episode; one of which nothing is known stands at the beginning."""
+    """Return the episode's standing; an unsaved empty one if there is none."""
     return Standing.objects.filter(episode=episode).select_related("review__reviewer").first() or Standing(
         episode=episode
     )
 
 
 def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
-    """Report of the checks, as written down; None where they were not done. Conflict if it is damaged."""
+    """Return the stored quality report; None before the checks. Raises: Conflict if it is damaged."""
     path = report_file(uuid)
     try:
         return read_json(path) if path.exists() else None
@@ -47,7 +47,7 @@ def report_of(*, uuid: UUID) -> Mapping[str, Any] | None:
 
 
 def report_get(*, uuid: UUID) -> Mapping[str, Any]:
-    """The same; NotFound where the checks were not done."""
+    """Return the stored quality report. Raises: NotFound before the checks; Conflict if it is damaged."""
     found = report_of(uuid=uuid)
     if found is None:
         raise NotFound(_EPISODE_HAS_NOT_BEEN_CHECKED(uuid=uuid))
@@ -55,9 +55,9 @@ def report_get(*, uuid: UUID) -> Mapping[str, Any]:
 
 
 def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list[Review], list[Segment], int]:
-    """What people said of it and its annotated parts, and how much of both is kept from this user.
+    """Return the reviews and segments that this user may see, and the number of hidden ones.
 
-    What others say is kept from whoever may still have to judge its trial.
+    Opinions of others are hidden from users who may still have to judge its trial.
     """
     reviews, segments = list(reviews_of(episode=episode)), list(segments_of(episode=episode))
     if not sight.hides_episode(episode) and not any(judges(user, episode) for judges in _judges):
@@ -68,37 +68,37 @@ def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list
 
 
 def still_judges(judges: Judges) -> Judges:
-    """Declare from above who has to judge the trial of an episode without knowing what others say of it."""
+    """Register a function of higher layers that returns whether a user still has to judge an episode blind."""
     _judges.append(judges)
     return judges
 
 
 def reviews_of(*, episode: Episode) -> QuerySet[Review]:
-    """All that people said of it, the newest first."""
+    """Return all reviews of the episode, newest first."""
     return Review.objects.filter(episode=episode).select_related("reviewer").order_by("-at")
 
 
 def segments_of(*, episode: Episode) -> QuerySet[Segment]:
-    """Its annotated parts, in order."""
+    """Return the episode's segments in order."""
     return Segment.objects.filter(episode=episode).select_related("annotator")
 
 
 def labels_offered() -> QuerySet[SegmentLabel]:
-    """The lab's vocabulary of parts, without what is retired."""
+    """Return the active labels for segments."""
     return SegmentLabel.objects.filter(active=True)
 
 
 def unreviewed_episodes() -> QuerySet[Episode]:
-    """Closed episodes with pictures or rows to look at and without a pass or fail, the newest first."""
+    """Return the closed episodes with frames and without pass or fail, newest first."""
     newest = (F("started_at").desc(nulls_last=True), "-created_at", "uuid")
     closed = Episode.objects.filter(status__in=CLOSED, frames__gt=0)
     return closed.filter(standing__review=None).order_by(*newest)
 
 
 def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
-    """The next one after that episode in the list, from its top where there is none below; and how many there are.
+    """Return the next unreviewed episode after `after` in the list, wrapping around, and the number of all.
 
-    Without `after` the first. The episode itself is never the next.
+    Without `after` the first. The episode itself is never returned.
     """
     waiting = unreviewed_episodes()
     count = waiting.count()
@@ -114,13 +114,13 @@ def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
 
 
 def unchecked_episodes() -> QuerySet[Episode]:
-    """Closed episodes that are here and of which no checks were ever asked for, the oldest first."""
+    """Return the closed local episodes whose checks were never requested, oldest first."""
     here = Episode.objects.filter(status__in=CLOSED, away_since=None)
     return here.filter(standing__asked_at=None).order_by("created_at")
 
 
 def outdated_episodes() -> QuerySet[Standing]:
-    """Those whose published episode has not the newest of what is said of it."""
+    """Return the standings whose published episode lacks the newest reviews."""
     published = Standing.objects.exclude(episode__published_at=None).exclude(changed_at=None)
     older = (
         Q(attached_at=None)

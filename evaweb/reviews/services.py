@@ -1,4 +1,4 @@
-"""Changes to verdicts, annotations and reports: a line on the disk first, then the row."""
+"""Services for reviews, segments, tags and reports; the line on disk is written before the row."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ _EPISODE_STILL_BEING_RECORDED_REVIEW = Pattern(
     "episode {uuid} is still being recorded: review it when it is closed",
 )
 
-LONGEST_NOTE = 8000  # characters
+LONGEST_NOTE = 8000  # longest note [characters]
 LONGEST_LABEL = 120
 LONGEST_MILESTONE = 200
-MOST_TAGS = 30  # of an episode
+MOST_TAGS = 30  # tags per episode
 
 
 # --- verdicts ------------------------------------------------------------------------------------------------
@@ -68,7 +68,7 @@ MOST_TAGS = 30  # of an episode
 def add_review(
     *, user: Any, episode: Episode, verdict: str, note: str = "", frame: int | None = None
 ) -> Review:
-    """Say pass, fail or a note of an episode that is closed, or of one moment of it; operators.
+    """Add a pass, fail or note on a closed episode, or on one frame of it; operators only.
 
     The newest pass or fail counts.
     """
@@ -84,7 +84,7 @@ def add_review(
     said = {"verdict": verdict, "note": note, "frame": frame, "reviewer": user}
     newest = Review.objects.filter(episode=episode).order_by("-at", "-pk").first()
     if newest is not None and all(getattr(newest, name) == value for name, value in said.items()):
-        return newest  # said once more, because the answer was lost
+        return newest  # repeated request whose answer was lost
     review = Review(episode=episode, at=timezone.now(), **said)
     REVIEWS.append(episode.uuid, ReviewLine.written(review))
     review.save(force_insert=True)
@@ -106,7 +106,10 @@ def save_segment(
     milestone: str = "",
     segment: UUID | None = None,
 ) -> Segment:
-    """Mark the frames `first` to `last`, both included; with `segment`, change that one of one's own. Operators."""
+    """Mark frames `first` to `last`, inclusive; with `segment`, change that one, which must be the user's own.
+
+    Operators only; an administrator may change any.
+    """
     require_role(user, Role.OPERATOR)
     label, milestone = (
         clean_text("label", label, LONGEST_LABEL),
@@ -120,7 +123,7 @@ def save_segment(
     said = {"first": first, "last": last, "label": label, "milestone": milestone}
     there = Segment.objects.filter(episode=episode, annotator=user, **said).first()
     if there is not None and segment in (None, there.pk):
-        return there  # marked once more, because the answer was lost
+        return there  # repeated request whose answer was lost
     row = _own(user, episode, segment) if segment else Segment(episode=episode, annotator=user)
     row.first, row.last, row.label, row.milestone, row.at = first, last, label, milestone, timezone.now()
     REVIEWS.append(episode.uuid, SegmentLine.written(row))
@@ -131,7 +134,7 @@ def save_segment(
 
 @transaction.atomic
 def remove_segment(*, user: Any, episode: Episode, segment: UUID) -> None:
-    """Take a part of one's own away again; an administrator any. Its lines stay on the disk."""
+    """Remove one's own segment, or any as an administrator; its lines stay on the disk."""
     require_role(user, Role.OPERATOR)
     _locked_episode(episode)
     row = _own(user, episode, segment)
@@ -155,7 +158,7 @@ def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
 
 @dataclass(frozen=True, slots=True)
 class Tagged:
-    """What was changed, which is less than what was asked for where it was so already."""
+    """Tags actually added and removed, without those that were so already."""
 
     added: tuple[str, ...]
     removed: tuple[str, ...]
@@ -165,7 +168,7 @@ class Tagged:
 def tags_change(
     *, user: Any, episode: Episode, add: Sequence[str] = (), remove: Sequence[str] = ()
 ) -> Tagged:
-    """Put tags on an episode that is closed, and take others off, whoever put them there; operators."""
+    """Add and remove tags of a closed episode, whoever added them; operators only."""
     require_role(user, Role.OPERATOR)
     wanted, unwanted = [tag_of(words) for words in add], {tag_of(words) for words in remove}
     if both := unwanted & set(wanted):
@@ -190,13 +193,13 @@ def tags_change(
 
 
 def tag_of(given: str) -> str:
-    """The tag that is meant; EvaError where it cannot be one."""
+    """Return the normalized tag. Raises: EvaError if it is invalid."""
     words = " ".join(clean_text("tag", given, LONGEST_TAG).casefold().split())
     try:
         check_name(words)
     except ValidationError as fault:
         raise EvaError(f"tag: {fault.messages[0]}") from None
-    if not words or "," in words or len(words) > LONGEST_TAG:  # casefold makes two letters of some
+    if not words or "," in words or len(words) > LONGEST_TAG:  # casefold can lengthen a text
         raise EvaError(f"tag = {given!r:.80}; allowed: 1 to {LONGEST_TAG} characters without a comma")
     return words
 
@@ -206,7 +209,7 @@ def tag_of(given: str) -> str:
 
 @transaction.atomic
 def request_quality_check(*, episode: Episode) -> Job:
-    """Have the worker look the episode through, again where it has."""
+    """Queue the checks of an episode, also if it was checked before."""
     if episode.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_CHECKED(uuid=episode.uuid))
     Standing.objects.update_or_create(episode=episode, defaults={"asked_at": timezone.now()})
@@ -215,7 +218,7 @@ def request_quality_check(*, episode: Episode) -> Job:
 
 @transaction.atomic
 def record_quality(*, episode: Episode, document: Mapping[str, Any], at: datetime) -> Standing:
-    """Keep what the checks found; the report itself lies on the disk."""
+    """Store the summary of the checks; the report itself is on the disk."""
     counts = document.get("counts", {})
     facts = {
         "asked_at": at,
@@ -231,9 +234,9 @@ def record_quality(*, episode: Episode, document: Mapping[str, Any], at: datetim
 
 
 def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
-    """Something was said of it; `review` counts from now on, None leaves the one that does.
+    """Mark that the episode's reviews have changed; `review` becomes the one that counts, None keeps the current.
 
-    By the database's time, as publications are: they are compared, and workers have clocks of their own.
+    Uses the database's time, because it is compared with publications by workers with clocks of their own.
     """
     facts: dict[str, Any] = {"changed_at": Now()}
     if review is not None:
@@ -242,7 +245,7 @@ def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
 
 
 def _locked_episode(episode: Episode) -> None:
-    """Make this the one writer of the episode's file; Conflict while it is being recorded."""
+    """Lock the episode's row, for a single writer of its file. Raises: Conflict while it is being recorded."""
     row = Episode.objects.select_for_update().get(pk=episode.pk)
     if row.status == EpisodeStatus.RECORDING:
         raise Conflict(_EPISODE_STILL_BEING_RECORDED_REVIEW(uuid=episode.uuid))

@@ -1,1 +1,1 @@
-"""Robots on the bench: their sites, leases and commands."""
+"""Stations: robots with their computers, leases and commands."""

@@ -1,4 +1,4 @@
-"""Stations in the admin pages; leases and commands are records and only read there."""
+"""Admin pages of stations; leases and commands are read-only records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from evaweb.stations.models import Command, Lease, LeaseRequest, Station, Statio
 
 
 class StationForm(forms.ModelForm):
-    """A station, its robot chosen from those there are."""
+    """Form of a station with a choice of the existing robots."""
 
     class Meta:
         model = Station
@@ -31,7 +31,7 @@ class StationForm(forms.ModelForm):
 
 @admin.register(Station)
 class StationAdmin(admin.ModelAdmin):
-    """A station is switched off rather than removed: its records refer to it."""
+    """Stations, which are deactivated instead of deleted, because records refer to them."""
 
     form = StationForm
     change_form_template = "stations/admin_station.html"
@@ -46,12 +46,12 @@ class StationAdmin(admin.ModelAdmin):
         return False
 
     def get_urls(self) -> list[URLPattern]:
-        """With the page on which a computer's code is shown."""
+        """Add the page that shows an enrolment code."""
         own = self.admin_site.admin_view(self.enrol_view)
         return [path("<int:object_id>/enrol/", own, name="stations_station_enrol"), *super().get_urls()]
 
     def enrol_view(self, request: HttpRequest, object_id: int) -> HttpResponse:
-        """Say what a code does; by POST make one and show it, this once."""
+        """Explain enrolment; on POST create a code and show it once."""
         station = get_object_or_404(Station, pk=object_id)
         shown = None
         if request.method == "POST":
@@ -74,7 +74,7 @@ class StationAdmin(admin.ModelAdmin):
 
 
 class RecordAdmin(admin.ModelAdmin):
-    """Records of what happened, which are not edited."""
+    """Base of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -88,7 +88,7 @@ class RecordAdmin(admin.ModelAdmin):
 
 @admin.register(StationKey)
 class StationKeyAdmin(RecordAdmin):
-    """Computers that are stations, and that were."""
+    """Keys of computers, current and withdrawn."""
 
     list_display = ("station", "computer", "enrolled_at", "enrolled_by", "withdrawn_at", "withdrawn")
     list_filter = ("station",)
@@ -97,7 +97,7 @@ class StationKeyAdmin(RecordAdmin):
 
     @admin.action(description="Withdraw: the computer is cut off within a second")
     def withdraw(self, request: HttpRequest, rows: QuerySet[StationKey]) -> None:
-        """Those chosen."""
+        """Withdraw the selected keys."""
         for key in rows.select_related("station"):
             key_withdraw(user=request.user, key=key)
             messages.success(request, f"The key of {key.station.name} is withdrawn.")

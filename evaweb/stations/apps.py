@@ -1,10 +1,10 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 
 
 class StationsConfig(AppConfig):
-    """Robots on the bench: their sites, leases and commands."""
+    """Stations: robots with their computers, leases and commands."""
 
     name = "evaweb.stations"
     default_auto_field = "django.db.models.BigAutoField"

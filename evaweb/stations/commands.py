@@ -1,6 +1,7 @@
-"""Commands: their users, their kinds, and their results.
+"""Commands to stations: their users, kinds and results.
 
-A row first, then the wire, then the answer. The stopping commands go to the wire first and wait for no database.
+A command is first written as a row, then sent, then its answer is stored. Stop, halt and e-stop are sent first and
+wait for no database.
 """
 
 from __future__ import annotations
@@ -62,27 +63,27 @@ _UUID_OF_ANOTHER = Pattern(
     "stations.commands.uuid_of_another",
     "uuid {uuid} is that of another command ({first}); each needs one of its own",
 )
-STOPPING = ("stop", "halt", "estop")  # never stale; the runtime has the same list
+STOPPING = ("stop", "halt", "estop")  # never expire; the runtime has the same list
 COLLECTING = ("arm", "disarm", "label", "discard")
 KINDS = (
     *("setup", "run", "stop", "halt", "resume", "home", "release", "record_start", "record_stop", "estop"),
     *("tune", "step", "commit", "cancel", "move", "gripper", "approach"),
     *COLLECTING,
 )
-TABLES = ("policy", "checkpoint")  # arguments of whom a station asks, and as whom it writes that down
+TABLES = ("policy", "checkpoint")  # arguments: the policy to query, and its name in recordings
 _UNANSWERED = (CommandStatus.PRESSED, CommandStatus.UNKNOWN)
 _ANSWER = ("status", "reason", "allowed", "data", "answered_at")
-_LONG_AGO = 0.0  # on the runtime's clock: a command that must not be carried out any more
+_LONG_AGO = 0.0  # expiry on the runtime's clock: the command must not be carried out any more
 
 
 class NotSent(EvaError):
-    """The command was not sent, because it could not be written down."""
+    """The command was not sent, because its row could not be written."""
 
     status = 503
 
 
 def parse_command_uuid(given: UUID | str | None) -> UUID:
-    """The uuid of a command, a new one where none is given; EvaError where it is none."""
+    """Return the uuid of a command, a new one for None. Raises: EvaError if it is malformed."""
     if given is None:
         return uuid4()
     try:
@@ -104,12 +105,18 @@ def issue_command(
     uuid: UUID | str | None = None,
     vouched: Sequence[str] = (),
 ) -> Command:
-    """Give a command and return its row with the answer; the same uuid again returns the first one's.
+    """Send a command and return its row with the answer; a repeated uuid returns the first row.
 
-    `boot` and `sequence` are those of the snapshot that the page showed. `vouched` names arguments that were not taken
-    from the user, but from what an administrator wrote, or the lab recorded. Never call it within a transaction:
-    no other process could write until the station has answered. Raises NotAllowed, Conflict for a uuid that is
-    another command's, NotSent where the database does not take the row.
+    Args:
+        boot, sequence: Those of the snapshot that the page showed.
+        vouched: Arguments that come from an administrator's table or the lab's records instead of the user.
+
+    Never call it within a transaction: other processes could not write until the station has answered.
+
+    Raises:
+        NotAllowed: The user lacks the role.
+        Conflict: The uuid is that of another command.
+        NotSent: The database did not accept the row.
     """
     row = Command(
         uuid=parse_command_uuid(uuid),
@@ -134,7 +141,7 @@ def issue_command(
 
 
 def _require_no_table(row: Command, role: Role, vouched: Sequence[str]) -> None:
-    """An operator names what an administrator wrote; the station looks at it once more."""
+    """Raise NotAllowed if an operator passes a table reserved for administrators; the station checks it again."""
     given = [key for key in TABLES if row.args.get(key) is not None and key not in vouched]
     if given and role is not Role.ADMIN:
         raise NotAllowed(
@@ -154,15 +161,15 @@ def record_estop(
     at: datetime,
     unverified: str = "",
 ) -> Command:
-    """The row of an e-stop that was pressed `at` a time, written down soon, whenever the database takes it.
+    """Queue the row of an e-stop that was pressed at `at`; it is written when the database accepts it.
 
-    Of `station` and `user` the names are enough. `unverified` is why the user is not known.
+    `station` and `user` need only their names. `unverified`: why the user is unknown.
     """
     args = {"why": clean_reason(why)} | ({"unverified": unverified} if unverified else {})
     row = Command(
         uuid=parse_command_uuid(uuid), station=station, user=user, kind="estop", args=args, issued_at=at
     )
-    if str(row.uuid) != answer.uuid and answer.data.get("latched") == "anew":  # which another press did
+    if str(row.uuid) != answer.uuid and answer.data.get("latched") == "anew":  # latched by another press
         answer = replace(answer, data={**answer.data, "latched": "already"})
     return _queue_record(row, answer)
 
@@ -178,18 +185,18 @@ def record_stop(
     answer: Answer,
     at: datetime,
 ) -> Command:
-    """The row of a stop or halt that was given `at` a time, written down soon, whenever the database takes it."""
+    """Queue the row of a stop or halt that was sent at `at`; it is written when the database accepts it."""
     given = {"station": station, "user": user, "kind": kind, "epoch": epoch, "issued_at": at}
     row = Command(uuid=parse_command_uuid(uuid), holder=holder_of(user.get_username(), page), **given)
     return _queue_record(row, answer)
 
 
 def resolve_unknown_outcome(*, row: Command) -> Command:
-    """Find out what became of a command whose answer was lost; leaves it as it is where that cannot be known yet.
+    """Determine the outcome of a command whose answer was lost; leave the row unchanged if it is still unknown.
 
-    The runtime answers a uuid that it knows as it did the first time. One that it does not know comes too
-    late now, is refused, and is remembered as refused: it can never be carried out any more. A stopping
-    command never comes too late, and is therefore not asked about.
+    The command is sent again, already expired. A runtime that knows its uuid repeats the first answer. One that does
+    not refuses it as too late and remembers the refusal, so it can never be carried out any more. Stopping commands
+    never expire, and are therefore not sent again.
     """
     age = timezone.now() - row.issued_at
     if row.kind in STOPPING or row.status not in _UNANSWERED or age < timedelta(seconds=_patience_s()):
@@ -205,12 +212,12 @@ def resolve_unknown_outcome(*, row: Command) -> Command:
 
 
 def record_run_not_opened(*, station: Station, uuid: UUID | str, reason: str) -> None:
-    """Keep of an accepted run that its recording could not be opened: its answer may be heard of later still."""
+    """Record for an accepted run that its recording could not be opened; its answer may still arrive later."""
     Command.objects.filter(pk=parse_command_uuid(uuid), station=station, kind="run").update(unopened=reason)
 
 
 def unresolved_commands(*, station: Station) -> list[Command]:
-    """The commands of the last hour whose answers were lost."""
+    """Return the commands of the last hour whose answers were lost."""
     now = timezone.now()
     return list(
         station.commands.filter(
@@ -233,20 +240,21 @@ def _send(row: Command, command: messages.Command) -> Command:
         with transaction.atomic(durable=True):
             row.issued_at = timezone.now()
             row.save(force_insert=True)
-    except IntegrityError:  # pressed twice in the same moment
+    except IntegrityError:  # sent twice concurrently
         first = _find_first(row)
         if first is None:
             raise
         return first
     except Error as error:
         raise NotSent(_NOT_WRITTEN_DOWN(kind=row.kind, error=error)) from error
+    # A row that took long to write delays the command; it is then reported as failed instead of moving a robot late.
     _put(row, _send_and_wait(row, command, waited=time.monotonic() - pressed))
     _update(row)
     return row
 
 
 def _require_sendable(command: messages.Command) -> None:
-    """Before it is a row that would be asked about for an hour."""
+    """Raise EvaError if the command cannot be encoded, before its row exists and is resolved for an hour."""
     try:
         messages.encode(command)
     except CodecError as error:
@@ -254,7 +262,7 @@ def _require_sendable(command: messages.Command) -> None:
 
 
 def _send_and_wait(row: Command, command: messages.Command, waited: float) -> Answer:
-    """The runtime's answer to a command whose row took `waited` seconds to be written."""
+    """Send a command and return the answer; `waited` is the time that writing its row took [s]."""
     if waited > settings.EVA_COMMAND_TIMEOUT_S:
         return Answer(CommandStatus.FAILED, _DATABASE_SLOW(seconds=waited))
     try:
@@ -275,21 +283,21 @@ def _stop(row: Command) -> Command:
 
 
 def _queue_record(row: Command, answer: Answer) -> Command:
-    """Have written down what has been done already."""
+    """Queue the row of a stop that has been carried out already."""
     _put(row, answer)
     notes.record(row)
     return row
 
 
 def _stored_row(row: Command) -> Command:
-    """The row as it is in the database: this one, or the first of that uuid with what this one knows better.
+    """Store the row, or merge its better knowledge into the first row with that uuid; return the stored row.
 
-    A press whose uuid is that of something else has a row of its own.
+    An e-stop press whose uuid belongs to another command gets its own row.
     """
     _resolve(row)
     try:
         return _merged(row)
-    except IntegrityError:  # pressed twice in the same moment: the other one has written it
+    except IntegrityError:  # sent twice concurrently: the other writer has inserted it
         return _merged(row)
 
 
@@ -303,12 +311,15 @@ def _merged(row: Command) -> Command:
     if better:
         row.save(
             update_fields=better, force_update=True
-        )  # not the object that was read: it would be inserted
+        )  # force_update: `row` was not loaded, so a plain save() would insert it
     return _find_first(row) or row
 
 
 def _merged_fields(row: Command, first: Command) -> list[str]:
-    """The fields of a stop that came another way as well, where its answer was heard or its user was known there."""
+    """Return the fields in which this record of a stop is better than the first, which arrived on another path.
+
+    These are the answer, if it was lost or not carried out there, and the user, if unknown there.
+    """
     carried_out = row.status in CARRIED_OUT and first.status not in CARRIED_OUT
     latched = row.data.get("latched") == "anew" and first.data.get("latched") == "before"
     answer = _ANSWER if first.status in _UNANSWERED or carried_out or latched else ()
@@ -317,9 +328,9 @@ def _merged_fields(row: Command, first: Command) -> list[str]:
 
 
 def _first_or_own(row: Command) -> Command | None:
-    """The row that has this uuid already, where it is this command; a press otherwise gets a uuid of its own.
+    """Return the existing row of this command; give a different press with the same uuid a uuid of its own.
 
-    That follows from what was pressed: by any writer, and however often, it is one row.
+    The new uuid is derived from the press, so that every writer and every repetition finds the same row.
     """
     try:
         first = _find_first(row)
@@ -338,13 +349,13 @@ def _first_or_own(row: Command) -> Command | None:
 
 
 def _latched_again(row: Command, first: Command) -> bool:
-    """True if a press latched anew, and not when the first of its uuid was carried out."""
+    """Return True if this press latched the e-stop anew, at another time than the first with its uuid."""
     at = first.data.get("carried_out_at")
     return row.data.get("latched") == "anew" and at not in (None, row.data["carried_out_at"])
 
 
 def _resolve(row: Command) -> None:
-    """Station and user as the database has them, where they are known by name alone; NotFound."""
+    """Load station and user from the database if only their names are known. Raises: NotFound."""
     if row.station_id is None:
         row.station = station_get(name=row.station.name)
     if row.user is not None and row.user_id is None:
@@ -356,14 +367,14 @@ notes = StopRecorder(lambda row: unwritten.store(row), journal=unwritten.prepare
 
 
 def _find_first(row: Command) -> Command | None:
-    """The row that has this uuid already; raises Conflict where it is another command."""
+    """Return the existing row with this uuid. Raises: Conflict if it is another command."""
     first = Command.objects.select_related("station", "user").filter(uuid=row.uuid).first()
     if first is None:
         return None
     unverified = row.kind == "estop" and None in (
         first.user_id,
         row.user_id,
-    )  # by one of the ways that it came
+    )  # its user is unknown on one of its paths
     same_user = first.user_id == row.user_id or unverified
     if (first.station_id, first.kind) != (row.station_id, row.kind) or not same_user:
         raise Conflict(_UUID_OF_ANOTHER(uuid=row.uuid, first=first))
@@ -377,7 +388,7 @@ def _put(row: Command, answer: Answer) -> None:
 
 
 def _update(row: Command) -> None:
-    """Save the answer; where the database refuses, `resolve_unknown_outcome` asks the runtime again later."""
+    """Save the answer; if the database refuses, `resolve_unknown_outcome` asks the runtime again later."""
     try:
         row.save(update_fields=_ANSWER)
     except Error as error:
@@ -389,7 +400,7 @@ def _update(row: Command) -> None:
 def _message(
     row: Command, role: str = "", vouched: Sequence[str] = (), valid_until: float = float("inf")
 ) -> messages.Command:
-    """`role` is what the station is told of the user's, "" for stops, which need none and wait for no database."""
+    """Return the command as sent; `role` is the user's, "" for stops, which need none and wait for no database."""
     return messages.Command(
         str(row.uuid),
         row.kind,
@@ -406,5 +417,5 @@ def _message(
 
 
 def _patience_s() -> float:
-    """Time after which no caller waits for an answer any more [s]."""
+    """Return the time after which no caller waits for an answer any more [s]."""
     return settings.EVA_COMMAND_TIMEOUT_S + 1.0

@@ -1,4 +1,4 @@
-"""Computers that are stations: the code that lets one in once, the keys of all, and who may connect by them."""
+"""Enrolment of other computers as stations: one-time codes, their keys, and the list of admitted keys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _EVERYWHERE = ("0.0.0.0", "::")
 
 
 class Shown(NamedTuple):
-    """A code with what else an administrator needs at the robot's computer; never to be had again."""
+    """Enrolment code with the data needed at the robot's computer; shown once, only its digest is stored."""
 
     code: str
     address: str
@@ -34,13 +34,16 @@ class Shown(NamedTuple):
 
     @property
     def command(self) -> str:
-        """To be typed there."""
+        """Command line to run on the robot's computer."""
         return f"python -m runtime.keys enrol {self.address} {self.code}"
 
 
 @transaction.atomic
 def code_make(*, user: Any, station: Station) -> Shown:
-    """A new code for this station; those of before are good no more. Raises NotAllowed, EvaError without a gate."""
+    """Create an enrolment code for this station and invalidate earlier ones.
+
+    Raises: NotAllowed unless an administrator; EvaError without a gate.
+    """
     require_role(user, Role.ADMIN)
     if settings.EVA_GATE is None:
         raise EvaError(
@@ -59,7 +62,10 @@ def code_make(*, user: Any, station: Station) -> Shown:
 
 @transaction.atomic
 def key_enrol(*, digest: str, key: str, computer: str) -> Station:
-    """Make the key that of the code's station, in place of the one that it had; Conflict for a code that is none."""
+    """Make `key` the key of the code's station, replacing an earlier one, and use up the code.
+
+    Raises: Conflict if the code is unknown, used or expired.
+    """
     row = EnrolmentCode.objects.select_for_update().filter(digest=digest).first()
     if row is None or row.expires_at < timezone.now():
         raise Conflict(
@@ -76,7 +82,7 @@ def key_enrol(*, digest: str, key: str, computer: str) -> Station:
 
 
 def key_withdraw(*, user: Any, key: StationKey) -> StationKey:
-    """The computer is no station any more: its connections are cut within a second."""
+    """Withdraw a computer's key; its connections are cut within a second."""
     require_role(user, Role.ADMIN)
     if key.withdrawn_at is None:
         key.withdrawn_at, key.withdrawn = timezone.now(), f"withdrawn by {user.get_username()}"
@@ -86,7 +92,7 @@ def key_withdraw(*, user: Any, key: StationKey) -> StationKey:
 
 
 def keys_allowed() -> Allowed:
-    """Who may connect to the gate, as the database has it now."""
+    """Return which keys may connect to the gate as which stations, and whether any code is valid."""
     names: dict[str, frozenset[str]] = {}
     for key, name in StationKey.objects.filter(withdrawn_at=None).values_list("key", "station__name"):
         names[key] = names.get(key, frozenset()) | {name}
@@ -95,7 +101,7 @@ def keys_allowed() -> Allowed:
 
 
 def _named(host: str) -> str:
-    """The name of this computer where it listens at all of its addresses."""
+    """Return the host for use in an address: this computer's name if the gate listens on all addresses."""
     if host in _EVERYWHERE:
         return socket.gethostname()
     return f"[{host}]" if ":" in host else host

@@ -1,7 +1,7 @@
-"""Requests to stations that are under way: one that says the same again does not go out again.
+"""Coalescing of concurrent requests to stations: a repeated request is not sent again.
 
-Each has a thread of its own, so that a station that hangs keeps none of another's waiting. What comes under the same
-key while one is under way is at most one more request, sent when that one is over: a flood costs two.
+Each pending request has its own thread, so that a hanging station does not delay others. Requests with the same key
+that arrive meanwhile share one further request, sent when the first is over: a flood costs two.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class TooManyRequests(Exception):
-    """More requests to one station are under way than it may have."""
+    """One station has the allowed number of pending requests."""
 
 
 @dataclass(slots=True)
@@ -36,9 +36,9 @@ class _PendingRequest(Generic[T]):
 
 
 class RequestCoalescer(Generic[T]):
-    """Requests to stations under way; from any thread, and none of its callers waits.
+    """Pending requests to stations; thread-safe, and callers do not block.
 
-    `most` is how many keys of one station may be under way at once, None for any number.
+    `most` limits the concurrent keys per station, None for no limit.
     """
 
     def __init__(self, name: str, most: int | None = None) -> None:
@@ -46,7 +46,7 @@ class RequestCoalescer(Generic[T]):
         self._lock = Lock()
         self._under_way: dict[
             tuple[str, Hashable], list[_PendingRequest[T]]
-        ] = {}  # the one that flies, the next
+        ] = {}  # the running request, then the next
         self._keys: Counter[str] = Counter()  # by station
 
     def submit(
@@ -58,14 +58,14 @@ class RequestCoalescer(Generic[T]):
         identity: Hashable,
         shared: bool = False,
     ) -> Future[T]:
-        """The answer to `work`, or to the same that is under way already.
+        """Start `work` or join an equal pending request; return the future of the answer.
 
-        The same `identity` gets the same answer. Another one of that `key` gets the answer of one request more,
-        which is sent after it came; where it is `shared`, that of the one under way, and that request is made all
-        the same. Raises TooMany.
+        The same `identity` shares the answer. Another identity with the same `key` gets the answer of one further
+        request, sent after this call; if `shared`, that of the pending one, and the further request is sent regardless.
+        Raises: TooManyRequests.
         """
         place, flight = (station, key), _PendingRequest(identity, work)
-        flight.answer.set_running_or_notify_cancel()  # who stops waiting for it ends nobody else's
+        flight.answer.set_running_or_notify_cancel()  # shared by callers: one must not cancel it for others
         with self._lock:
             flights = self._under_way.get(place)
             if flights is not None:
@@ -80,7 +80,7 @@ class RequestCoalescer(Generic[T]):
     def _start(self, place: tuple[str, Hashable]) -> None:
         try:
             Thread(target=self._fly, args=(place,), name=self._name, daemon=True).start()
-        except RuntimeError as error:  # no more threads: what stops a robot is done all the same
+        except RuntimeError as error:  # cannot start a thread: a stop is sent nevertheless
             log.error("%s %s has no thread of its own: %s", self._name, place, error)
             self._fly(place)
 
@@ -97,7 +97,7 @@ class RequestCoalescer(Generic[T]):
                 done.answer.set_result(answer)
 
     def _next(self, place: tuple[str, Hashable]) -> _PendingRequest[T] | None:
-        """The one that waited, which flies now; no caller joins the one that is over."""
+        """Remove the finished request, so that no caller joins it, and return the waiting one."""
         with self._lock:
             flights = self._under_way[place]
             flights.pop(0)

@@ -1,4 +1,4 @@
-"""The process to which stations on other computers connect: who may is the database's to say."""
+"""Process to which stations on other computers connect; the database decides which keys it admits."""
 
 from __future__ import annotations
 
@@ -33,18 +33,17 @@ from runtime.recording.files import write_atomic
 
 log = logging.getLogger(__name__)
 _LOOK_S = 0.5
-_TURN_S = 0.001  # of the interpreter: a stop waits for no more of what other threads do
+_TURN_S = 0.001  # switch interval of the interpreter: bounds the delay of a stop by other threads
 
 
 class GateError(EvaError):
-    """The gate cannot start or go on; the message says why."""
+    """The gate cannot start or continue; the message states the reason."""
 
 
 class Keys:
-    """Who may connect, asked of the database twice a second; what it last said counts as long as it says nothing.
+    """Admitted keys, read from the database twice a second; the last result counts while the database is away.
 
-    It is kept in a file too: stations that are linked can be stopped though the gate is started while the database is
-    away.
+    The result is also stored in a file: linked stations can be stopped even if the gate starts without the database.
     """
 
     def __init__(self, data: Path) -> None:
@@ -54,7 +53,7 @@ class Keys:
         self.look()
 
     def look(self) -> None:
-        """Ask once; from any thread."""
+        """Read the keys once; thread-safe."""
         try:
             found = keys_allowed()
             self._failing = False
@@ -70,13 +69,11 @@ class Keys:
             self._keep(found)
 
     def follow(self, ended: threading.Event) -> None:
-        """Ask until it has ended."""
+        """Read the keys periodically until `ended` is set."""
         while not ended.wait(_LOOK_S):
             try:
                 self.look()
-            except (
-                Exception
-            ):  # else a key that is withdrawn would be let in for as long as this process lives
+            except Exception:  # otherwise this thread would end, and withdrawn keys would stay admitted
                 log.exception("who may connect is as it was")
 
     def _keep(self, found: Allowed) -> None:
@@ -94,9 +91,9 @@ class Keys:
 
 
 def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
-    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; prints where as JSON. GateError.
+    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; print the address as JSON.
 
-    `owner` says whose an episode is that a station offers.
+    `owner` returns the name of the station that owns an offered episode. Raises: GateError.
     """
     try:
         with _only_one(key_files.folder(settings.DATA_DIR) / "gate.lock"):
@@ -107,7 +104,7 @@ def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
 
 @contextmanager
 def _only_one(path: Path) -> Iterator[None]:
-    """Hold the lab's folders of stations elsewhere: two gates would both take in what these send."""
+    """Lock the lab's folders of remote stations: two gates would both store the stations' data."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as lock:
         try:
@@ -158,14 +155,14 @@ def _enroller(keys: Keys, tokens: bytes) -> Callable[[str, str, str], Enrolled |
             return str(fault)
         finally:
             close_old_connections()
-        keys.look()  # before the computer connects as what it is now
+        keys.look()  # admit the new key before the computer connects with it
         return Enrolled(station.name, socket.gethostname(), public, 0)
 
     return enrol
 
 
 def _watch(ended: threading.Event) -> None:
-    """The process that started us holds the other end of our standard input."""
+    """Set `ended` when standard input ends: the parent process holds its other end."""
     while os.read(0, 4096):
         pass
     ended.set()

@@ -1,4 +1,4 @@
-"""Static data of the 3D scene: a robot's parts and shapes, its frames, what it stands on, and the bench."""
+"""Static data of the 3D scene: a robot's parts, shapes and frames, its surroundings and the bench."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ Float64 = NDArray[np.float64]
 
 
 def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, simulated: bool) -> dict[str, Any]:
-    """Parts, shapes, frames and surroundings of a robot with these groups; NotFound where there is none such.
+    """Return parts, shapes, frames and surroundings of a robot with these groups.
 
-    Matrices go column by column. A frame's `part` is None where it stands still in the scene.
+    Matrices are column-major. A frame's `part` is None if it is fixed in the scene.
+    Raises: NotFound for an unknown robot or group.
     """
     looks = drawn_robot(robot, groups)
     return {
@@ -45,7 +46,7 @@ def scene_geometry(robot: str, groups: Sequence[str] | None = None, *, simulated
 
 
 def _visual(robot: str, visual: Visual) -> dict[str, Any]:
-    """A shape; a mesh has an `address`, and a `box` that stands for it until it is there."""
+    """Return a shape; a mesh has an `address` and a `box` that is drawn until it is loaded."""
     shown = {"part": visual.part, **_shape(visual), "colour": list(visual.colour)}
     if visual.file is None:
         return shown
@@ -64,7 +65,7 @@ def _shape(visual: Visual) -> dict[str, Any]:
 
 
 def _frames(looks: DrawnRobot) -> list[dict[str, Any]]:
-    """Every arm's end effector, and once each frame in which such poses may be given."""
+    """Return the end effector of every arm, and each reference frame of its poses once."""
     robot = looks.robot
     found: dict[int | None, dict[str, Any]] = {}
     for arm in robot.arms:
@@ -78,12 +79,12 @@ def _frames(looks: DrawnRobot) -> list[dict[str, Any]]:
 
 
 def _link(looks: DrawnRobot, arm: Group, link: str) -> str:
-    """A link's name, behind its arm's where there are several of that name."""
+    """Return a link's name, prefixed by its arm's if several parts have that name."""
     return link if len(looks.scene.parts_showing(link)) == 1 else f"{arm.name}/{link}"
 
 
 def _capsules(looks: DrawnRobot) -> list[dict[str, Any]]:
-    """Capsules that stand for the links in checks of collision with each other or with the table."""
+    """Return the capsules that approximate the links in collision checks."""
     return [
         {"part": part, "start": one.start.tolist(), "end": one.end.tolist(), "radius": one.radius}
         for link, made in capsules(looks.robot).items()
@@ -102,6 +103,6 @@ def _frame(name: str, kind: str, part: int | None, pose: Float64 | None = None) 
 
 
 def _numbers(matrix: Float64) -> list[float]:
-    """A matrix [4, 4], column by column."""
+    """Return a matrix [4, 4] as 16 numbers in column-major order."""
     found: list[float] = matrix.T.ravel().tolist()
     return found

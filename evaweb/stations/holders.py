@@ -10,15 +10,15 @@ _PAGE = re.compile(r"\bweb:([^:\s]+):[A-Za-z0-9_-]+")
 
 
 def holder_of(username: str, page: str) -> str:
-    """The name under which a page holds a lease."""
+    """Return the holder name of a page."""
     return f"web:{username}:{page}"
 
 
 def holder_display_name(holder: str) -> str:
-    """A holder's name as people know it."""
+    """Return a holder's name for users: the user name for a page."""
     return holder.split(":")[1] if holder.startswith("web:") else holder
 
 
 def with_display_names(reason: str) -> str:
-    """A sentence of the runtime with people's names where it names their pages."""
+    """Replace the holder names of pages in a message by user names."""
     return rewritten(reason, lambda text: _PAGE.sub(r"\1", text))

@@ -1,4 +1,4 @@
-"""What a process has in mind to write down, as lines of a file: whoever looks after its death finds them."""
+"""Journal of a process: intended database writes, recovered by another process if it dies."""
 
 from __future__ import annotations
 
@@ -15,13 +15,18 @@ from uuid import uuid4
 
 log = logging.getLogger(__name__)
 _SUFFIX = ".lines"
-_NO_FILE = (errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENXIO)  # of this process, and never will be
+_NO_FILE = (
+    errno.EACCES,
+    errno.EPERM,
+    errno.ELOOP,
+    errno.ENXIO,
+)  # permanent errors: not a file of this process
 
 
 class ProcessJournal:
-    """One file at a time, locked as long as this process lives; there is none while nothing is in mind.
+    """One file of lines, locked as long as this process lives; removed while nothing is pending.
 
-    Nothing is synced: what the system has taken outlives the process, if not the machine.
+    Writes are not synced: data handed to the kernel survives the process, though not the machine.
     """
 
     def __init__(self, folder: Callable[[], Path]) -> None:
@@ -30,14 +35,14 @@ class ProcessJournal:
         self._file: BinaryIO | None = None
 
     def add(self, documents: Iterable[Any]) -> None:
-        """A line of JSON for each; OSError."""
+        """Append one line of JSON per document. Raises: OSError."""
         lines = b"".join(json.dumps(document).encode() + b"\n" for document in documents)
         if self._file is None:
             self._path, self._file = self._begun()
         self._file.write(lines)
 
     def clear(self) -> None:
-        """All of it is written down otherwise; OSError."""
+        """Remove the file, because everything in it is stored elsewhere. Raises: OSError."""
         if self._file is None or self._path is None:
             return
         self._path.unlink(missing_ok=True)
@@ -51,7 +56,7 @@ class ProcessJournal:
         draft = path.with_suffix(".draft")
         file = draft.open("ab", buffering=0)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX)  # before it has the name that is looked for
+            fcntl.flock(file, fcntl.LOCK_EX)  # lock it before it gets the name that recovery searches for
             os.replace(draft, path)
         except OSError:
             file.close()
@@ -60,20 +65,21 @@ class ProcessJournal:
 
 
 def recover_journals(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> bool:
-    """Hand `take` the lines of each process that has died; whether a file has to wait for the disk.
+    """Pass the lines of each dead process's journal to `take`; return True if a file must wait for the disk.
 
-    A file is removed when `take` says that all of it was good; else it stays as .refused, as does what is no file.
+    The file is removed if `take` returns True (all lines were valid); else it is renamed to .refused, as is anything
+    that is not a regular file.
     """
     waits = False
     for path in sorted(folder.glob(f"*{_SUFFIX}")):
         try:
             _take_up(path, take)
         except (FileNotFoundError, BlockingIOError):
-            continue  # another process has taken it up, or its own lives
+            continue  # another process has recovered it, or its owner lives
         except OSError as error:
             log.info("%s waits for the disk: %s", path, error)
             waits = True
-        except Exception as fault:  # a file may hold anything: the next one is looked at all the same
+        except Exception as fault:  # a file may contain anything: continue with the next
             _put_aside(path, repr(fault))
     return waits
 

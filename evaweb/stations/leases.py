@@ -1,7 +1,7 @@
-"""Leases: the web grants the command of a station, its runtime enforces it.
+"""Leases: the right to command a station, granted by the web and enforced by the station's runtime.
 
-A lease begins where the runtime has accepted it, and ends where the runtime says so; rows are the record of it.
-Renewing is a stream from the holder's page and touches no row.
+A lease begins when the runtime has accepted it and ends when the runtime reports so; the rows are the record.
+The holder's page renews its lease in a stream, which touches no row.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ _ANSWERED_ALREADY = Pattern(
     "the request of {user} was {answer} already",
 )
 
-_ECHO = timedelta(seconds=3)  # for which an old snapshot may still be under way
+_ECHO = timedelta(seconds=3)  # time for which an outdated snapshot may still arrive
 
 
 def claim(*, user: Any, station: Station, page: str) -> Lease:
-    """Take a free station, or keep one's own; raises Conflict that names the holder."""
+    """Acquire a free station, or confirm one's own lease. Raises: Conflict that names the holder."""
     require_role(user, Role.OPERATOR)
     _require_active(station)
     holder = holder_of(user.get_username(), page)
@@ -81,16 +81,16 @@ def claim(*, user: Any, station: Station, page: str) -> Lease:
 
 
 def renew(*, username: str, page: str, station: str, epoch: int, hidden: bool = False) -> messages.Ack:
-    """Pass a page's sign of life on to the runtime, which alone decides; no row, no database.
+    """Forward a page's heartbeat to the runtime, which alone decides; uses no database.
 
-    That of a `hidden` page counts while nothing moves.
+    A heartbeat of a `hidden` page counts only while nothing moves.
     """
     args = {"hidden": True} if hidden else {}
     return _send_lease_command(station, "lease_renew", holder_of(username, page), epoch, args=args)
 
 
 def release(*, user: Any, station: Station, page: str) -> Lease:
-    """End one's own lease; a run that is going on is held then."""
+    """End one's own lease; the runtime then holds an active run. Raises: Conflict if the runtime refuses."""
     lease = _own(user, station, page)
     ack = _send_lease_command(station.name, "lease_give_up", lease.holder, lease.epoch)
     if ack.status == "refused":
@@ -100,7 +100,7 @@ def release(*, user: Any, station: Station, page: str) -> Lease:
 
 
 def request_handover(*, user: Any, station: Station, page: str) -> LeaseRequest:
-    """Ask the holder to hand the station over; asking again moves the request to the page that asks."""
+    """Ask the holder to hand the station over; a repeated request moves to the page that repeats it."""
     require_role(user, Role.OPERATOR)
     _require_active(station)
     holder, held = holder_of(user.get_username(), page), _held(station)["holder"]
@@ -115,7 +115,7 @@ def request_handover(*, user: Any, station: Station, page: str) -> LeaseRequest:
 
 
 def withdraw_request(*, user: Any, station: Station) -> LeaseRequest:
-    """Take one's request back."""
+    """Withdraw one's open request. Raises: NotFound if there is none."""
     asked = LeaseRequest.objects.filter(station=station, user=user, answer=LeaseRequest.Answer.OPEN).first()
     if asked is None:
         raise NotFound(_NOT_ASKED(user=user.get_username(), station=station))
@@ -123,13 +123,13 @@ def withdraw_request(*, user: Any, station: Station) -> LeaseRequest:
 
 
 def decline_request(*, user: Any, station: Station, page: str, request: int) -> LeaseRequest:
-    """The holder says no to a request."""
+    """Decline a request, as the holder."""
     _own(user, station, page)
     return _answered(_open_request(station, request), LeaseRequest.Answer.DECLINED)
 
 
 def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
-    """The holder gives the station to the page that asked; a run goes on without a pause."""
+    """Hand the station over to the page that requested it, as the holder; a run continues without a pause."""
     own = _own(user, station, page)
     asked = _open_request(station, request)
     _require_commander(asked.user)
@@ -141,9 +141,9 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
 
 
 def move(*, user: Any, station: Station, page: str) -> Lease:
-    """Bring one's own lease from another page to this one; a run goes on without a pause.
+    """Move one's own lease from another page to this one; a run continues without a pause.
 
-    Raises Conflict where the station is free or another user's.
+    Raises: Conflict if the station is free or held by another user.
     """
     require_role(user, Role.OPERATOR)
     _require_active(station)
@@ -158,7 +158,7 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
 
 
 def take_over(*, user: Any, station: Station, page: str, reason: str) -> Lease:
-    """An administrator takes the station from its holder, and says why."""
+    """Take the station from its holder, as an administrator and with a reason."""
     require_role(user, Role.ADMIN)
     if not reason.strip():
         raise EvaError(_TAKE_WITHOUT_REASON)
@@ -168,10 +168,10 @@ def take_over(*, user: Any, station: Station, page: str, reason: str) -> Lease:
 
 
 def record_snapshot_lease(*, station: Station, boot: str, held: Mapping[str, Any]) -> bool:
-    """Write down what the runtime says of its lease (a snapshot's "lease"); True where rows had to change.
+    """Record the lease in a snapshot of the runtime (its "lease"); return True if rows changed.
 
-    This is how a lease ends that expired, and how one comes into the records that a terminal or a script took.
-    A snapshot older than the newest row of the same boot says nothing new.
+    This ends expired leases in the records and adds those acquired by a terminal or script. A snapshot older than the
+    newest row of the same boot is ignored.
     """
     holder, epoch = str(held["holder"]), int(held["epoch"])
     with transaction.atomic():
@@ -189,7 +189,7 @@ def _end_reason(lease: Lease, boot: str) -> str:
 
 
 def _require_commander(user: Any) -> None:
-    """A user who was switched off, or became a viewer, after asking gets no station any more."""
+    """Raise NotAllowed if a requesting user has been deactivated or has become a viewer since."""
     if not user.is_active:
         raise NotAllowed(_USER_SWITCHED_OFF(user=user.get_username()))
     require_role(user, Role.OPERATOR)
@@ -201,13 +201,13 @@ def _require_active(station: Station) -> None:
 
 
 def _held(station: Station) -> dict[str, Any]:
-    """The lease as the runtime has it now: holder, epoch."""
+    """Return the lease as the runtime reports it now: holder, epoch."""
     held: dict[str, Any] = connection_to(station.name).status()["lease"]
     return held
 
 
 def _next_epoch(station: Station, held: Mapping[str, Any]) -> int:
-    """Above all that runtime and rows have seen: a runtime whose folder was lost begins anew."""
+    """Return an epoch above all known to runtime and database: a runtime that lost its folder starts at zero."""
     return 1 + max(int(held["epoch"]), station.leases.aggregate(newest=Max("epoch"))["newest"] or 0)
 
 
@@ -219,7 +219,7 @@ def _send_lease_command(
     role: str = "",
     args: Mapping[str, Any] | None = None,
 ) -> messages.Ack:
-    """A lease command to the runtime; to keep or end a lease needs no role."""
+    """Send a lease command to the runtime; renewing or ending a lease needs no role."""
     user = holder_display_name(holder)
     command = messages.Command(
         str(uuid4()), kind, args or {}, user=user, holder=holder, epoch=epoch, role=role
@@ -228,9 +228,9 @@ def _send_lease_command(
 
 
 def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str) -> Lease:
-    """Have the runtime accept the lease of `user`, then write it down; raises Conflict where another was faster.
+    """Make the runtime accept the lease, then record it, and mark the holder's own request as granted.
 
-    The request of the new holder is answered with it.
+    Raises: Conflict if another user was faster.
     """
     ack = _send_lease_command(station.name, "lease_claim", holder, epoch, role_of(user))
     if ack.status == "refused":
@@ -246,7 +246,7 @@ def _grant(user: Any, station: Station, holder: str, epoch: int, end_reason: str
 
 
 def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: str) -> tuple[Lease, bool]:
-    """The open row of this lease, all others ended; and whether anything had to change."""
+    """Open the row of this lease and end all others; return it and whether anything changed."""
     others = station.leases.filter(ended_at=None).exclude(epoch=epoch)
     changed = others.update(ended_at=timezone.now(), end_reason=end_reason) > 0
     lease, created = Lease.objects.get_or_create(
@@ -261,12 +261,12 @@ def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: st
 
 
 def _just_ended(lease: Lease) -> bool:
-    """True if it ended so lately that what is heard of it now was said before."""
+    """Whether the lease ended so recently that a report of it may be older than its end."""
     return lease.ended_at is not None and timezone.now() - lease.ended_at < _ECHO
 
 
 def _lock(station: Station) -> None:
-    """Others that write this station's leases wait until the transaction ends."""
+    """Lock the station's row, so that other writers of its leases wait until the transaction ends."""
     Station.objects.select_for_update().get(pk=station.pk)
 
 
@@ -299,7 +299,7 @@ def _answered(asked: LeaseRequest, answer: LeaseRequest.Answer) -> LeaseRequest:
 
 
 def _end(lease: Lease, reason: str) -> bool:
-    """End the row unless it has ended; True where it had not."""
+    """End the row; return True unless it had ended already."""
     lease.ended_at, lease.end_reason = timezone.now(), reason
     changed = Lease.objects.filter(pk=lease.pk, ended_at=None).update(
         ended_at=lease.ended_at, end_reason=reason

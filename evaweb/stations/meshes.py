@@ -1,4 +1,4 @@
-"""The files with meshes that a robot is drawn with, known to pages by their content alone, never by a path."""
+"""Mesh files of robots, which pages request by content digest, never by path."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _MESH_CANNOT_READ = Pattern("stations.meshes.mesh_cannot_read", "the mesh {name}
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A file's content: its sha256 in hex, and whether it is "stl", "obj" or "dae"."""
+    """Content of a mesh file: its SHA-256 in hexadecimal, and its format "stl", "obj" or "dae"."""
 
     digest: str
     format: str
 
 
 def mesh_in(file: Path) -> Mesh:
-    """Mesh in the file as it is now; NotFound where it cannot be read."""
+    """Return digest and format of the file as it is now. Raises: NotFound if it cannot be read."""
     return Mesh(_digest(file), file.suffix.lower().removeprefix("."))
 
 
 def mesh_content(*, robot: str, digest: str) -> bytes:
-    """The content of that digest; NotFound unless one of the robot's visuals shows a file that has it."""
+    """Return the mesh with that digest. Raises: NotFound unless a visual of the robot uses such a file."""
     files = {visual.file for visual in drawn_robot(robot).scene.visuals if visual.file is not None}
     for file in sorted(files):
         if _digest(file) == digest:

@@ -1,4 +1,4 @@
-"""Stations, the leases on them, and every command that was given."""
+"""Stations, their leases, and all commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STATION_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$"
 
 
 class Station(models.Model):
-    """One robot on a bench, with the runtime that moves it; its sockets are found by its name."""
+    """A robot with the runtime that moves it; its sockets are found by its name."""
 
     name = models.CharField(
         max_length=63,
@@ -35,8 +35,8 @@ class Station(models.Model):
     message = models.CharField(
         max_length=240, blank=True, help_text="Shown to everybody, e.g. why it is switched off."
     )
-    collects = models.BooleanField(default=False, editable=False)  # as its runtime last said
-    # How far its events are in the database; they start anew with each boot of the runtime.
+    collects = models.BooleanField(default=False, editable=False)  # as last reported by its runtime
+    # Newest event in the database; numbers restart with each boot of the runtime.
     boot = models.CharField(max_length=64, blank=True, editable=False)
     last_event = models.PositiveBigIntegerField(default=0, editable=False)
     created_at = models.DateTimeField(auto_now_add=True)
@@ -49,7 +49,7 @@ class Station(models.Model):
 
 
 class StationKey(models.Model):
-    """A computer's key, with which it is this station; one that was withdrawn stays as a record."""
+    """Public key that identifies a computer as this station; a withdrawn key stays as a record."""
 
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="keys")
     key = models.CharField(max_length=64, editable=False, help_text="Public, of CURVE, hexadecimal.")
@@ -74,7 +74,7 @@ class StationKey(models.Model):
 
 
 class EnrolmentCode(models.Model):
-    """A code that was shown once, to enrol a computer as this station; of it a digest is kept."""
+    """One-time code that enrols a computer as this station; only its digest is stored."""
 
     station = models.ForeignKey(Station, on_delete=models.CASCADE, related_name="codes")
     digest = models.CharField(max_length=64, unique=True)
@@ -90,7 +90,7 @@ class EnrolmentCode(models.Model):
 
 
 class Lease(models.Model):
-    """Who had the right to command a station, from when to when; the runtime enforces the epoch."""
+    """Right of one holder to command a station for a period; the runtime enforces the epoch."""
 
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="leases")
     user = models.ForeignKey(
@@ -117,7 +117,7 @@ class Lease(models.Model):
 
 
 class LeaseRequest(models.Model):
-    """Somebody asks the holder to hand the station over."""
+    """Request of a user that the holder hand the station over."""
 
     class Answer(models.TextChoices):
         OPEN = "open", "waiting"
@@ -162,7 +162,7 @@ NOT_CARRIED_OUT = (CommandStatus.REFUSED, CommandStatus.FAILED)
 
 
 class Command(models.Model):
-    """One discrete verb that a person or a program gave; the runtime's own journal is the authority."""
+    """Command of a user or program; the runtime's own journal is authoritative."""
 
     uuid = models.UUIDField(primary_key=True, default=uuid.uuid4)
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="commands")

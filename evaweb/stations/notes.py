@@ -1,7 +1,7 @@
-"""Records of stops of a robot, on their way to disk and database: no stop waits for either.
+"""Recorder of stops on their way to disk and database: a stop waits for neither.
 
-A thread of its own takes each row: first into a file of `unwritten`, then into the database. Repeated presses
-are written down once a second, with how often; until then a line of the journal has each, which a kill leaves.
+A thread hands each row on: first into a file of `unwritten`, then into the database. Repeated presses are written once
+a second with a count; until then each has a line in the process journal, which survives a kill.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from evaweb.rarely import LogThrottle
 from evaweb.stations.models import Command, CommandStatus
 
 log = logging.getLogger(__name__)
-_APART_S = 1.0  # between two rows of the same
-_MOST = 1000  # different ones that wait
-_EVERY_S = 10.0  # between two lines of the log about one name
-_MOST_NAMES = 16  # that the log tells apart in that time
+_APART_S = 1.0  # period of rows with one key
+_MOST = 1000  # waiting keys
+_EVERY_S = 10.0  # period of log lines about one name
+_MOST_NAMES = 16  # names with log lines of their own
 _Key = tuple[str, ...]
 _Journal = Callable[[Sequence[Command]], object]
 
 
 class StopRecorder:
-    """Rows that are handed to `keep`, one after the other, in a thread that may wait for the disk.
+    """Queue of rows that a thread passes to `keep`, which may wait for the disk.
 
-    `journal` is told of those that have to wait meanwhile, and with none when they have all been handed on.
+    `journal` is called with the rows that have to wait, and with none when all have been passed on.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class StopRecorder:
         journal: _Journal = lambda rows: None,
     ) -> None:
         self._keep, self._clock, self._journal = keep, clock, journal
-        self._fresh: deque[tuple[_Key, Command]] = deque(maxlen=_MOST)  # that the journal has not
+        self._fresh: deque[tuple[_Key, Command]] = deque(maxlen=_MOST)  # not journaled yet
         self._news = Condition()
         self._waiting: dict[_Key, tuple[Command, int]] = {}
         self._written: dict[_Key, float] = {}
@@ -51,9 +51,9 @@ class StopRecorder:
         self._failed = LogThrottle(_EVERY_S, _MOST_NAMES, clock)
 
     def record(self, row: Command) -> None:
-        """Have it written down; of a second's with one station, kind, user and outcome the newest, and how many.
+        """Queue a stop. Repeats within a second with the same `merge_key` become the newest row with a count.
 
-        A press that latched the e-stop anew is never one of many.
+        A press that latched the e-stop anew is not merged.
         """
         key = merge_key(row)
         with self._news:
@@ -65,7 +65,7 @@ class StopRecorder:
             self._run_soon()
 
     def _drop_one(self) -> None:
-        """The oldest that came to nothing, as at a station that there is not; else the oldest."""
+        """Drop the oldest failed stop, as for an unknown station; if there is none, the oldest."""
         failed = (key for key, (row, _) in self._waiting.items() if row.status == CommandStatus.FAILED)
         key = next(failed, None)
         lost = self._waiting.pop(key or next(iter(self._waiting)))
@@ -76,7 +76,7 @@ class StopRecorder:
             )
 
     def write_due(self, *, all_of_them: bool = False) -> float | None:
-        """Hand on what is due; in how many seconds the next one is, None where nothing waits [s]."""
+        """Pass on all rows that are due; return the delay until the next one [s], None if none is waiting."""
         now = self._clock()
         with self._news:
             self._written = {key: at for key, at in self._written.items() if now - at < _APART_S}
@@ -106,11 +106,11 @@ class StopRecorder:
     def _write_ahead(self, rows: Sequence[Command]) -> None:
         try:
             self._journal([row for row in rows if _has_station(row)])
-        except Exception as error:  # it is written down all the same
+        except Exception as error:  # the rows are stored nevertheless, only a kill would lose them
             log.error("a kill would lose %d stops that wait to be written down: %r", len(rows), error)
 
     def _try_hand_on(self, row: Command, times: int) -> bool:
-        """Whatever is wrong with one, the next one is written all the same; that one is tried again."""
+        """Pass on one row; log an error and return False, so that it is retried and does not block others."""
         try:
             self._hand_on(row, times)
         except Exception:
@@ -147,14 +147,14 @@ class StopRecorder:
 
 
 def merge_key(row: Command) -> _Key:
-    """Key of the presses of one second that are one row."""
+    """Return the key under which presses within a second are merged into one row."""
     user = row.user.get_username() if row.user else ""
     latched_at = str(row.data["carried_out_at"]) if row.data.get("latched") == "anew" else ""
     return (row.station.name, row.kind, user, str(row.status), latched_at)
 
 
 def _has_station(row: Command) -> bool:
-    """True also where the disk does not say: a stop too many in the record is better than one too few."""
+    """Return True if the station exists or the disk does not tell: an extra record is better than a lost one."""
     if row.station.pk is not None:
         return True
     try:

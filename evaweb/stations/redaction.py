@@ -1,6 +1,6 @@
-"""Messages of a station without what tells which checkpoint it is set up for: pure functions on them.
+"""Redaction of a station's messages that would reveal its checkpoint; pure functions.
 
-What is shown is listed, so that whatever a runtime says besides is covered by itself.
+Visible keys are listed explicitly, so that anything else in a message is hidden by default.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from evaweb.blinding import COVERED, COVERED_AT_REST, Visibility
 from runtime.core.sentences import Sentence, heard, identity, shows, texts
 from runtime.ipc.session_state import SessionState
 
-# Of a snapshot: the robot, the bench, who commands; nothing of the policy, its times and its chunks.
+# Visible keys of a snapshot: robot, bench, lease; nothing about the policy, its timing and its chunks.
 _SHOWN = (
     "boot",
     "sequence",
@@ -50,20 +50,20 @@ _COVERED: Mapping[str, Any] = {
     "strategy": "",
     "tuning": {},
     "last_run": {},
-    "newest_event": 0,  # how many there were tells a checkpoint: so do gaps in their numbers
+    "newest_event": 0,  # counts and gaps of event numbers could reveal a checkpoint
 }
 _CONTROL = ("rate", "engaged", "scheduling", "records_lost")
 _CONTROL_COVERED = {"step": 0, "behaviour": "", "remaining": 0, "ticks": 0, "missed": 0}
-_FACTS = ("strategies", "strategy")  # what the policy is asked by
+_FACTS = ("strategies", "strategy")  # hidden facts: how the policy is queried
 _JOINTS = ("measured", "commanded", "simulated", "engaged", "limited", "clock")
 
-# Kinds of events, of which nothing but the sentence is shown; of all others nothing.
+# Kinds of events whose text is shown without data; other kinds are hidden or handled in `_event`.
 _EVENTS = ("camera_back", "camera_lost", "drives", "estopped", "labelled", "released")
-_JUDGED = ("milestones", "success")  # of the bench's truth: people score before they hear it
+_JUDGED = ("milestones", "success")  # hidden ground truth: operators score before they learn it
 
 
 def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, Any]:
-    """A snapshot, in the same shape: what would tell is empty, and "veiled" says that it is."""
+    """Return a snapshot of the same structure in which revealing values are empty, with "veiled" set to True."""
     shown = {key: snapshot[key] for key in _SHOWN if key in snapshot}
     covered = COVERED_AT_REST if snapshot.get("state") == SessionState.IDLE else COVERED
     reason = (snapshot.get("sentences") or {}).get("reason")
@@ -90,14 +90,14 @@ def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, An
 
 
 def _reason(text: object, said: object, sight: Visibility, covered: str) -> str:
-    """Why the station is where it is, as it may be read, else `covered`; `said` has its id and arguments."""
+    """Return the reason for the station's state as it may be shown, else `covered`; `said` has id and arguments."""
     return sight.redact_text(
         _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), covered
     )
 
 
 def _sentence(said: object) -> str:
-    """A sentence as it travelled; a plain text where it has no id, or none that is one."""
+    """Return a transmitted message as a Sentence; plain text if it has no valid id."""
     found = said if isinstance(said, Mapping) else {"text": str(said or "")}
     text = str(found.get("text") or "")
     try:
@@ -107,7 +107,7 @@ def _sentence(said: object) -> str:
 
 
 def _sentences(snapshot: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[str, Any]:
-    """Ids and arguments of the texts that are shown as they were, where these say all that the arguments say."""
+    """Return ids and arguments of the unchanged texts whose arguments contain nothing beyond the visible text."""
     before, now = texts(snapshot), texts(shown)
     return {
         path: one
@@ -117,7 +117,7 @@ def _sentences(snapshot: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[st
 
 
 def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """Id and arguments of an event, where its whole text is shown and says all that they say."""
+    """Return id and arguments of an event, {} unless its whole text is shown and contains all arguments."""
     arguments = row.get("arguments") or {}
     if not row.get("id") or text != row.get("text") or not shows(text, arguments):
         return {}
@@ -127,9 +127,9 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
 def redact_events(
     rows: Iterable[Mapping[str, Any]], sight: Visibility, last: int = 0
 ) -> list[dict[str, Any]]:
-    """Events that name no policy; the others are left out, and with them when they were, and how many.
+    """Return the events that reveal no policy, without the times and the number of the others.
 
-    Numbers are made of their times [us], rising from the one before them, `last`: gaps would count what is left out.
+    Events are renumbered by their times [us], increasing from `last`: gaps would reveal how many are hidden.
     """
     found = []
     for row in rows:
@@ -140,12 +140,12 @@ def redact_events(
 
 
 def redact_joints(content: Mapping[str, Any]) -> dict[str, Any]:
-    """The robot's joints without what the policy wanted, and without which chunk made a step."""
+    """Return the robot's joints without the policy's targets and contributing chunks."""
     return {key: content[key] for key in _JOINTS if key in content}
 
 
 def redact_answer(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Data of the answer to a command."""
+    """Return the visible data of the answer to a command."""
     return {key: data[key] for key in ("episode", "bench") if key in data}
 
 

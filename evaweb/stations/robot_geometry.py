@@ -1,4 +1,4 @@
-"""A robot as pages know it: names of its numbers, where its parts are for given joints, and in which groups."""
+"""Robots as pages draw them: names of the joint vector, poses of the parts for given joints, groups."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _ROBOT_DOES_NOT_EXIST_THERE = Pattern(
     "stations.robot_geometry.robot_does_not_exist_there",
     "robot {robot!r:.80} does not exist; there are: {names}",
 )
-_KEPT = 64  # robots in the groups of some station or episode
+_KEPT = 64  # cached combinations of robot and groups
 _kernels = ThreadPoolExecutor(1, "links")
 
 
 class DrawnRobot:
-    """A robot as it is drawn: its description and its scene.
+    """A robot for drawing: its description and its scene.
 
-    Kernels are compiled, or loaded from disk, in a thread of their own: no caller waits for them, and one before they
-    are there is answered by numpy.
+    Kernels are compiled, or loaded from disk, in a separate thread: no caller waits for them, and until they are ready
+    numpy computes the poses.
     """
 
     def __init__(self, robot: robots.Robot, scene: robots.RobotScene) -> None:
@@ -40,9 +40,9 @@ class DrawnRobot:
         self._links.add_done_callback(_compiled)
 
     def poses(self, q: NDArray[Any]) -> NDArray[np.float32]:
-        """World <- part for joints [..., D] as float32 [..., P, 16], each matrix column by column.
+        """Return world <- part for joints [..., D] as float32 [..., P, 16], each matrix column-major.
 
-        Where a joint is not a number nothing is: all of its row is NaN.
+        If any joint of a row is not finite, the whole row is NaN.
         """
         joints = np.asarray(q, np.float64)
         found = self._links.result().poses(joints) if self.compiled else self._placed(joints)
@@ -55,29 +55,31 @@ class DrawnRobot:
 
     @property
     def compiled(self) -> bool:
-        """True if the kernels are there."""
+        """Whether the kernels are ready."""
         return self._links.done() and self._links.exception() is None
 
     def fingertip_positions(self, links: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Fingertips for parts at `links` [..., P, 16]: float32 [..., arms, 3], in the world [m]."""
+        """Return the fingertips for part poses `links` [..., P, 16]: float32 [..., arms, 3] in the world [m]."""
         found = np.empty((*links.shape[:-2], len(self.robot.arms), 3), np.float32)
         for index, arm in enumerate(self.robot.arms):
-            part = links[..., self.tip_part(arm), :].reshape(*links.shape[:-2], 4, 4)  # its columns as rows
+            part = links[..., self.tip_part(arm), :].reshape(
+                *links.shape[:-2], 4, 4
+            )  # column-major, so this is the transpose
             found[..., index, :] = (tip_of(arm)[:, 3] @ part)[..., :3]
         return found
 
     def tip_part(self, arm: robots.Group) -> int:
-        """The part that is an arm's end effector, and carries its fingertips."""
+        """Return the index of the part that is the arm's end effector and carries its fingertips."""
         assert arm.eef_link is not None
         return self.scene.link_of(arm.name, arm.eef_link)
 
     @cached_property
     def units(self) -> tuple[str, ...]:
-        """The unit of every number of the robot's vector."""
+        """Unit of every element of the joint vector."""
         return units_of(self.robot)
 
     def facts(self) -> dict[str, Any]:
-        """Groups, names and units of the numbers, which are grippers, names of the cameras, and the robot's title."""
+        """Return title, groups, names and units of the joint vector, gripper dimensions, cameras and rate as JSON."""
         return {
             "robot": self.robot.name,
             "title": self.robot.title,
@@ -96,21 +98,21 @@ def _compiled(links: Future[LinkPoses]) -> None:
 
 
 def tip_of(arm: robots.Group) -> NDArray[np.float64]:
-    """The frame [4, 4] between an arm's fingertips in its end effector; without a gripper the end effector itself."""
+    """Return the frame [4, 4] between the fingertips in the arm's end effector; identity without a gripper."""
     return np.eye(4) if arm.tip is None else arm.tip
 
 
 def drawn_robot(robot: str, groups: Sequence[str] | None = None) -> DrawnRobot:
-    """The looks of a known robot with these groups, None for all that are not optional.
+    """Return a robot with these groups; None means all that are not optional. Cached.
 
-    NotFound lists what there is, or says what its description lacks.
+    Raises: NotFound, which lists the robots or states the error in the description.
     """
     return _looks(robot, None if groups is None else tuple(groups))
 
 
 @lru_cache(_KEPT)
 def _looks(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot:
-    if robot not in robots.robot_names():  # a name, never a path: it may come from an address
+    if robot not in robots.robot_names():  # the name may come from a URL: never use it as a path
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     try:
         described = robots.load_robot(robot, groups)
@@ -120,12 +122,15 @@ def _looks(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot:
 
 
 def groups_of(joint_names: Iterable[str]) -> tuple[str, ...]:
-    """The groups that numbers of these names ("group.joint") are in, in their order."""
+    """Return the groups of these joint names ("group.joint"), in order."""
     return tuple(dict.fromkeys(name.partition(".")[0] for name in joint_names))
 
 
 def describe_robot(robot: str) -> dict[str, Any]:
-    """The facts of a robot; where its description cannot be read, none but why: stopping must work all the same."""
+    """Return the facts of a robot; if its description is unreadable, empty ones with `error`.
+
+    The page must open nevertheless, because it has the stop buttons.
+    """
     try:
         return drawn_robot(robot).facts()
     except NotFound as error:

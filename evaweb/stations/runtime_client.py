@@ -1,7 +1,6 @@
-"""The connection of this process to a station's runtime: requests with a deadline, from any thread.
+"""Connection of this process to a station's runtime: requests with a deadline, from any thread.
 
-Knows the bus and no rules: rights are decided in leases and commands. Nothing here touches the
-database, so that stopping works without it.
+Rights are decided in `leases` and `commands`. Nothing here uses the database, so that stopping works without it.
 """
 
 from __future__ import annotations
@@ -54,17 +53,17 @@ _UNREADABLE = Pattern(
     "{name} answered {kind} with what cannot be read: {error}",
 )
 
-_CLOCK_KNOWN_S = 60.0  # how long the difference of two computers' clocks is believed
+_CLOCK_KNOWN_S = 60.0  # validity of a measured clock offset
 
 
 class NoAnswer(StationGone):
-    """The request may have arrived and may have been carried out: it is not known."""
+    """The request may have arrived and may have been carried out: its outcome is unknown."""
 
     status = 504
 
 
 class StationConnection:
-    """One station; its sockets are found anew where its runtime was restarted."""
+    """Connection to one station; reconnects when its runtime has restarted."""
 
     def __init__(self, name: str) -> None:
         if not re.fullmatch(STATION_NAME, name):
@@ -72,19 +71,22 @@ class StationConnection:
         self.name = name
         folder = settings.DATA_DIR / "stations" / name
         self.endpoints = Endpoints(folder)
-        self._key = Key(folder)  # what is given in a person's name is signed with it
+        self._key = Key(folder)  # signs commands sent in a user's name
         self._lock = threading.Lock()
         self._client: CommandClient | None = None
         self._endpoint = ""
-        self._ahead = 0.0  # its clock minus ours [s]
+        self._ahead = 0.0  # its clock minus this process's [s]
         self._ahead_known = -float("inf")
 
     def request(self, command: Command, *, timeout: float | None = None, expires: bool = False) -> Ack:
-        """The answer of the coordinator; one request at a time over a connection that is kept.
+        """Return the coordinator's answer; one request at a time over a persistent connection.
 
-        With `expires` the command is void once we have given up waiting for its answer: it can never be
-        carried out behind the back of a user who was told that it was lost. Raises StationGone where it was
-        not sent, NoAnswer where that is not known.
+        With `expires` the command becomes void when this call gives up: it is never carried out after its user was
+        told that it was lost.
+
+        Raises:
+            StationGone: The command was not sent.
+            NoAnswer: The outcome is unknown.
         """
         deadline = time.monotonic() + (timeout or settings.EVA_COMMAND_TIMEOUT_S)
         if not self._lock.acquire(timeout=max(0.0, deadline - time.monotonic())):
@@ -99,7 +101,7 @@ class StationConnection:
             self._lock.release()
 
     def request_urgent(self, command: Command, process: str, key: str, timeout: float) -> Ack:
-        """The answer over a connection of its own: nothing that hangs stands before it.
+        """Return the answer over a new connection, so that no hanging request delays it.
 
         `process` and `key` name the socket: the coordinator's "commands", the guard's "estop".
         """
@@ -116,18 +118,18 @@ class StationConnection:
             raise self._not_running() from None
 
     def status(self, timeout: float | None = None) -> dict[str, Any]:
-        """The newest snapshot, as JSON may carry it; raises StationGone."""
+        """Return the newest snapshot as JSON-compatible objects. Raises: StationGone."""
         return complete_state_meaning(
             to_json_value(self.request(Command(str(uuid4()), "status"), timeout=timeout).data)
         )
 
     def events_since(self, number: int, timeout: float | None = None) -> tuple[str, list[dict[str, Any]]]:
-        """The runtime's boot id and its events after `number`, as JSON may carry them; raises StationGone."""
+        """Return the runtime's boot id and its events after `number`, JSON-compatible. Raises: StationGone."""
         ack = self.request(Command(str(uuid4()), "events_since", {"number": number}), timeout=timeout)
         return ack.boot, [checked_row(row) for row in to_json_value(ack.data.get("events", []))]
 
     def address(self, process: str, key: str) -> str:
-        """Address of a socket, as its process last wrote it; raises StationGone where there is none."""
+        """Return the address of a socket, as its process last wrote it. Raises: StationGone if there is none."""
         try:
             return str(self.endpoints.read(process)[key])
         except (TransportError, KeyError):
@@ -137,7 +139,7 @@ class StationConnection:
         return StationGone(self._link() or _NOT_RUNNING(name=self.name))
 
     def _link(self) -> str:
-        """What the gate says of the link to a station on another computer; "" where it says nothing."""
+        """Return the gate's report on the link to a station on another computer, "" if there is none."""
         try:
             told = self.endpoints.read("link")
             since = localtime(datetime.fromtimestamp(float(told["since"]), UTC))
@@ -187,7 +189,10 @@ class StationConnection:
 
 
 def connection_to(name: str) -> StationConnection:
-    """This process's wire to the station; raises NotFound for what cannot be a station's name."""
+    """Return this process's connection to the station. Raises: NotFound for an invalid name.
+
+    Only connections to existing stations are cached, so that requests for invented names do not accumulate.
+    """
     wire = StationConnection(name)
     return _kept(name) if (settings.DATA_DIR / "stations" / name).is_dir() else wire
 

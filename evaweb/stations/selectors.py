@@ -18,12 +18,12 @@ _NO_SUCH_STATION = Pattern(
 
 
 def station_list(*, all_of_them: bool = False) -> QuerySet[Station]:
-    """The stations that are offered to operators, or all."""
+    """Return the active stations, or all."""
     return Station.objects.all() if all_of_them else Station.objects.filter(active=True)
 
 
 def station_get(*, name: str) -> Station:
-    """The station of that name; NotFound lists those that there are."""
+    """Return the station of that name. Raises: NotFound, which lists the existing ones."""
     found = Station.objects.filter(name=name).first() if is_text(name) else None
     if found is None:
         known = ", ".join(Station.objects.values_list("name", flat=True)) or "none yet"
@@ -32,26 +32,26 @@ def station_get(*, name: str) -> Station:
 
 
 def lease_open(*, station: Station) -> Lease | None:
-    """Open lease of the station, as far as the database knows."""
+    """Return the station's open lease according to the database, None if there is none."""
     return station.leases.filter(ended_at=None).select_related("user").first()
 
 
 def leases_open() -> dict[int, Lease]:
-    """Open leases by the station's id, as far as the database knows."""
+    """Return the open leases by station id, according to the database."""
     return {lease.station_id: lease for lease in Lease.objects.filter(ended_at=None).select_related("user")}
 
 
 def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
-    """Open requests for the station, the oldest first."""
+    """Return the open requests for the station, oldest first."""
     return station.lease_requests.filter(answer=LeaseRequest.Answer.OPEN).select_related("user")
 
 
 def command_list(*, station: Station, limit: int = 100) -> QuerySet[Command]:
-    """The newest commands first."""
+    """Return the newest commands first."""
     return station.commands.select_related("user")[:limit]
 
 
 def last_set_up(*, station: Station) -> UUID | None:
-    """The newest set-up of the station that may have been carried out."""
+    """Return the uuid of the newest set-up that may have been carried out, None if there is none."""
     asked = station.commands.filter(kind="setup").exclude(status__in=NOT_CARRIED_OUT)
     return asked.order_by("-issued_at").values_list("pk", flat=True).first()

@@ -1,7 +1,7 @@
-"""Stop, halt and e-stop: straight to the station, without the database; and what a station's answer comes to.
+"""Stop, halt and e-stop: sent directly to the station, without the database.
 
-`press` and `ask` never wait: each station has threads of its own, and a call while the same is under way shares its
-answer.
+`press_estop` and `request_stop` never block: requests run in threads per station, and a call during an equal request
+shares its answer.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ _VIEWER = Pattern(
     "stations.stops.viewer",
     "{user} is a viewer; this needs an operator: ask an administrator, or press the e-stop",
 )
-_ESTOP_S = 1.0  # what a person waits for before the page turns red
-_MOST_STOPS = 32  # of different leases that one station is asked at once
+_ESTOP_S = 1.0  # longest wait for the answer to an e-stop before the page turns red
+_MOST_STOPS = 32  # concurrent stops of different leases at one station
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Answer to a command; `allowed` names the commands that would be accepted now.
+    """Answer to a command; `allowed` lists the commands that would be accepted now.
 
-    `uuid` is that of the press that was answered, which may be another one that was under way.
+    `uuid` is that of the e-stop press that was answered, possibly a concurrent one.
     """
 
     status: CommandStatus
@@ -62,14 +62,14 @@ class Answer:
 
 
 def answer_of(ack: messages.Ack) -> Answer:
-    """The runtime's answer with people's names, as JSON may carry it."""
+    """Return the runtime's answer as JSON-compatible objects, with user names for holders."""
     return Answer(
         CommandStatus(ack.status), with_display_names(ack.reason), list(ack.allowed), to_json_value(ack.data)
     )
 
 
 def clean_reason(why: str) -> str:
-    """The beginning of it, with nothing in it that cannot be sent or kept: no press is lost for its words."""
+    """Return the reason truncated and without characters that cannot be sent or stored: no press fails for its text."""
     return pressing.sanitize_text(why)
 
 
@@ -78,13 +78,13 @@ _stops: RequestCoalescer[Answer] = RequestCoalescer("stop", _MOST_STOPS)
 
 
 def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
-    """Answer to a press of the e-stop: that of a press under way, and one more is made all the same."""
+    """Press the e-stop. During another press its answer is shared, and this press is sent nevertheless."""
     work = partial(send_estop, station=station, username=username, why=why, uuid=uuid)
     return _presses.submit(station, work, identity=str(uuid), shared=True)
 
 
 def request_stop(command: messages.Command, station: str) -> Future[Answer]:
-    """Answer to a stop or halt; those of one lease that come while one is under way are one more."""
+    """Send a stop or halt. During an equal one of the same lease, one further request is sent for all later calls."""
     key = (command.kind, command.holder, command.epoch)
     try:
         return _stops.submit(station, partial(send_stop, command, station), key=key, identity=command.uuid)
@@ -95,18 +95,18 @@ def request_stop(command: messages.Command, station: str) -> Future[Answer]:
 
 
 def refused_to_a_viewer(username: str) -> str:
-    """Why a viewer's stop or halt goes nowhere."""
+    """Return the message for a viewer whose stop or halt is refused."""
     return _VIEWER(user=username)
 
 
 def send_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Answer:
-    """Press the e-stop of the station of that name; for any user, and without the database."""
+    """Press the e-stop of the station and wait for the answer; for any user, without the database."""
     command = messages.Command(str(uuid), "estop", {"why": clean_reason(why)}, user=username, holder=username)
     try:
         ack = connection_to(station).request_urgent(command, "guard", "estop", _estop_s())
         answer = replace(answer_of(ack), uuid=str(uuid))
         said = answer.data.get("station", station)
-        if said != station:  # its socket is where another station's was before that one was killed
+        if said != station:  # another station reuses the socket address of this one, which was killed
             reason = _STOP_BY_HAND(why=_ANOTHER_ANSWERED(other=said, station=station))
             return Answer(CommandStatus.FAILED, reason, [], answer.data)
     except NoAnswer as fault:
@@ -120,13 +120,13 @@ def send_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> An
 
 
 def stop_command(*, kind: str, username: str, page: str, epoch: int, uuid: UUID | str) -> messages.Command:
-    """A stop or halt as it is sent: the runtime itself knows the lease's holder."""
+    """Return the message of a stop or halt; the runtime itself checks the lease."""
     holder = holder_of(username, page)
     return messages.Command(str(uuid), kind, user=username, holder=holder, epoch=epoch)
 
 
 def send_stop(command: messages.Command, station: str) -> Answer:
-    """The station's answer to a stop or halt; nothing that hangs stands before it."""
+    """Send a stop or halt over a new connection and return the answer, so that no hanging request delays it."""
     try:
         timeout = settings.EVA_COMMAND_TIMEOUT_S
         return answer_of(connection_to(station).request_urgent(command, "coordinator", "commands", timeout))

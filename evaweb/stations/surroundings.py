@@ -1,7 +1,7 @@
-"""Surroundings of a robot in the scene: table, floor, mounts, and from where the robot looks at the table.
+"""Surroundings of a robot in the scene: table, floor, mounts, and the direction from robot to table.
 
-The scene is that of the simulated bench: z = 0 is the table's surface, things lie within BENCH's `area`. A robot
-whose body reaches below the table stands on a floor, and the table keeps clear of it.
+The scene is that of the simulated bench: z = 0 is the surface of the table, objects lie within BENCH's `area`. A robot
+whose body reaches below the table stands on a floor, and the table is cut clear of it.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from robots.visuals import Visual
 Float64 = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # x from, to, y from, y to [m]
 
-AREA: Rectangle = (-0.22, 0.22, 0.18, 0.40)  # where things may lie
-# The simulated bench of runtime.sim.bench, whose sizes a test compares: [m], and colours from 0 to 1.
+AREA: Rectangle = (-0.22, 0.22, 0.18, 0.40)  # area for objects
+# The simulated bench of runtime.sim.bench (a test compares the sizes): lengths [m], colours from 0 to 1.
 BENCH = {
     "block_edge": 0.04,
     "plate_radius": 0.075,
@@ -38,25 +38,25 @@ BENCH = {
 _WOOD = [176 / 255, 164 / 255, 146 / 255, 1.0]
 _STEEL = [96 / 255, 102 / 255, 110 / 255, 1.0]
 _THICKNESS = 0.03
-_LEAST_TABLE: Rectangle = (-0.6, 0.6, -0.2, 0.6)  # around the area, with room beside it
-_CLEAR = 0.03  # between table and body
-_FOOT = 0.15  # of table around an arm's base
-_BELOW = -0.05  # a body that reaches lower stands on the floor
-_ABOVE = 0.04  # a base that stands higher has a mount under it
-_RADIUS = 0.055  # of a mount
-_ONE_MOUNT = 0.3  # bases nearer to each other share theirs
-_NOWHERE = 0.05  # from base to area: no way that could be looked along
+_LEAST_TABLE: Rectangle = (-0.6, 0.6, -0.2, 0.6)  # AREA with a margin
+_CLEAR = 0.03  # distance between table and body [m]
+_FOOT = 0.15  # margin of the table around an arm's base [m]
+_BELOW = -0.05  # height below which a body stands on the floor [m]
+_ABOVE = 0.04  # height above which a base has a mount [m]
+_RADIUS = 0.055  # radius of a mount [m]
+_ONE_MOUNT = 0.3  # distance below which bases share a mount [m]
+_NOWHERE = 0.05  # distance from base to area below which the direction is undefined [m]
 
 
 class Box(NamedTuple):
-    """Something's bounds in the scene: corners [3], in m."""
+    """Axis-aligned bounding box in the scene: corners [3] in m."""
 
     low: Float64
     high: Float64
 
 
 def scene_surroundings(looks: DrawnRobot) -> dict[str, Any]:
-    """For drawing: `table`, `mounts`, `floor` (its height or None), `ahead` [2] and `view`, what has to be seen."""
+    """Return `table`, `mounts`, `floor` (its height or None), `ahead` [2] and `view` (volume to be visible)."""
     boxes = _at_poses(looks)
     home = boxes[0]
     floor = _floor(looks, home)
@@ -71,7 +71,7 @@ def scene_surroundings(looks: DrawnRobot) -> dict[str, Any]:
 
 
 def bounds(visual: Visual, part: Float64) -> Box:
-    """The least and the greatest corner [3] of what a shape on a part at `part` [4, 4] fills in the scene."""
+    """Return the bounding box in the scene of a shape on a part at `part` [4, 4]."""
     low, high = visual.bounds()
     placed = part @ visual.origin
     middle = placed[:3, :3] @ ((low + high) / 2) + placed[:3, 3]
@@ -80,7 +80,7 @@ def bounds(visual: Visual, part: Float64) -> Box:
 
 
 def _at_poses(looks: DrawnRobot) -> list[list[Box]]:
-    """Boxes that the robot's shapes fill in each of its named poses, home first."""
+    """Return the boxes of the robot's shapes in each of its named poses, home first."""
     named = looks.robot.poses
     found = []
     for name in sorted(named, key=lambda name: name != "home"):
@@ -90,20 +90,20 @@ def _at_poses(looks: DrawnRobot) -> list[list[Box]]:
 
 
 def _roots(looks: DrawnRobot) -> list[Float64]:
-    """Positions of the copies of the robot's tree, [3] each."""
+    """Return the positions of the roots of the robot's copies of its URDF, [3] each."""
     root = urdf.read(looks.robot.urdf).root
     poses = looks.scene.poses(looks.robot.poses["home"])
     return [poses[part, :3, 3] for part in looks.scene.parts_showing(root)]
 
 
 def _floor(looks: DrawnRobot, home: Sequence[Box]) -> float | None:
-    """Height of the floor that it stands on; None for a robot on a table."""
+    """Return the height of the floor on which the robot stands [m]; None for a robot on a table."""
     lowest = min([*(box.low[2] for box in home), *(root[2] for root in _roots(looks))], default=0.0)
     return float(lowest) if lowest < _BELOW else None
 
 
 def _table(looks: DrawnRobot, home: Sequence[Box]) -> Rectangle:
-    """x from, to, y from, to: with room for the bases that stand on it, clear of a body that stands beside it."""
+    """Return the table's x from, to, y from, to [m]: large enough for bases on it, clear of a body next to it."""
     x_from, x_to, y_from, y_to = _LEAST_TABLE
     for x, y, z in _roots(looks):
         if z > _BELOW:
@@ -117,7 +117,7 @@ def _table(looks: DrawnRobot, home: Sequence[Box]) -> Rectangle:
 
 
 def _clear_of(table: Rectangle, box: Box) -> Rectangle:
-    """The largest part of the table that is clear of a box and keeps the area; as it is where there is none."""
+    """Return the largest part of the table that avoids `box` and contains AREA; the whole table if there is none."""
     x_from, x_to, y_from, y_to = table
     (x_low, y_low), (x_high, y_high) = box.low[:2] - _CLEAR, box.high[:2] + _CLEAR
     if x_high <= x_from or x_low >= x_to or y_high <= y_from or y_low >= y_to:
@@ -149,7 +149,7 @@ def _drawn(table: Rectangle, floor: float | None) -> dict[str, Any]:
 
 
 def _mounts(looks: DrawnRobot, table: Rectangle, floor: float | None) -> list[dict[str, Any]]:
-    """A column under the bases that stand above the table, one for those close to each other."""
+    """Return a column under each base above the table; bases close to each other share one."""
     near: list[list[Float64]] = []
     for root in _roots(looks):
         if root[2] < _ABOVE:
@@ -170,7 +170,7 @@ def _mount(roots: Float64, table: Rectangle, floor: float | None) -> dict[str, A
 
 
 def _ahead(looks: DrawnRobot) -> list[float]:
-    """The way from the bases to where things lie, a unit vector in x and y."""
+    """Return the horizontal unit vector [2] from the bases to the middle of AREA."""
     x_from, x_to, y_from, y_to = AREA
     way = np.array([x_from + x_to, y_from + y_to]) / 2 - np.mean(_roots(looks), axis=0)[:2]
     length = float(np.linalg.norm(way))
@@ -178,7 +178,7 @@ def _ahead(looks: DrawnRobot) -> list[float]:
 
 
 def _view(boxes: Sequence[Box]) -> dict[str, list[float]]:
-    """Volume to be seen: the robot in each of its named poses and the area where things lie."""
+    """Return the volume to be visible: the robot in each of its named poses, and AREA."""
     x_from, x_to, y_from, y_to = AREA
     low = [np.array([x_from, y_from, 0.0]), *(box.low for box in boxes)]
     high = [np.array([x_to, y_to, 0.0]), *(box.high for box in boxes)]

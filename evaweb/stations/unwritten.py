@@ -1,9 +1,8 @@
-"""Commands that were carried out and that the database did not take: they wait for it as files in DATA/unwritten.
+"""Stops that were carried out but are not in the database yet: they wait as files in DATA/unwritten.
 
-A file each, so that a restart loses none, and any process may write any of them. Of one command each process that
-carried it out has a file of its own: none overwrites, or removes, what another one heard of it. Where the disk does
-not take them either, as when it is full, this process keeps the newest. What a killed process had not come to, its
-journal has.
+One file per command and process, so that a restart loses none, any process may write any of them, and none overwrites
+or removes the answer that another process received. If the disk is full too, this process holds the newest in memory.
+What a killed process had not stored yet is in its journal.
 """
 
 from __future__ import annotations
@@ -31,23 +30,23 @@ from runtime.recording.files import RecordingError, write_atomic
 
 log = logging.getLogger(__name__)
 
-_MOST = 1000  # that a process keeps
+_MOST = 1000  # commands held in memory
 _AGAIN_S = 1.0
-_EVERY_S = 60.0  # between two lines of the log about turns that failed
+_EVERY_S = 60.0  # period of log lines about failed turns
 _TIMES = ("issued_at", "answered_at")
 _PLAIN = ("kind", "args", "holder", "epoch", "boot", "sequence", "status", "reason", "allowed", "data")
 
 
 class UnwrittenCommands:
-    """Those that wait, and the thread that goes on trying to have them written by `write`.
+    """Queue of commands, and the thread that retries `write` until the database accepts them.
 
-    `write` raises a database's Error where it has to be tried again; IntegrityError, DataError or any other where
-    that is no use: the log then has the command, and its file stays as UUID.PID.refused.
+    `write` raises a database Error if it must be retried. After IntegrityError, DataError or any other exception a
+    retry is useless: the command is logged and its file renamed to UUID.PID.refused.
     """
 
     def __init__(self, write: Callable[[Command], object]) -> None:
         self._write = write
-        self._kept: dict[str, bytes] = {}  # those without a file
+        self._kept: dict[str, bytes] = {}  # commands that the disk did not accept
         self._news = threading.Event()
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -55,9 +54,9 @@ class UnwrittenCommands:
         self._failed = LogThrottle(_EVERY_S, 1)
 
     def prepare(self, rows: Sequence[Command]) -> None:
-        """Those that will be kept soon: the next reader finds them where this process is killed before; OSError.
+        """Journal the commands that will be stored soon, for recovery if this process is killed. Raises: OSError.
 
-        With none, all that were foreseen have been kept.
+        An empty sequence clears the journal: all prepared commands are stored.
         """
         if rows:
             self._journal.add(map(_document, rows))
@@ -65,7 +64,7 @@ class UnwrittenCommands:
             self._journal.clear()
 
     def store(self, row: Command) -> None:
-        """Have it written when the database takes it; its station and user may be known by name alone."""
+        """Store a command until the database accepts it; its station and user may be known by name only."""
         name, content = f"{row.uuid}.{os.getpid()}", json.dumps(_document(row)).encode()
         try:
             _folder().mkdir(parents=True, exist_ok=True)
@@ -81,7 +80,7 @@ class UnwrittenCommands:
         self.start_writing()
 
     def start_writing(self) -> None:
-        """Have what waits written, by a thread; also what a process left that has ended since."""
+        """Wake the writer thread, starting it if needed; it also handles files of ended processes."""
         with self._starting:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="unwritten", daemon=True)
@@ -89,7 +88,7 @@ class UnwrittenCommands:
         self._news.set()
 
     def write_all(self) -> bool:
-        """Write what waits; whether some has to wait on. A file that the disk does not give keeps no other waiting."""
+        """Write all stored commands; return True if some must be retried. An unreadable file does not block others."""
         waits = recover_journals(_folder(), self._adopt)
         for name in self._waiting():
             try:
@@ -105,9 +104,9 @@ class UnwrittenCommands:
         return waits
 
     def _adopt(self, lines: Sequence[bytes]) -> bool:
-        """Keep what a killed process had foreseen, as it would have: one of each kind, and how often.
+        """Store the journaled commands of a killed process: one per merge key, with a count.
 
-        Whether all lines were commands; the log has the others.
+        Returns: Whether all lines were commands; others are logged.
         """
         counted: dict[tuple[str, ...], list[Command]] = {}
         whole = True
@@ -115,7 +114,7 @@ class UnwrittenCommands:
             try:
                 row = _row(json.loads(line))
                 counted.setdefault(merge_key(row), []).append(row)
-            except Exception as fault:  # a file may hold anything
+            except Exception as fault:  # a file may contain anything
                 log.error("a command is not in the database: %r; it was %.9999r", fault, line)
                 whole = False
         for rows in counted.values():
@@ -134,7 +133,7 @@ class UnwrittenCommands:
                 time.sleep(_AGAIN_S)
 
     def _turn(self) -> bool:
-        """As `attempt`; without this thread nothing of this process would be written any more."""
+        """Call `write_all`; survive any error, because the thread must continue."""
         try:
             waits = self.write_all()
             connection.close()
@@ -155,12 +154,13 @@ class UnwrittenCommands:
         content = self._kept.get(name) or _path(name).read_bytes()
         try:
             self._write(_row(json.loads(content)))
-        except Exception as refused:  # a file may hold anything: this thread must see the next one
+        except Exception as refused:  # a file may contain anything: continue with the next
             if isinstance(refused, Error) and not isinstance(refused, IntegrityError | DataError):
                 raise
             log.error("a command is not in the database: %r; it was %.9999r", refused, content)
             if _path(name).exists():
                 _path(name).replace(_folder() / f"{name}.refused")
+        # Removed only after the write: a crash in between repeats it, and `write` merges rows with the same uuid.
         _path(name).unlink(missing_ok=True)
         self._kept.pop(name, None)
 

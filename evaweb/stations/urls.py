@@ -1,4 +1,4 @@
-"""Addresses of what pages draw of stations."""
+"""URLs of geometry and meshes."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from evaweb.stations import views
 
 
 class Digest:
-    """A sha256 in hex."""
+    """Path converter for a SHA-256 in hexadecimal."""
 
     regex = "[0-9a-f]{64}"
 
     def to_python(self, value: str) -> str:
-        """As it is."""
+        """Return the value unchanged."""
         return value
 
     def to_url(self, value: str) -> str:
-        """As it is."""
+        """Return the value unchanged."""
         return value
 
 

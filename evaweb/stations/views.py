@@ -1,4 +1,4 @@
-"""Data of a station and of a robot that pages draw."""
+"""Geometry of stations and robots for the 3D pages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _A_YEAR = 365 * 24 * 3600
 
 @require_safe
 def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
-    """The scene of a station, whose robot has the groups ?groups=a,b where its runtime says so."""
+    """Return the scene of a station; its robot has the groups ?groups=a,b, as its runtime reports them."""
     try:
         station = station_get(name=name)
         found = geometry.scene_geometry(station.robot, _groups(request), simulated=station.simulated)
@@ -25,7 +25,7 @@ def station_geometry(request: HttpRequest, name: str) -> JsonResponse:
 
 @require_safe
 def robot_geometry(request: HttpRequest, robot: str) -> JsonResponse:
-    """The scene of a robot by itself, with ?groups=a,b or all that are not optional."""
+    """Return the scene of a robot alone, with ?groups=a,b or all that are not optional."""
     try:
         return JsonResponse(geometry.scene_geometry(robot, _groups(request), simulated=False))
     except NotFound as error:
@@ -44,7 +44,7 @@ def _etag(request: HttpRequest, robot: str, digest: str) -> str:
 @require_safe
 @condition(etag_func=_etag)
 def robot_mesh(request: HttpRequest, robot: str, digest: str) -> HttpResponse:
-    """A mesh of a robot; another content has another address, so a browser may keep it."""
+    """Return a mesh of a robot; the URL contains the digest, so a browser may cache it for good."""
     try:
         content = meshes.mesh_content(robot=robot, digest=digest)
     except NotFound as error:

@@ -1,4 +1,4 @@
-"""Scenes and checkpoints in the admin pages; evaluations, trials and scores are records and only read there."""
+"""Admin pages of scenes and checkpoints; evaluations, trials and scores are read-only records."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from evaweb.trials.selectors import checkpoint_used
 from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
 
-LONGEST_TABLE = 64 * 1024  # characters; a station takes no more
+LONGEST_TABLE = 64 * 1024  # characters; the limit of a station
 _SHORT = {models.TextField: {"widget": forms.Textarea(attrs={"rows": 2, "cols": 80})}}
 
 
 class Table(forms.JSONField):
-    """JSON that says where it cannot be read; every field for JSON is one, for Django's own reads to any depth."""
+    """JSON form field that reports where the text is invalid; used for every JSON field to bound size and depth."""
 
     widget = forms.Textarea(attrs={"rows": 3, "cols": 60, "spellcheck": "false", "class": "mono"})
 
     def to_python(self, value: Any) -> Any:
-        """The table; ValidationError with line and column, or with the bound."""
+        """Return the parsed value. Raises: ValidationError with line and column, or with the exceeded limit."""
         if isinstance(value, str) and value.strip():
             try:
                 self._read(value)
@@ -57,7 +57,7 @@ class Table(forms.JSONField):
         return super().to_python(value)
 
     def bound_data(self, data: Any, initial: Any) -> Any:
-        """Value that is shown again: as it was given, where it cannot be read."""
+        """Return the value to display again: the text as typed if it cannot be parsed."""
         if data is None:
             return None
         try:
@@ -70,7 +70,7 @@ class Table(forms.JSONField):
 
 
 class PositionForm(forms.ModelForm):
-    """One initial condition."""
+    """Form of one initial condition."""
 
     bench = Table(required=False, help_text=Position._meta.get_field("bench").help_text)
 
@@ -90,21 +90,21 @@ class PositionInline(admin.StackedInline):
     fields = (("number", "label"), "description", "bench")
 
     def get_formset(self, request: HttpRequest, obj: Scene | None = None, **named: Any) -> Any:
-        """A scene without a position could not be tried."""
+        """Require at least one position, because a trial needs one."""
         return super().get_formset(request, obj, **{"validate_min": True, **named})
 
 
 class MilestoneFormSet(forms.BaseInlineFormSet):
-    """Milestones of a scene; one that had the same words twice before may keep them."""
+    """Milestones of a scene; a scene that already had duplicate texts may keep them."""
 
     def add_fields(self, form: forms.BaseForm, index: int | None) -> None:
-        """Django's table has its heads as the only labels, which no reader of screens finds."""
+        """Add labels for screen readers, which Django's table lacks."""
         super().add_fields(form, index)
         for name, field in form.fields.items():
             field.widget.attrs.setdefault("aria-label", str(field.label or name))
 
     def clean(self) -> None:
-        """Different words for each, where any were changed."""
+        """Require distinct texts if any was changed."""
         super().clean()
         rows = [form for form in self.forms if form not in self.deleted_forms]
         if any("text" in form.changed_data for form in rows):
@@ -121,14 +121,14 @@ class MilestoneInline(admin.TabularInline):
 
 
 class LogsValues(admin.ModelAdmin):
-    """What a change made of a row stands in its history with what was there before, also if it is taken back later."""
+    """ModelAdmin whose history has the old and new value of each change."""
 
     def table_of(self, row: Any) -> dict[str, Any]:
-        """The row in plain values."""
+        """Return the row as plain values."""
         raise NotImplementedError
 
     def save_model(self, request: HttpRequest, obj: Any, form: Any, change: bool) -> None:
-        """Keep for the log what is there before."""
+        """Remember the values before the change for the log entry."""
         if change:
             before = type(obj)._default_manager.get(pk=obj.pk)
             request._eva_before = self.table_of(before)  # type: ignore[attr-defined]
@@ -137,14 +137,14 @@ class LogsValues(admin.ModelAdmin):
     def construct_change_message(
         self, request: HttpRequest, form: Any, formsets: Any, add: bool = False
     ) -> Any:
-        """Each value that is another one; once all of it, lines of other tables included, is saved."""
+        """Return all changed values, computed after the row and its inlines are saved."""
         before = getattr(request, "_eva_before", None)
         changes = [] if before is None else difference(before, self.table_of(form.instance))
         return "; ".join(changes) or super().construct_change_message(request, form, formsets, add)
 
 
 def _readable(policy: Any) -> Any:
-    """A policy's table without what an address or a tunnel may have of a secret."""
+    """Return a policy's table without parts of URL and tunnel that may contain a secret."""
     if not isinstance(policy, dict):
         return policy
     url, tunnel = str(policy.get("url") or ""), policy.get("tunnel")
@@ -158,18 +158,18 @@ def _readable(policy: Any) -> Any:
 
 
 class ActiveActions:
-    """Switching on and off for whole selections."""
+    """Actions that activate or deactivate the selected rows."""
 
     actions = ("switch_on", "switch_off")
 
     @admin.action(description="Switch on: offer to operators")
     def switch_on(self, request: HttpRequest, rows: QuerySet[Any]) -> None:
-        """Operators can choose them."""
+        """Offer the rows to operators."""
         self._switch(request, rows, active=True)
 
     @admin.action(description="Switch off: offer no longer")
     def switch_off(self, request: HttpRequest, rows: QuerySet[Any]) -> None:
-        """Operators cannot choose them; what was tried stays."""
+        """Stop offering the rows to operators; existing trials are unaffected."""
         self._switch(request, rows, active=False)
 
     def _switch(self, request: HttpRequest, rows: QuerySet[Any], active: bool) -> None:
@@ -186,10 +186,10 @@ def _trials(n: int) -> str:
 
 @admin.register(Scene)
 class SceneAdmin(ActiveActions, LogsValues):
-    """A task on a bench, with its positions and milestones."""
+    """Tasks on a bench, with positions and milestones."""
 
     def table_of(self, row: Scene) -> dict[str, Any]:
-        """As the scene editor has it."""
+        """Return the scene in the form of the scene editor."""
         return scene_table(Scene.objects.get(pk=row.pk))
 
     list_display = ("title", "name", "active", "instruction", "positions_n", "milestones_n", "trials_n")
@@ -205,7 +205,7 @@ class SceneAdmin(ActiveActions, LogsValues):
     )
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Scene]:
-        """With how much belongs to each."""
+        """Add the numbers of positions, milestones and trials."""
         return (
             super()
             .get_queryset(request)
@@ -217,15 +217,15 @@ class SceneAdmin(ActiveActions, LogsValues):
         )
 
     def get_readonly_fields(self, request: HttpRequest, obj: Scene | None = None) -> tuple[str, ...]:
-        """The name of a scene is in its seeds and in every export."""
+        """Fix the name of an existing scene, which is part of seeds and exports."""
         return ("name",) if obj else ()
 
     def get_prepopulated_fields(self, request: HttpRequest, obj: Scene | None = None) -> dict[str, Any]:
-        """Only as long as the name can be chosen."""
+        """Derive the name from the title only for a new scene."""
         return {} if obj else dict(self.prepopulated_fields)
 
     def save_formset(self, request: HttpRequest, form: Any, formset: Any, change: bool) -> None:
-        """Say what a change of milestones or positions means for trials that were made with the others."""
+        """Warn about earlier trials if milestones or positions change."""
         super().save_formset(request, form, formset, change)
         changed = formset.changed_objects or formset.deleted_objects or formset.new_objects
         trials = form.instance.trials.count() if change and changed else 0
@@ -239,34 +239,34 @@ class SceneAdmin(ActiveActions, LogsValues):
 
     @admin.display(description="positions", ordering="n_positions")
     def positions_n(self, scene: Scene) -> int:
-        """Number of positions."""
+        """Return the number of positions."""
         return scene.n_positions  # type: ignore[attr-defined, no-any-return]
 
     @admin.display(description="milestones", ordering="n_milestones")
     def milestones_n(self, scene: Scene) -> int:
-        """Number of milestones."""
+        """Return the number of milestones."""
         return scene.n_milestones  # type: ignore[attr-defined, no-any-return]
 
     @admin.display(description="trials", ordering="n_trials")
     def trials_n(self, scene: Scene) -> int:
-        """Number of trials."""
+        """Return the number of trials."""
         return scene.n_trials  # type: ignore[attr-defined, no-any-return]
 
 
 @admin.register(FailureTerm)
 class FailureTermAdmin(LabelledRows, ActiveActions, admin.ModelAdmin):
-    """The taxonomy of failures; scores keep its words, whatever becomes of them here."""
+    """Taxonomy of failures; scores store the words and are unaffected by changes here."""
 
     list_display = ("words", "level", "shortcut", "order", "active")
     list_editable = ("order",)
     list_filter = ("level", "active")
 
     def get_readonly_fields(self, request: HttpRequest, obj: FailureTerm | None = None) -> tuple[str, ...]:
-        """What a word is of."""
+        """Fix the level of an existing term."""
         return ("level",) if obj else ()
 
     def save_model(self, request: HttpRequest, obj: FailureTerm, form: Any, change: bool) -> None:
-        """Say so where scores were given with other words."""
+        """Warn if scores exist with the previous words."""
         before = form.initial.get("words") if "words" in form.changed_data else ""
         super().save_model(request, obj, form, change)
         field = "failure_phase" if obj.level == FailureTerm.Level.PHASE else "failure"
@@ -280,12 +280,12 @@ class FailureTermAdmin(LabelledRows, ActiveActions, admin.ModelAdmin):
 
     @admin.display(description="key", ordering="key")
     def shortcut(self, term: FailureTerm) -> str:
-        """As it is pressed."""
+        """Return the key combination that selects the term."""
         return f"Shift + {term.key.upper()}" if term.key else ""
 
 
 class CheckpointForm(forms.ModelForm):
-    """A policy, and how it is reached."""
+    """Form of a policy and its connection."""
 
     policy = Table(
         required=False,
@@ -318,32 +318,32 @@ class CheckpointForm(forms.ModelForm):
         self.initial["tags"] = ", ".join(self.instance.tags)
 
     def clean_tags(self) -> list[str]:
-        """The words, each once."""
+        """Return the distinct tags."""
         return list(
             dict.fromkeys(word for part in self.cleaned_data["tags"].split(",") if (word := part.strip()))
         )
 
     def clean_policy(self) -> dict[str, Any]:
-        """An empty field is an empty table: everything as in the deployment."""
+        """Return {} for an empty field: everything as in the deployment."""
         given = self.cleaned_data["policy"]
         return {} if given is None else given
 
     def clean_strategy(self) -> Any:
-        """An empty field is no strategy of its own."""
+        """Return None for an empty field: the strategy of plan or station."""
         return self.cleaned_data["strategy"] or None
 
 
 @admin.register(Checkpoint)
 class CheckpointAdmin(ActiveActions, LogsValues):
-    """A trained policy."""
+    """Trained policies."""
 
     def table_of(self, row: Checkpoint) -> dict[str, Any]:
-        """All that its form has; of an address what may be read by everybody who reads results."""
+        """Return all fields of the form, with the policy's table reduced to what readers of results may see."""
         table = model_to_dict(row, CheckpointForm.Meta.fields)
         return {**table, "policy": _readable(table["policy"])}
 
     form = CheckpointForm
-    save_as = True  # the same weights, served otherwise
+    save_as = True  # copy for the same weights, served in another way
     formfield_overrides = _SHORT
     list_display = ("name", "tagged", "active", "reached_at", "trials_n", "created_at")
     list_filter = ("active",)
@@ -351,22 +351,22 @@ class CheckpointAdmin(ActiveActions, LogsValues):
     autocomplete_fields = ("parent",)
 
     def get_queryset(self, request: HttpRequest) -> QuerySet[Checkpoint]:
-        """With the number of trials, which nobody is told from whom the checkpoint is hidden."""
+        """Add the number of trials, 0 for checkpoints hidden from the user."""
         hidden = visibility_for_request(request).checkpoints
         shown = Count("trials", filter=~Q(pk__in=hidden)) if hidden else Count("trials")
         return super().get_queryset(request).annotate(n_trials=shown)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Checkpoint | None = None) -> tuple[str, ...]:
-        """The name is in every manifest from the first trial on; those trials were of these weights."""
+        """Fix the name (which manifests contain) and digest of a checkpoint that trials or plans use."""
         used = obj is not None and checkpoint_used(obj)
         return ("name", *(("digest",) if obj and obj.digest else ())) if used else ()
 
     def has_delete_permission(self, request: HttpRequest, obj: Checkpoint | None = None) -> bool:
-        """Only of one on which nothing rests."""
+        """Allow deletion only of checkpoints that no trial or frozen plan uses."""
         return super().has_delete_permission(request, obj) and (obj is None or not checkpoint_used(obj))
 
     def get_deleted_objects(self, objs: Iterable[Checkpoint], request: HttpRequest) -> Any:
-        """What would go with them; what rests on one that is used is not listed: it may be hidden."""
+        """Return the objects to be deleted; dependants of used checkpoints are not listed, as they may be hidden."""
         used = [checkpoint for checkpoint in objs if checkpoint_used(checkpoint)]
         found = super().get_deleted_objects([one for one in objs if one not in used], request)
         to_delete, counts, perms_needed, protected = found
@@ -376,7 +376,7 @@ class CheckpointAdmin(ActiveActions, LogsValues):
         return to_delete, counts, perms_needed, [*protected, *kept]
 
     def save_model(self, request: HttpRequest, obj: Checkpoint, form: Any, change: bool) -> None:
-        """Say so where trials may have been made with another table."""
+        """Warn if trials or a frozen plan use the checkpoint with another policy or strategy table."""
         super().save_model(request, obj, form, change)
         if change and {"policy", "strategy"} & {*form.changed_data} and checkpoint_used(obj):
             messages.warning(
@@ -388,12 +388,12 @@ class CheckpointAdmin(ActiveActions, LogsValues):
 
     @admin.display(description="tags")
     def tagged(self, checkpoint: Checkpoint) -> str:
-        """Its tags."""
+        """Return the tags as text."""
         return ", ".join(checkpoint.tags)
 
     @admin.display(description="policy")
     def reached_at(self, checkpoint: Checkpoint) -> str:
-        """Its address, where it has one."""
+        """Return the policy's address, path or kind."""
         policy = checkpoint.policy if isinstance(checkpoint.policy, dict) else {}
         place = str(policy.get("url") or policy.get("path") or policy.get("kind") or "as deployed")
         tunnel = policy.get("tunnel")
@@ -402,29 +402,29 @@ class CheckpointAdmin(ActiveActions, LogsValues):
 
     @admin.display(description="trials", ordering="n_trials")
     def trials_n(self, checkpoint: Checkpoint) -> int:
-        """Number of trials; 0 of one that is hidden."""
+        """Return the number of trials, 0 for a hidden checkpoint."""
         return checkpoint.n_trials  # type: ignore[attr-defined, no-any-return]
 
 
 class ReadOnly:
-    """Records of what happened, which are not edited."""
+    """Mixin of read-only records."""
 
     def has_add_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
     def has_delete_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
 
 @admin.register(Evaluation)
 class EvaluationAdmin(ReadOnly, admin.ModelAdmin):
-    """Evaluations that trials belong to; the open bench of a station is made by itself."""
+    """Evaluations; a station's open bench is created automatically."""
 
     list_display = ("name", "version", "kind", "station", "created_at")
     list_filter = ("kind", "station")
@@ -432,7 +432,7 @@ class EvaluationAdmin(ReadOnly, admin.ModelAdmin):
 
 
 class ScoreInline(ReadOnly, admin.TabularInline):
-    """Every score that it was given; the last one counts."""
+    """All scores of a trial; the last counts."""
 
     model = Score
     fk_name = "trial"
@@ -443,7 +443,7 @@ class ScoreInline(ReadOnly, admin.TabularInline):
 
 @admin.register(Trial)
 class TrialAdmin(ReadOnly, admin.ModelAdmin):
-    """Trials are scored, corrected and voided on their result page, where the reason is asked for."""
+    """Trials, read-only: scoring, correcting and voiding are on their result page, which asks for the reason."""
 
     list_display = (
         "id",
@@ -464,17 +464,17 @@ class TrialAdmin(ReadOnly, admin.ModelAdmin):
 
     @admin.display(description="position")
     def position_n(self, trial: Trial) -> int:
-        """Its number alone."""
+        """Return the number of the position."""
         return trial.position.number
 
     @admin.display(description="result")
     def page(self, trial: Trial) -> str:
-        """A link to its result page."""
+        """Return a link to the result page."""
         return format_html('<a href="{}">open</a>', reverse("result-trial", args=[trial.pk]))
 
 
 class OutcomeInline(ReadOnly, admin.TabularInline):
-    """Its milestones as they were."""
+    """Milestones as they were at scoring time."""
 
     model = MilestoneOutcome
     extra = 0
@@ -484,7 +484,7 @@ class OutcomeInline(ReadOnly, admin.TabularInline):
 
 @admin.register(Score)
 class ScoreAdmin(ReadOnly, admin.ModelAdmin):
-    """Every score there ever was."""
+    """All scores, including corrected ones."""
 
     list_display = ("scored_at", "trial", "rater", "source", "success", "score", "why", "reason")
     list_filter = ("success", "source", "trial__scene", "trial__checkpoint")

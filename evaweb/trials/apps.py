@@ -1,4 +1,4 @@
-"""Registers the app."""
+"""Django app configuration."""
 
 from django.apps import AppConfig
 

@@ -1,4 +1,4 @@
-"""Clips of failed trials and their table as one archive, made while it is sent: no file of it is on the disk."""
+"""Zip archive of failure clips with their table, generated while it is sent, without temporary files."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from evaweb.trials.models import Trial
 from runtime.datasets.remux import cut
 from runtime.recording.files import RecordingError
 
-MOST = 500  # clips of an archive, each a few seconds
+MOST = 500  # clips per archive
 _ARCHIVE_COLUMNS = (*COLUMNS, "file", "file_begin_s", "why_no_file")
 _TABLE = "failures.csv"
 
 
 def require_few(filters: FailureFilters, sight: Visibility) -> None:
-    """EvaError where the filters are wrong, or mean more trials than an archive holds."""
+    """Raise EvaError if the filters are invalid or match more trials than an archive may have."""
     count = failed_list(filters, sight).count()
     if count > MOST:
         raise EvaError(f"{count} failed trials; allowed in one archive: at most {MOST}. Narrow the filters")
 
 
 def clip_archive(filters: FailureFilters, sight: Visibility, root: str) -> Iterator[bytes]:
-    """A zip with a video per clip, named by trial and code, and the table of all; one clip in memory at a time."""
+    """Yield a zip with a video per clip, named by trial and code, and the table; holds one clip in memory."""
     written = _Written()
     rows: list[dict[str, Any]] = []
-    with zipfile.ZipFile(written, "w", zipfile.ZIP_STORED) as packed:  # videos are as small as they get
+    with zipfile.ZipFile(written, "w", zipfile.ZIP_STORED) as packed:  # videos are compressed already
         for page in failure_trials(filters, sight):
-            for trial in page[: MOST - len(rows)]:  # some may have failed since they were counted
+            for trial in page[: MOST - len(rows)]:  # more may have failed since the count
                 content, told = _clip(trial)
                 rows.append(row_of(trial, sight, root) | told)
                 if content:
@@ -47,7 +47,7 @@ def clip_archive(filters: FailureFilters, sight: Visibility, root: str) -> Itera
 
 
 def _clip(trial: Trial) -> tuple[bytes, dict[str, Any]]:
-    """The clip as a video, and what the table says of it; no bytes where there is none."""
+    """Return the clip as a video (b"" if there is none) and its columns of the table."""
     told = dict.fromkeys(("file", "why_no_file"), "") | {"file_begin_s": None}
     clip, episode = clip_of(trial), trial.episode
     if clip is None or episode is None:
@@ -68,7 +68,7 @@ def _clip(trial: Trial) -> tuple[bytes, dict[str, Any]]:
 
 
 class _Written(io.RawIOBase):
-    """A file that only goes forward, and gives away what was written to it."""
+    """Write-only sequential file whose content is removed by `taken`."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []

@@ -1,4 +1,4 @@
-"""The part of a failed trial's recording that shows what went wrong: when it begins and ends, and what was missed."""
+"""Clip of a failed trial's recording around the failure."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from django.urls import reverse
 
 from evaweb.trials.models import Trial
 
-BEFORE_S = 1.0  # shown of what still went well
+BEFORE_S = 1.0  # lead before the last reached milestone
 LASTS_S = 6.0
 
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """From `begin` to `end` [s of the recording] of the first camera; `missed` is the first milestone not reached.
+    """Part of the first camera's video from `begin` to `end` [s]; `missed` is the first milestone not reached.
 
-    `after` is the last one reached before it of which the time is known; "": the recording's end is shown.
+    `after` is the last milestone before it with a known time; "": the clip is the end of the recording.
     """
 
     video: str
@@ -29,14 +29,14 @@ class Clip:
 
     @property
     def words(self) -> str:
-        """Which part it is."""
+        """Description of the part."""
         return f"after “{self.after}”" if self.after else f"the last {self.end - self.begin:.0f} s"
 
 
 def clip_of(trial: Trial) -> Clip | None:
-    """The clip of a scored trial; None where it has no recording with pictures.
+    """Return the clip of a scored trial; None without a recording with images.
 
-    A milestone that was missed has no time: the clip begins just before the last one in front of it was reached.
+    A missed milestone has no time: the clip begins just before the previous one was reached.
     """
     episode = trial.episode
     if episode is None or trial.verdict is None or not (episode.cameras and episode.frames and episode.fps):

@@ -1,4 +1,4 @@
-"""Corrections of one thing that a score says, which leave all else as it was."""
+"""Corrections of only the failure phase and cause of a score."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def trial_failure(
     score: UUID | str | None = None,
     reason: str = "",
 ) -> Score:
-    """Correct why a trial failed, and nothing else of its score: None leaves that level as it is.
+    """Correct why a trial failed, without changing its score otherwise; None leaves a level unchanged.
 
-    Success, points and milestones are copied from the score that stood, not judged by the scene as it is now.
+    Success, points and milestones are copied from the current score, not evaluated with the scene as it is now. Without
+    a `reason`, the old and new terms are recorded as the reason. An identical request adds nothing.
 
-    `score` is the one that the user saw: Conflict where another counts by now. Without a `reason` it says what was
-    changed into what. The same again adds nothing.
+    Raises: Conflict if the trial has no counting score, or another one than `score`, the uuid that the user saw.
     """
     require_role(user, Role.OPERATOR)
     with transaction.atomic():
@@ -74,7 +74,7 @@ def trial_failure(
 
 
 def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], reason: str) -> Score:
-    """Another score like the one `seen`, but for its failure, whatever became of the scene's milestones since."""
+    """Add a copy of the score `seen` with another failure, whatever became of the scene's milestones since."""
     for what in ("scored", "reworded"):
         run_checks(what, held, user)
     require_scorable(held, reason)

@@ -1,4 +1,4 @@
-"""What ended a run that did not end by itself; no Django, so that exports of before say the same."""
+"""Causes that ended a run prematurely; independent of Django, so that exported analyses share it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _TIMEOUT = re.compile(r"the run's [\d.e+]+ s are over")
 
 
 def ending_of(interrupted: bool, reason: str) -> str:
-    """One of `ENDINGS` by the station's reason; "" where it ended by itself, or the operator stopped it."""
+    """Return one of `ENDINGS` by the station's reason; "" if the run ended by itself or the operator stopped it."""
     if interrupted:
         return ESTOP if _ESTOP.search(reason) else INTERRUPTION
     return TIMEOUT if _TIMEOUT.search(reason) else ""

@@ -1,16 +1,16 @@
-"""Failures in words; no Django, so that analyses outside of it say the same."""
+"""Failures as text; independent of Django, so that external analyses share it."""
 
 from __future__ import annotations
 
 UNSPECIFIED = "not specified"
-_BEFORE = "not said"  # addresses that were kept say it
+_BEFORE = "not said"  # earlier name, still in bookmarked URLs
 
 
 def is_not_said(words: str) -> bool:
-    """True if these words stand for none."""
+    """Return True if the text stands for an unspecified failure."""
     return words.strip().casefold() in (UNSPECIFIED, _BEFORE)
 
 
 def failure_text(phase: str, cause: str) -> str:
-    """ "grasp: dropped"; what was not said is left out."""
+    """Return phase and cause as "grasp: dropped"; an empty part is omitted."""
     return ": ".join(filter(None, (phase, cause)))

@@ -1,4 +1,4 @@
-"""The lab's taxonomy of failures: what a form offers, and what a score may say."""
+"""Taxonomy of failures: choices of a form, and validation of scores."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _MISSING_SCENE_WANTS_EVERY_FAILED = Pattern(
 )
 
 FIELDS = {"failure_phase": FailureTerm.Level.PHASE, "failure": FailureTerm.Level.CAUSE}
-"""What scores, forms and REST call each level."""
+"""Name of each level in scores, forms and REST."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Words of one level, with their key, and whether they are those that were said before."""
+    """Term of one level with its shortcut key, and whether it is currently selected."""
 
     words: str
     key: str
@@ -40,7 +40,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One level as a form offers it, under the name of its field."""
+    """Level of the taxonomy as a form shows it, with the name of its field."""
 
     field: str
     label: str
@@ -48,14 +48,14 @@ class Level:
 
     @property
     def said(self) -> bool:
-        """True if one is chosen."""
+        """Whether a choice is selected."""
         return any(choice.is_selected for choice in self.choices)
 
 
 def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
-    """Phases, then causes, those that are retired left out; what was `said` before stays, whatever became of it.
+    """Return the active phases, then causes; a term in `said` is included even if retired or deleted.
 
-    A level without words is left out.
+    A level without terms is omitted.
     """
     terms, found = list(FailureTerm.objects.filter(active=True)), []
     for field, level in FIELDS.items():
@@ -69,18 +69,18 @@ def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
 
 
 def score_failure(score: Score | None) -> dict[str, str]:
-    """What a score says of it, by field."""
+    """Return phase and cause of a score by field, {} without a score."""
     return {field: getattr(score, field) for field in FIELDS} if score else {}
 
 
 def ordered_terms() -> Mapping[str, tuple[str, ...]]:
-    """Of each level by its field the words, retired ones too, in the lab's order."""
+    """Return by field the terms of each level, including retired ones, in the lab's order."""
     rows = FailureTerm.objects.values_list("level", "words")
     return {field: tuple(words for of, words in rows if of == level) for field, level in FIELDS.items()}
 
 
 def clean_failure(*, failure_phase: str, failure: str) -> dict[str, str]:
-    """Both as they are kept; EvaError where they cannot be."""
+    """Return phase and cause as stored. Raises: EvaError if they cannot be."""
     found = {
         "failure": clean_text("failure", failure, LONGEST_FAILURE),
         "failure_phase": clean_text("failure_phase", failure_phase, LONGEST_FAILURE),
@@ -99,10 +99,10 @@ def check_failure(
     by_person: bool = True,
     said: Mapping[str, str] | None = None,
 ) -> None:
-    """EvaError where a score must not say `words`, by field; `said` is what stood before, which may stay.
+    """Raise EvaError if a score must not have these `words` (by field); terms of the previous score, `said`, may stay.
 
-    A phase is one of the lab's. So is a cause that stands with a phase, or where the scene wants both of whoever
-    scores; a cause alone may be in other words, as programs have them.
+    A phase must be one of the lab's. So must a cause given with a phase, or if the scene requires both from human
+    raters; a cause alone may be any text, as programs send it.
     """
     for field in FIELDS if success else ():
         if words[field]:

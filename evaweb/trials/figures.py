@@ -16,7 +16,7 @@ _WIDTH, _PAD = 200, 6
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """A rate and its interval on an axis of 200 units; `words` say the same to those who cannot see it."""
+    """Rate with its interval on an axis of 200 units; `words` is the alternative text."""
 
     rate: float
     low: float
@@ -36,7 +36,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class SceneFigure:
-    """One table of the result page: a scene and its checkpoints, and how many of their trials were scored."""
+    """Table of one scene: its checkpoints, and the number of scored trials."""
 
     scene: Scene
     rows: tuple[tuple[StatisticsRow, Bar | None], ...]
@@ -44,7 +44,7 @@ class SceneFigure:
 
 
 def rate_bar(found: Proportion) -> Bar | None:
-    """The bar of a proportion; None where nothing is known."""
+    """Return the bar of a proportion; None if it is unknown."""
     if found.rate is None or found.interval is None:
         return None
     words = f"{format_percent(found.rate)} of {found.n}, 95 % interval {format_interval(found)}"
@@ -52,7 +52,7 @@ def rate_bar(found: Proportion) -> Bar | None:
 
 
 def scene_figures(rows: Iterable[StatisticsRow]) -> list[SceneFigure]:
-    """One per scene, in the order of the rows."""
+    """Return one figure per scene, in the order of the rows."""
     figures = []
     for _, group in groupby(rows, key=lambda row: row.scene.pk):
         found = list(group)
@@ -62,19 +62,19 @@ def scene_figures(rows: Iterable[StatisticsRow]) -> list[SceneFigure]:
 
 
 def format_percent(share: float) -> str:
-    """A share as whole percent."""
+    """Return a fraction as whole percent."""
     return f"{100 * share:.0f} %"
 
 
 def format_interval(found: Proportion) -> str:
-    """The ends of the interval in whole percent, without the sign: "49 to 94"."""
+    """Return the ends of the interval in whole percent, without the sign: "49 to 94"."""
     if found.interval is None:
         return ""
     return f"{100 * found.interval.low:.0f} to {100 * found.interval.high:.0f}"
 
 
 def average_words(found: Average | None, of: int) -> str:
-    """ "−5.21 [−5.60, −4.82], 14 of 16 trials"; "" where no trial has one."""
+    """Return a mean such as "−5.21 [−5.60, −4.82], 14 of 16 trials"; "" if no trial has a value."""
     if found is None:
         return ""
     n = f"n {found.n}" if found.n == of else f"{found.n} of {of} trials"

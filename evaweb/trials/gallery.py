@@ -1,4 +1,4 @@
-"""Failed trials by cause, phase, position or checkpoint: which there are, how many of each, and their clips."""
+"""Failed trials grouped by cause, phase, position or checkpoint, with counts and clips."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class FailureFilters:
-    """Which failed trials are meant, and `group`, one of GROUPS; "" where it does not matter.
+    """Selection of failed trials, "" for any, and `group`, one of GROUPS.
 
     `position` is "SCENE/NUMBER"; phase and cause may be "not specified".
     """
@@ -57,17 +57,17 @@ class FailureFilters:
 
     @property
     def narrowed(self) -> bool:
-        """True if not all are meant."""
+        """Whether any filter is set."""
         return replace(self, group="failure") != FailureFilters()
 
     @property
     def words(self) -> str:
-        """By what they are grouped, in words."""
+        """Display name of the grouping."""
         return GROUPS[self.group]
 
     @property
     def query(self) -> str:
-        """As it stands in an address."""
+        """Filters as a URL query string."""
         said = {
             **asdict(self.trials),
             **{name: getattr(self, name) for name in ("position", *_WORDS, "group")},
@@ -77,7 +77,7 @@ class FailureFilters:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """One group: what it is called, how many trials it has, and where it stands alone; "" for hidden checkpoints."""
+    """Group of failures: name, number of trials, and URL of the group alone ("" for hidden checkpoints)."""
 
     name: str
     count: int
@@ -85,9 +85,9 @@ class Group:
 
 
 def failed_list(filters: FailureFilters, sight: Visibility) -> QuerySet[Trial]:
-    """The failed trials that count, group by group, the newest of each first; EvaError says what is allowed.
+    """Return the failed trials that count, sorted by group, newest first. Raises: EvaError for invalid filters.
 
-    Trials of hidden checkpoints are there without what tells which they are of: their order is that of their numbers.
+    Trials of hidden checkpoints are included without distinguishing them: they are sorted by trial number.
     """
     if filters.group not in GROUPS:
         raise EvaError(_GROUP_ALLOWED(group=filters.group, groups=", ".join(GROUPS)))
@@ -104,7 +104,7 @@ def failed_list(filters: FailureFilters, sight: Visibility) -> QuerySet[Trial]:
 
 
 def failure_groups(filters: FailureFilters, sight: Visibility) -> list[Group]:
-    """The groups, the largest first."""
+    """Return the groups, largest first."""
     keys = list(_keys(filters.group, sight))
     rows = failed_list(filters, sight).order_by().values_list(*keys).annotate(n=Count("pk"))
     found = [Group(_named(filters.group, key), n, _alone(filters, key)) for *key, n in rows]
@@ -112,16 +112,16 @@ def failure_groups(filters: FailureFilters, sight: Visibility) -> list[Group]:
 
 
 def failures_of(keys: Sequence[int], filters: FailureFilters, sight: Visibility) -> list[Trial]:
-    """Those of `failed_list` by their ids, in its order, with all that is shown of them.
+    """Return the trials of `failed_list` with these ids, in its order, with related rows loaded.
 
-    So that of a hundred thousand trials only the ids are sorted.
+    With this, only ids need sorting when there are very many trials.
     """
     rows = failed_list(filters, sight).filter(pk__in=keys).select_related("episode", *NAMED)
     return list(rows.prefetch_related("verdict__outcomes"))
 
 
 def shown_group(trial: Trial, filters: FailureFilters) -> str:
-    """Name of the group in which a trial of `failed_list` stands."""
+    """Return the name of the group of a trial from `failed_list`."""
     names = {"position": ("group_scene", "group_number")}.get(filters.group, ("group_last", "group_words"))
     return _named(filters.group, [getattr(trial, name) for name in names])
 
@@ -129,13 +129,13 @@ def shown_group(trial: Trial, filters: FailureFilters) -> str:
 def failure_rows(
     filters: FailureFilters, sight: Visibility, root: str, size: int = 500
 ) -> Iterator[list[dict[str, Any]]]:
-    """All of them as rows of COLUMNS, so many at a time, the oldest first; `root` stands before each address."""
+    """Yield all failures as rows of COLUMNS, in lists of at most `size`, oldest first; `root` prefixes URLs."""
     for page in failure_trials(filters, sight, size):
         yield [row_of(trial, sight, root) for trial in page]
 
 
 def failure_trials(filters: FailureFilters, sight: Visibility, size: int = 500) -> Iterator[list[Trial]]:
-    """All of them with what is shown of them, so many at a time, the oldest first."""
+    """Yield all failures with related rows loaded, in lists of at most `size`, oldest first."""
     trials = (
         failed_list(filters, sight).prefetch_related("verdict__outcomes").select_related("episode", *NAMED)
     )
@@ -146,7 +146,7 @@ def failure_trials(filters: FailureFilters, sight: Visibility, size: int = 500) 
 
 
 def row_of(trial: Trial, sight: Visibility, root: str) -> dict[str, Any]:
-    """One of them by COLUMNS."""
+    """Return one failure as a row of COLUMNS."""
     clip, verdict = clip_of(trial), trial.verdict
     return {
         "trial": trial.pk,
@@ -166,7 +166,7 @@ def row_of(trial: Trial, sight: Visibility, root: str) -> dict[str, Any]:
 
 
 def _keys(group: str, sight: Visibility) -> dict[str, Any]:
-    """What trials are grouped and ordered by: two columns, of which the first puts last what has no name."""
+    """Return the two expressions by which trials are grouped and sorted; the first puts unnamed groups last."""
     if group == "position":
         return {"group_scene": F("scene__name"), "group_number": F("position__number")}
     if group == "checkpoint":

@@ -1,4 +1,4 @@
-"""The failure gallery: clips of what went wrong, side by side, and their table."""
+"""Failure gallery: clips of failed trials and their table."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TRIALS = ("evaluation", "checkpoint", "scene", "station", "since")
 
 @require_GET
 def failure_gallery(request: HttpRequest) -> HttpResponse:
-    """Failed trials as clips, group by group; the filters are in the address."""
+    """Show the clips of failed trials by group; the filters are in the URL."""
     seen, filters, fault = visibility_for_request(request), _filters(request.GET), None
     try:
         groups = gallery.failure_groups(filters, seen)
@@ -69,9 +69,9 @@ def failure_gallery(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def failure_table(request: HttpRequest) -> StreamingHttpResponse:
-    """The same, all of them, as CSV with the address of each clip."""
+    """Return all filtered failures as CSV with the URL of each clip."""
     seen, filters = visibility_for_request(request), _filters(request.GET)
-    gallery.failed_list(filters, seen)  # what is wrong with the filters is said before anything is sent
+    gallery.failed_list(filters, seen)  # reports invalid filters before the response begins
     root = request.build_absolute_uri("/").rstrip("/")
     pieces = iter_csv(gallery.COLUMNS, gallery.failure_rows(filters, seen, root))
     return download(request, pieces, "failures.csv", CSV)
@@ -79,7 +79,7 @@ def failure_table(request: HttpRequest) -> StreamingHttpResponse:
 
 @require_GET
 def failure_clips(request: HttpRequest) -> StreamingHttpResponse:
-    """The clips themselves with their table, as an archive that is made while it is sent."""
+    """Return the clips and their table as a zip archive, generated while it is sent."""
     seen, filters = visibility_for_request(request), _filters(request.GET)
     clip_export.require_few(filters, seen)
     root = request.build_absolute_uri("/").rstrip("/")

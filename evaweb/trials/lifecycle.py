@@ -1,4 +1,4 @@
-"""The life of a trial: one table says what may follow what."""
+"""Life cycle of a trial: table of allowed transitions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TRIAL_CANNOT = Pattern(
 
 
 class Transition(StrEnum):
-    """Moves of a trial; the value is the word for it in a sentence."""
+    """Transition of a trial; the value is its participle for messages."""
 
     RUN = "run"
     PAUSE = "paused"
@@ -34,8 +34,8 @@ _S = TrialStatus
 TRANSITIONS: dict[tuple[TrialStatus, Transition], TrialStatus] = {
     (_S.PREPARED, Transition.RUN): _S.RUNNING,
     (_S.PREPARED, Transition.ABANDON): _S.ABANDONED,
-    (_S.ABANDONED, Transition.RUN): _S.RUNNING,  # it was given up, then the lost answer says that it runs
-    (_S.RUNNING, Transition.GIVE_BACK): _S.PREPARED,  # its recording could not be opened: it never ran
+    (_S.ABANDONED, Transition.RUN): _S.RUNNING,  # abandoned while the answer to its run was lost
+    (_S.RUNNING, Transition.GIVE_BACK): _S.PREPARED,  # its recording could not be opened, so it never ran
     (_S.PAUSED, Transition.GIVE_BACK): _S.PREPARED,
     (_S.RUNNING, Transition.PAUSE): _S.PAUSED,
     (_S.RUNNING, Transition.END): _S.ENDED,
@@ -43,15 +43,15 @@ TRANSITIONS: dict[tuple[TrialStatus, Transition], TrialStatus] = {
     (_S.PAUSED, Transition.RESUME): _S.RUNNING,
     (_S.PAUSED, Transition.END): _S.ENDED,
     (_S.PAUSED, Transition.INTERRUPT): _S.INTERRUPTED,
-    (_S.ENDED, Transition.INTERRUPT): _S.INTERRUPTED,  # its recording turns out not to be whole
+    (_S.ENDED, Transition.INTERRUPT): _S.INTERRUPTED,  # its recording turns out to be incomplete
     (_S.ENDED, Transition.SCORE): _S.SCORED,
     (_S.ENDED, Transition.VOID): _S.VOIDED,
-    # An e-stop may well be the checkpoint's own failure: leaving such trials out would flatter it.
+    # An e-stop may be the checkpoint's own failure: excluding such trials would bias its rate upwards.
     (_S.INTERRUPTED, Transition.SCORE): _S.SCORED,
     (_S.INTERRUPTED, Transition.VOID): _S.VOIDED,
     (_S.SCORED, Transition.SCORE): _S.SCORED,  # a correction
     (_S.SCORED, Transition.VOID): _S.VOIDED,
-    (_S.SCORED, Transition.ASK): _S.VOID_ASKED,  # of a blind plan: a second operator has to agree
+    (_S.SCORED, Transition.ASK): _S.VOID_ASKED,  # in a blind plan, where a second operator has to agree
     (_S.VOID_ASKED, Transition.VOID): _S.VOIDED,
     (_S.VOID_ASKED, Transition.KEEP): _S.SCORED,
 }
@@ -60,7 +60,7 @@ OPEN_STATES = (_S.PREPARED, _S.RUNNING, _S.PAUSED)
 RUNNING_STATES = (_S.RUNNING, _S.PAUSED)
 SCORED_STATES = (_S.SCORED, _S.VOID_ASKED, _S.VOIDED)
 REPEATABLE_STATES = (_S.INTERRUPTED, _S.VOID_ASKED, _S.VOIDED, _S.ABANDONED)
-"""What does not count: the next trial of the same kind is another attempt of the same number."""
+"""States that do not count: the next trial is another attempt of the same number."""
 
 _ADVICE = {
     _S.PREPARED: "run it, or abandon it",
@@ -76,23 +76,23 @@ _ADVICE = {
 
 
 def advice(status: str) -> str:
-    """Advice to a person on a trial in this status."""
+    """Return advice to the user on a trial in this status."""
     return _ADVICE[TrialStatus(status)]
 
 
 def allows(trial: Trial, move: Transition) -> bool:
-    """True if `move` is in the table for this trial as it stands."""
+    """Return True if the table has this transition from the trial's status."""
     return (TrialStatus(trial.status), move) in TRANSITIONS
 
 
 def require(trial: Trial, move: Transition) -> None:
-    """Raise Conflict, with what can be done instead, unless the table has `move` for this trial."""
+    """Raise Conflict, with advice, unless the table has this transition from the trial's status."""
     if not allows(trial, move):
         status = TrialStatus(trial.status)
         raise Conflict(_TRIAL_CANNOT(trial=trial.pk, label=status.label, move=move, advice=advice(status)))
 
 
 def apply(trial: Trial, move: Transition) -> None:
-    """Set the status that follows; the caller saves. Conflict where the table has no such move."""
+    """Set the resulting status without saving. Raises: Conflict if the table lacks the transition."""
     require(trial, move)
     trial.status = TRANSITIONS[TrialStatus(trial.status), move]

@@ -20,7 +20,7 @@ from evaweb.trials.tables import check_bench, check_policy, check_strategy, chec
 
 
 class Scene(models.Model):
-    """A task on a bench: what the robot is told, how the bench is laid out, what counts as success."""
+    """A task on a bench: the policy's instruction, the layout, and the criterion of success."""
 
     name = models.SlugField(max_length=60, unique=True, help_text="Short name for addresses and exports.")
     title = models.CharField(max_length=120, validators=[check_name])
@@ -55,7 +55,7 @@ class Scene(models.Model):
 
 
 class Position(models.Model):
-    """One initial condition of a scene, by number."""
+    """Initial condition of a scene, by number."""
 
     scene = models.ForeignKey(Scene, on_delete=models.CASCADE, related_name="positions")
     number = models.PositiveSmallIntegerField()
@@ -77,7 +77,7 @@ class Position(models.Model):
 
 
 class Milestone(models.Model):
-    """One step on the way to success; the score of a trial is the share of points it reached."""
+    """Step towards success; a trial's score is the fraction of points of the reached milestones."""
 
     scene = models.ForeignKey(Scene, on_delete=models.CASCADE, related_name="milestones")
     order = models.PositiveSmallIntegerField()
@@ -108,16 +108,16 @@ class Milestone(models.Model):
 
 
 FAILURE_KEYS = "abcdefghijmnoqtvwyz"
-"""Letters that choose a failure, with Shift: not those with which the Eval page commands, alone or with Shift.
+"""Letters that select a failure together with Shift; none is a command key of the Eval page, with or without Shift.
 
-A scored trial's keys are gone with its form: pressed once too often, each must be harmless.
+After scoring the form no longer handles its keys: a surplus key press must be harmless.
 """
 
 
 class FailureTerm(models.Model):
-    """A word of the lab's taxonomy of failures: a phase of the task, or a cause.
+    """Term of the lab's taxonomy of failures: a phase of the task, or a cause.
 
-    Scores keep the words, not the term: what becomes of a term changes nothing that was said.
+    Scores store the words instead of a reference: changes of a term do not affect them.
     """
 
     class Level(models.TextChoices):
@@ -144,7 +144,7 @@ class FailureTerm(models.Model):
     active = models.BooleanField(default=True, help_text="Off: retired, not offered; scores keep it.")
 
     class Meta:
-        ordering = ("-level", "order", "pk")  # phases come first
+        ordering = ("-level", "order", "pk")  # phases before causes
         verbose_name = "failure phase or cause"
         verbose_name_plural = "failure phases and causes"
         constraints = [
@@ -169,7 +169,7 @@ class FailureTerm(models.Model):
 
 
 class Checkpoint(models.Model):
-    """A trained policy: which weights, trained on from what, and how it is reached."""
+    """A trained policy: its weights, its parent in training, and its connection."""
 
     name = models.CharField(max_length=120, unique=True, validators=[check_name])
     description = models.TextField(blank=True, help_text="Trained on what, for how long, by whom.")
@@ -231,12 +231,12 @@ class Checkpoint(models.Model):
 
     @property
     def strategy_words(self) -> str:
-        """Its own strategy as one reads it; "" where it has none."""
+        """The checkpoint's own strategy as text; "" if it has none."""
         return ", ".join(f"{key} {value}" for key, value in (self.strategy or {}).items())
 
     @property
     def lineage(self) -> list[Checkpoint]:
-        """Those that training went on from, the nearest first."""
+        """Ancestors in training, nearest first."""
         found: list[Checkpoint] = []
         above = self.parent
         while above is not None and above not in found:
@@ -245,7 +245,7 @@ class Checkpoint(models.Model):
         return found
 
     def clean(self) -> None:
-        """Nothing is trained on from itself."""
+        """Raise ValidationError if the parent was itself trained from this checkpoint."""
         if self.pk is not None and self in self.lineage:
             raise ValidationError(
                 {"parent": f"{self.parent} was trained on from {self}; allowed: one that was not, or none"}
@@ -253,7 +253,7 @@ class Checkpoint(models.Model):
 
 
 class Evaluation(models.Model):
-    """A set of trials that belong together; the open bench of a station takes those outside any plan."""
+    """A set of trials; the open bench of a station has those outside any plan."""
 
     class Kind(models.TextChoices):
         OPEN_BENCH = "open_bench", "open bench"
@@ -296,7 +296,7 @@ class TrialStatus(models.TextChoices):
 
     @property
     def tone(self) -> str:
-        """Its colour, by the name the style sheets have for it."""
+        """Colour name of the style sheets."""
         return _TONES[self]
 
 
@@ -359,7 +359,7 @@ class Trial(models.Model):
         editable=False,
         help_text="How long its policy took to connect and to warm up [s], by the names of the runtime.",
     )
-    # Which commands made it, and from where on the station's events are about it.
+    # Commands of this trial, and the station event from which on events concern it.
     setup = models.UUIDField(null=True, blank=True, editable=False, help_text="Of its newest set-up.")
     run = models.UUIDField(null=True, blank=True, editable=False, help_text="Of the command that ran it.")
     run_boot = models.CharField(max_length=64, blank=True, editable=False)
@@ -406,7 +406,7 @@ class Trial(models.Model):
             "status": {"scored": ("void_asked", "voided"), "void_asked": ("voided", "scored"), "voided": ()}
         },
         never=(
-            # What was not known yet when it was judged is told once.
+            # Values still unknown at scoring time are set once.
             f"{_JUDGED} AND OLD.episode_id IS NOT NULL "
             "AND (NEW.episode_id IS NULL OR NEW.episode_id <> OLD.episode_id)",
             f"{_JUDGED} AND OLD.truth IS NOT NULL AND (NEW.truth IS NULL OR NEW.truth <> OLD.truth)",
@@ -414,7 +414,7 @@ class Trial(models.Model):
             "SELECT 1 FROM episodes_episode WHERE uuid = NEW.episode_id AND duration_s = NEW.duration_s)",
             "OLD.status = 'voided' AND (NEW.reason <> OLD.reason OR "
             "COALESCE(NEW.voided_by_id, 0) <> COALESCE(OLD.voided_by_id, 0))",
-            # A verdict is one of its own scores, and gives way to a later one alone.
+            # The verdict is one of the trial's own scores, replaced only by a later one.
             "COALESCE(NEW.verdict_id, 0) <> COALESCE(OLD.verdict_id, 0) AND NOT EXISTS ("
             "SELECT 1 FROM trials_score WHERE id = NEW.verdict_id AND trial_id = NEW.id "
             "AND id > COALESCE(OLD.verdict_id, 0))",
@@ -456,7 +456,7 @@ class Trial(models.Model):
 
 
 class VoidRequest(models.Model):
-    """An operator asks for a scored trial of a blind plan to be voided, which a second one agrees to or refuses."""
+    """Request of an operator to void a scored trial of a blind plan, which a second one agrees to or refuses."""
 
     class Answer(models.TextChoices):
         AGREED = "agreed", "agreed to"
@@ -498,7 +498,7 @@ class VoidRequest(models.Model):
 
 
 class Score(models.Model):
-    """What one rater says of a trial; a correction is another row, and the newest one counts."""
+    """Score of a trial by one rater; a correction is another row, and the newest counts."""
 
     class Source(models.TextChoices):
         HUMAN = "human", "a person"
@@ -524,7 +524,7 @@ class Score(models.Model):
         ordering = ("trial", "id")
 
     def save(self, *args: object, **kwargs: object) -> None:
-        """Write it once; a correction is another row."""
+        """Insert the row. Raises: TypeError for an existing row, as a correction is another row."""
         if self.pk is not None:
             raise TypeError(f"score {self.pk} is never changed: a correction is another score")
         super().save(*args, **kwargs)
@@ -534,12 +534,12 @@ class Score(models.Model):
 
     @property
     def why(self) -> str:
-        """Phase and cause of a failure, as far as they were said."""
+        """Phase and cause of a failure, as far as specified."""
         return failure_text(self.failure_phase, self.failure)
 
 
 class MilestoneOutcome(models.Model):
-    """Whether a milestone was reached, with its words and points as they were when it was scored."""
+    """Whether a milestone was reached, with its text and points as they were at scoring time."""
 
     score = models.ForeignKey(Score, on_delete=models.CASCADE, related_name="outcomes")
     milestone = models.ForeignKey(Milestone, null=True, on_delete=models.SET_NULL, related_name="outcomes")
@@ -553,7 +553,7 @@ class MilestoneOutcome(models.Model):
     append_only = AppendOnly(
         "what was scored is never changed or removed: a correction is another score",
         except_columns=("milestone",),
-        # They are added with their score, before it counts or is corrected.
+        # Outcomes are added together with their score, before it counts or is corrected.
         forbidden_inserts="EXISTS (SELECT 1 FROM trials_trial WHERE verdict_id = NEW.score_id) OR EXISTS (SELECT 1 "
         "FROM trials_score own, trials_score later WHERE own.id = NEW.score_id AND later.trial_id = own.trial_id "
         "AND later.id > own.id)",

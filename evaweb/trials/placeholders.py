@@ -1,4 +1,4 @@
-"""Placeholders for what restored trials refer to: found by name, or made by name, switched off and marked."""
+"""Placeholders for rows that restored trials need: found by name, or created deactivated and marked."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ PLACEHOLDER_NOTE = "Known from recordings alone: the database was lost."
 
 
 def station(facts: TrialRecord) -> Station:
-    """The station of the trial."""
+    """Return the trial's station."""
     return get_or_create_station(
         name=facts.station, robot="", simulated=facts.simulated, source=f"trial {facts.uuid}"
     )
 
 
 def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
-    """The trial's evaluation; the open bench of its station takes all versions."""
+    """Return the trial's evaluation; a station's open bench serves all versions."""
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         found, _ = Evaluation.objects.get_or_create(
             name=facts.evaluation, version=facts.version, defaults={"description": PLACEHOLDER_NOTE}
@@ -33,7 +33,7 @@ def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
 
 
 def checkpoint(facts: TrialRecord) -> Checkpoint:
-    """The checkpoint of that name."""
+    """Return the checkpoint of that name."""
     words = f"{PLACEHOLDER_NOTE} Say again how it is reached, then switch it on."
     found, _ = Checkpoint.objects.get_or_create(
         name=facts.checkpoint, defaults={"description": words, "active": False}
@@ -42,7 +42,7 @@ def checkpoint(facts: TrialRecord) -> Checkpoint:
 
 
 def scene(facts: TrialRecord) -> Scene:
-    """The scene of that name; milestones it gets from the first scores that are restored."""
+    """Return the scene of that name; a created one gets its milestones from the first restored score."""
     words = f"{PLACEHOLDER_NOTE} Write down again what counts as success, then switch it on."
     found, _ = Scene.objects.get_or_create(
         name=facts.scene,
@@ -58,7 +58,7 @@ def scene(facts: TrialRecord) -> Scene:
 
 
 def position(scene: Scene, number: int) -> Position:
-    """The position of that number."""
+    """Return the position of that number."""
     words = f"{PLACEHOLDER_NOTE} Write down again where things stand."
     found, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": words})
     return found

@@ -1,7 +1,7 @@
-"""A trial's record: what it has, where it is written and shown, and to whom; and the lines of what was said of it.
+"""Records of trials: columns with their storage, display and visibility; journal lines of their scores and voids.
 
-`TrialRecord` declares every column once. Manifests and scores files, restoring, REST, CSV, Parquet and the tables of
-results are made from it; a column is a field of models.Trial and one here (docs/contributing.md).
+`TrialRecord` declares every column once. Manifests, scores files, restoring, REST, CSV, Parquet and result tables are
+derived from it; a column is a field of models.Trial and one here (docs/contributing.md).
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ _Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 @dataclass(frozen=True, slots=True)
 class Column(RowPath):
-    """One column: `path` is where a trial has it, "" under its own name.
+    """Declaration of one column: `path` is the query path from a trial, "" for the field's own name.
 
-    While it is hidden from somebody which checkpoint a trial is of, a column that is not `open` is hidden too, or is
-    what `seen` says.
+    While a trial's checkpoint is hidden from a user, a column is hidden too, unless it is `always_visible` or has a
+    `masked_value`.
     """
 
     path: str = ""
-    always_visible: bool = False  # it tells nothing of the checkpoint
+    always_visible: bool = False  # it reveals nothing about the checkpoint
     masked_value: Callable[[Visibility, Trial], Any] | None = None
     written: Literal["before", "after", "never"] = (
-        "before"  # the run: manifests have what is written before it
+        "before"  # relative to the run; manifests have the columns written before it
     )
-    api: Literal["list", "detail", "never"] = "list"  # from "list" CSV and Parquet too
-    table: bool = True  # in the tables of a plan's results
-    type: Any = None  # as it is shown; None: as it is read
-    label: str = ""  # on the trial's page; "" where that shows it otherwise, or not
+    api: Literal["list", "detail", "never"] = "list"  # "list" includes CSV and Parquet
+    table: bool = True  # part of a plan's result tables
+    type: Any = None  # displayed type; None: the type when read
+    label: str = ""  # label on the trial's page; "" if it is shown elsewhere or not at all
 
     def shown(self, name: str, hint: Any, trial: Trial, sight: Visibility) -> Any:
-        """Its value as somebody may see it."""
+        """Return the value as this user may see it."""
         if self.masked_value is not None:
             return self.masked_value(sight, trial)
         if self.always_visible or not sight.hides(trial):
@@ -55,7 +55,7 @@ class Column(RowPath):
 
 
 class TrialRecord(Line):
-    """A trial, its columns in the order in which they are shown; what is not written is empty where it was read."""
+    """Record of a trial, with columns in display order; columns that are not written are None or "" when read."""
 
     id: Annotated[
         Annotated[int, Field(gt=0, lt=2**53)] | None, Column("pk", always_visible=True, type=int)
@@ -128,21 +128,21 @@ class TrialRecord(Line):
 
     @classmethod
     def names(cls) -> Iterable[str]:
-        """What is written of it."""
+        """Return the names of the written columns."""
         return [name for name, column in COLUMNS.items() if column.written != "never"]
 
     @classmethod
     def for_manifest(cls, trial: Trial) -> dict[str, Any]:
-        """The trial as its run is asked for, for the manifest: the uuid tells it from those of other databases."""
+        """Return the columns known before the run, for the manifest; the uuid is unique across databases."""
         whole = cls.written(trial)
         return {name: value for name, value in whole.items() if COLUMNS[name].written == "before"}
 
     def pre_run_fields(self) -> dict[str, Any]:
-        """What was known before its run, as fields of models.Trial; without its id, and without other rows."""
+        """Return the fields of models.Trial known before the run, without its id and foreign keys."""
         return self._fields("before")
 
     def run_fields(self) -> dict[str, Any]:
-        """How its run went, as fields of models.Trial."""
+        """Return the fields of models.Trial that the run determines."""
         return self._fields("after")
 
     def _fields(self, when: str) -> dict[str, Any]:
@@ -157,7 +157,7 @@ COLUMNS: Mapping[str, Column] = {
 
 
 def _shown_as(annotation: Any) -> Any:
-    """A type without what is asked of a value that is read."""
+    """Return a type without its validation metadata."""
     if get_origin(annotation) is Annotated:
         return _shown_as(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
@@ -169,31 +169,31 @@ HINTS: Mapping[str, Any] = {
     name: column.type or _shown_as(TrialRecord.model_fields[name].annotation)
     for name, column in COLUMNS.items()
 }
-"""The types of the columns, as they are shown."""
+"""Displayed types of the columns."""
 
 
 def api_columns(where: Literal["list", "detail"]) -> dict[str, Any]:
-    """The columns of one trial in a list, or those that a single one has beside them, with their types."""
+    """Return the columns with types of a trial in a list, or those that only a single trial's response adds."""
     return {name: HINTS[name] for name, column in COLUMNS.items() if column.api == where}
 
 
 def visible_columns(trial: Trial, sight: Visibility, names: Iterable[str]) -> dict[str, Any]:
-    """The trial as somebody may see it."""
+    """Return the named columns of a trial as this user may see them."""
     return {name: COLUMNS[name].shown(name, HINTS[name], trial, sight) for name in names}
 
 
 def visible_labels(trial: Trial, sight: Visibility) -> Iterator[tuple[str, Any]]:
-    """What the trial's page shows of itself, as somebody may see it."""
+    """Yield label and value of the columns on the trial's page, as this user may see them."""
     for name, column in COLUMNS.items():
         if column.label:
             yield column.label, column.shown(name, HINTS[name], trial, sight)
 
 
-# --- DATA/scores/<uuid>.jsonl: every verdict on an episode, or on a trial that was not recorded ------------------
+# --- DATA/scores/<uuid>.jsonl: scores and voids of an episode, or of a trial without a recording -----------------
 
 
 class OutcomeLine(Line):
-    """A milestone as it was when it was scored."""
+    """Milestone as it was at scoring time."""
 
     order: _Small
     text: Annotated[str, Field(max_length=200)]
@@ -204,7 +204,7 @@ class OutcomeLine(Line):
 
 
 class ScoreLine(Line):
-    """A score."""
+    """Score of a trial."""
 
     kind: Literal["score"] = "score"
     uuid: UUID
@@ -229,7 +229,7 @@ class ScoreLine(Line):
 
 
 class VoidLine(Line):
-    """A trial taken out of the count."""
+    """Void of a trial."""
 
     kind: Literal["void"] = "void"
     trial: TrialRecord
@@ -239,12 +239,12 @@ class VoidLine(Line):
 
     @classmethod
     def written(cls, row: Trial, **given: Any) -> dict[str, Any]:
-        """The line of a trial that is about to be saved as voided."""
+        """Return the line of a trial that is about to be saved as voided."""
         return super().written(row, trial=TrialRecord.written(row), **given)
 
 
 class VoidRequestLine(Line):
-    """A void that an operator asked for."""
+    """Request of an operator to void a trial."""
 
     kind: Literal["void_request"] = "void_request"
     uuid: UUID
@@ -255,11 +255,11 @@ class VoidRequestLine(Line):
 
 
 class VoidAnswerLine(Line):
-    """What became of it; `at` the time when it was answered, or lapsed at somebody's act."""
+    """Answer to a void request; `at` is when it was answered, or lapsed through a user's action."""
 
     ELSEWHERE = frozenset({"kind", "uuid"})
     kind: Literal["void_answer"] = "void_answer"
-    uuid: UUID  # of the request
+    uuid: UUID  # uuid of the request
     trial: TrialRecord
     answer: Annotated[str, Field(pattern="^(agreed|refused|lapsed)$")]
     reason: Annotated[str, RowPath("answer_reason")] = ""
@@ -272,10 +272,10 @@ JUDGEMENTS: Journal[Judgement] = Journal("scores", ScoreLine, VoidLine, VoidRequ
 
 
 def journal_uuid(trial: Trial) -> UUID:
-    """What the file of a trial's verdicts is named by."""
+    """Return the uuid that names the file of a trial's scores: its episode's, or its own."""
     return trial.episode_id or trial.uuid
 
 
 def trial_of_manifest(asked: Mapping[str, Any]) -> TrialRecord | None:
-    """The trial that a manifest names; None where its run was none of ours."""
+    """Return the trial that a manifest names; None if the run has no trial of this lab."""
     return parse_model(TrialRecord, asked, "the manifest's trial") if "uuid" in asked else None

@@ -1,7 +1,7 @@
-"""Trials and scores that the database has lost, made again from manifests and scores files.
+"""Restoring of lost trials and scores from manifests and scores files.
 
-What was there is never overwritten; a row that is older than the disk (from a backup) is brought up to it.
-Scenes, positions, checkpoints and people that are gone too are made by name, switched off, and say so.
+Existing rows are not overwritten; a row older than the disk (from a backup) is updated from it. Scenes, positions,
+checkpoints and users that are missing too are created by name, deactivated, and marked as placeholders.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ _TRIAL_HAS_EPISODE_CANNOT_HAVE = Pattern(
     "trial {trial} has episode {episode_id}, and cannot have another one",
 )
 
-_BEHIND = (*lifecycle.OPEN_STATES, TrialStatus.ABANDONED)  # what a trial with a closed recording cannot be
-_GHOST_S = 0.1  # the clock of a run that never began stood at a few hundredths of a second
+_BEHIND = (*lifecycle.OPEN_STATES, TrialStatus.ABANDONED)  # outdated if the recording is closed
+_GHOST_S = 0.1  # runs that never began have durations of a few hundredths of a second
 
 
 @register_restorer
 def restore(kept: RestorableRun) -> int:
-    """Make the trial of a run and its scores, where they are not there; how many rows that were."""
+    """Restore the trial of a run and its scores if they are missing; return the number of restored rows."""
     asked = read_recorded_episode(journal_folder(kept.uuid)).trial if kept.recorded else {}
     lines = _judgements(kept, asked)
     if not lines and Trial.objects.filter(episode_id=kept.uuid).exclude(status__in=_BEHIND).exists():
@@ -87,7 +87,7 @@ def restore(kept: RestorableRun) -> int:
 
 
 def _never_ran_reason(trial: Trial) -> str:
-    """What is said of a score that earlier versions took for a run whose recording could not be opened; "" else."""
+    """Return a warning for a scored trial whose recording was never opened, which earlier versions allowed; else ""."""
     if trial.status != TrialStatus.SCORED or trial.episode is None or (trial.duration_s or 0.0) >= _GHOST_S:
         return ""
     why = why_unrecorded(episode=trial.episode)
@@ -95,9 +95,10 @@ def _never_ran_reason(trial: Trial) -> str:
 
 
 def _judgements(kept: RestorableRun, asked: Mapping[str, Any]) -> list[Judgement]:
-    """What its lines say; of a score that was given once more, as the database did not take it, the last.
+    """Return the lines of the run; of several lines with one score's uuid, the last.
 
-    Those of another trial than its recording, in a copy of another file, are left out.
+    A score written twice had failed in the database. Lines of another trial than the recording's, from a copied file,
+    are reported and skipped.
     """
     lines = [line for line in kept.lines if isinstance(line, Judgement)]
     own = asked.get("uuid", "")
@@ -113,7 +114,7 @@ def _judgements(kept: RestorableRun, asked: Mapping[str, Any]) -> list[Judgement
 
 
 def _facts(lines: Sequence[Judgement], asked: Mapping[str, Any]) -> TrialRecord | None:
-    """The newest line knows most of its trial; without one it is as its run was asked for."""
+    """Return the trial's record: from the newest line, which is most complete, else from the manifest."""
     named = {line.trial.uuid for line in lines}
     if len(named) > 1:
         raise EvaError(_SCORES_SEVERAL_TRIALS(named=", ".join(sorted(map(str, named)))))
@@ -124,7 +125,7 @@ def _facts(lines: Sequence[Judgement], asked: Mapping[str, Any]) -> TrialRecord 
 
 
 def _trial(facts: TrialRecord, kept: RestorableRun, episode: Episode | None) -> tuple[Trial, bool]:
-    """The trial's row, held, and whether it was made."""
+    """Return the trial's row, locked, and whether it was created."""
     trial = Trial.objects.select_for_update().filter(uuid=facts.uuid).first()
     if trial is None:
         return _made(facts, _episode(facts, kept, episode)), True
@@ -142,7 +143,7 @@ def _trial(facts: TrialRecord, kept: RestorableRun, episode: Episode | None) -> 
 
 
 def _episode(facts: TrialRecord, kept: RestorableRun, found: Episode | None) -> Episode | None:
-    """The recording, known as missing where its folder is lost too; a run that was none has the trial's uuid."""
+    """Return the recording, created as missing if its folder is lost too; None for a trial without recording."""
     if found is not None or kept.uuid == facts.uuid:
         return found
     return episodes.create_missing_episode(
@@ -157,7 +158,7 @@ def _episode(facts: TrialRecord, kept: RestorableRun, found: Episode | None) -> 
 
 
 def _made(facts: TrialRecord, episode: Episode | None) -> Trial:
-    """The row as it was; its id too, where that is free, so that addresses of trials stay valid."""
+    """Create the trial with its original id if that is free, so that URLs of trials stay valid."""
     station, scene = placeholders.station(facts), placeholders.scene(facts)
     key = {
         "evaluation": placeholders.evaluation(facts, station),
@@ -174,13 +175,13 @@ def _made(facts: TrialRecord, episode: Episode | None) -> Trial:
         **(facts.pre_run_fields() | key | course | _numbered(facts, key, course["reason"])),
     )
     prepared_at = facts.prepared_at or course["started_at"] or timezone.now()
-    Trial.objects.filter(pk=trial.pk).update(prepared_at=prepared_at)  # `create` takes the present
+    Trial.objects.filter(pk=trial.pk).update(prepared_at=prepared_at)  # `create` sets the current time
     _advance_sequence(Trial)
     return Trial.objects.get(pk=trial.pk)
 
 
 def _numbered(facts: TrialRecord, key: Mapping[str, Any], reason: str) -> dict[str, Any]:
-    """Its number and attempt; the next number where others were given these since, and the reason says so."""
+    """Return number and attempt; the next number, with a note in the reason, if another trial has them now."""
     same = Trial.objects.filter(**key)
     if not same.filter(number=facts.number, attempt=facts.attempt).exists():
         return {"number": facts.number, "attempt": facts.attempt}
@@ -190,7 +191,7 @@ def _numbered(facts: TrialRecord, key: Mapping[str, Any], reason: str) -> dict[s
 
 
 def _run_values(facts: TrialRecord, episode: Episode | None) -> dict[str, Any]:
-    """How the run went: what is kept of the trial itself first, then what its recording says."""
+    """Return the outcome of the run from the trial's record, completed from its recording."""
     ended_at, truth = _end(episode) if episode else (None, None)
     exact = episode.duration_s if episode else None
     missing = episode is None or episode.status == EpisodeStatus.MISSING
@@ -208,7 +209,7 @@ def _run_values(facts: TrialRecord, episode: Episode | None) -> dict[str, Any]:
 
 
 def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
-    """When the recording was closed, and how a simulated bench said it was left then."""
+    """Return when the recording was closed, and the last ground truth in its events."""
     if episode.status not in CLOSED:
         return None, None
     folder = journal_folder(episode.uuid)
@@ -217,11 +218,11 @@ def _end(episode: Episode) -> tuple[datetime | None, Mapping[str, Any] | None]:
     return read_recorded_episode(folder).ended_at, told[-1] if told else None
 
 
-# --- what was said of it -----------------------------------------------------------------------------------
+# --- scores and voids --------------------------------------------------------------------------------------
 
 
 def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
-    """Add the scores that are not there."""
+    """Add the missing scores; return their number."""
     lost = missing_rows(Score, lines, trial=trial)
     for line in lost:
         _score(trial, line)
@@ -232,7 +233,10 @@ def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
 
 
 def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
-    """That of the last line; of a trial with scores in two files (its episode was found late) the later one."""
+    """Return the score that counts: that of the last line, unless a later one is in another file.
+
+    A trial has two files if its episode was found late.
+    """
     newest, known = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
     elsewhere = known is not None and known.uuid not in [line.uuid for line in lines]
     return known if known and elsewhere and known.scored_at > newest.scored_at else newest
@@ -248,7 +252,7 @@ def _score(trial: Trial, line: ScoreLine) -> None:
 
 
 def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int, str], Milestone]:
-    """The scene's by order and words; a scene that was made here gets those of the first score that has any."""
+    """Return the scene's milestones by order and text; a placeholder scene gets those of the first score with any."""
     if (
         not scene.active
         and scene.criterion.startswith(placeholders.PLACEHOLDER_NOTE)
@@ -260,7 +264,7 @@ def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int
 
 
 def _apply_outcomes(trial: Trial, lines: Sequence[Judgement]) -> None:
-    """Move the trial to where its lines have brought it; nothing leaves voided."""
+    """Set the status that follows from the lines; a void is final."""
     void = next((line for line in lines if isinstance(line, VoidLine)), None)
     asked = [line for line in lines if isinstance(line, VoidRequestLine | VoidAnswerLine)]
     if void is not None and trial.status != TrialStatus.VOIDED:
@@ -276,7 +280,7 @@ def _apply_outcomes(trial: Trial, lines: Sequence[Judgement]) -> None:
 
 
 def _restore_void_requests(trial: Trial, lines: Sequence[Judgement]) -> int:
-    """The voids that were asked for, and their answers; how many rows were not there, or not answered."""
+    """Restore missing void requests and answers; return the number of added or updated rows."""
     answers = {line.uuid: line.to_row_values() for line in lines if isinstance(line, VoidAnswerLine)}
     asked = missing_rows(
         VoidRequest, [line for line in lines if isinstance(line, VoidRequestLine)], trial=trial
@@ -290,7 +294,7 @@ def _restore_void_requests(trial: Trial, lines: Sequence[Judgement]) -> int:
 
 
 def _publish(trial: Trial, *, made: bool) -> None:
-    """Have it published where that may not have been done: the job is lost with the database."""
+    """Queue the publication if it may be missing: its job was lost with the database."""
     episode = trial.episode
     if trial.status not in lifecycle.SCORED_STATES or episode is None or episode.status not in CLOSED:
         return
@@ -299,7 +303,7 @@ def _publish(trial: Trial, *, made: bool) -> None:
 
 
 def _advance_sequence(model: type[Trial]) -> None:
-    """Where the database counts apart from the rows, let it go on after the highest number given by us."""
+    """Advance the database's id sequence past the explicitly assigned ids."""
     statements = connection.ops.sequence_reset_sql(no_style(), [model])
     with connection.cursor() as cursor:
         for statement in statements:

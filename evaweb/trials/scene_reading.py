@@ -1,4 +1,4 @@
-"""A scene as one table, with its positions and milestones, and what refers to them."""
+"""Scene with positions and milestones as one table, and the trials and plans that use them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from evaweb.refusals import is_text
 from evaweb.trials.models import Scene
 
-_FROZEN = ("frozen", "closed", "revealed")  # states of plans, which are bound to positions by evaweb.plans
+_FROZEN = ("frozen", "closed", "revealed")  # states of plans; evaweb.plans defines the relation
 FIELDS = (
     *("title", "instruction", "criterion", "layout"),
     *("time_limit_s", "ordered", "failure_required", "active"),
@@ -37,7 +37,7 @@ class _Table(BaseModel):
 
 
 class PositionTable(_Table):
-    """A position; `id` of one that there is."""
+    """Position; `id` is None for a new one."""
 
     id: int | None = None
     number: int = Field(ge=0, lt=2**15)
@@ -47,7 +47,7 @@ class PositionTable(_Table):
 
 
 class MilestoneTable(_Table):
-    """A milestone, in its place; `id` of one that there is."""
+    """Milestone at its place in the list; `id` is None for a new one."""
 
     id: int | None = None
     text: _Text = ""
@@ -58,7 +58,7 @@ class MilestoneTable(_Table):
 
 
 class SceneTable(_Table):
-    """A scene as it shall be."""
+    """Scene as it is to be written."""
 
     name: _Text = ""
     title: _Text = ""
@@ -74,7 +74,7 @@ class SceneTable(_Table):
 
 
 def scene_table(scene: Scene) -> dict[str, Any]:
-    """The scene in plain values, as `scene_write` takes it."""
+    """Return the scene as plain values, in the form that `scene_write` takes."""
     return {
         "name": scene.name,
         **{name: getattr(scene, name) for name in FIELDS},
@@ -84,13 +84,13 @@ def scene_table(scene: Scene) -> dict[str, Any]:
 
 
 def seen_of(scene: Scene) -> str:
-    """Another text whenever anything of the scene, as the database has it, is another."""
+    """Return a digest of the scene as stored, which changes with any part of it."""
     kept = scene_table(Scene.objects.get(pk=scene.pk))
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def kept_positions(scene: Scene) -> dict[int, str]:
-    """Positions that trials or frozen plans refer to, by id, with the reason in words."""
+    """Return by id the positions used by trials or frozen plans, with the reason as text."""
     referred = Q(trials__isnull=False) | Q(plan__state__in=_FROZEN)
     rows = scene.positions.filter(referred).annotate(n=Count("trials", distinct=True)).distinct()
     found = {}
@@ -102,7 +102,7 @@ def kept_positions(scene: Scene) -> dict[int, str]:
 
 
 def running_plans(scene: Scene) -> list[str]:
-    """Plans whose trials are being made with the scene, by title."""
+    """Return the titles of running plans that use the scene."""
     rows = scene.positions.filter(plan__state="frozen").order_by("plan__title", "plan__version")
     found = rows.values_list("plan__title", "plan__version").distinct()
     return [f"{title} v{version}" for title, version in found]

@@ -1,6 +1,6 @@
-"""A scene written as a whole, with its positions and milestones, as the scene editor sends it.
+"""Writing of a whole scene with its positions and milestones, as the scene editor sends it.
 
-What trials or frozen plans refer to is not changed under them; nobody overwrites what another wrote meanwhile.
+Rows used by trials or frozen plans are not changed; concurrent edits are detected instead of overwritten.
 """
 
 from __future__ import annotations
@@ -44,27 +44,25 @@ _SCENE_DOES_NOT_EXIST_ANY = Pattern(
     "scene {name!r:.80} does not exist any more: nothing was saved",
 )
 
-APART_M = (
-    0.15  # block and plate of a simulated bench, centre to centre, at least: runtime.sim.layout refuses less
-)
+APART_M = 0.15  # least distance between the centres of block and plate; runtime.sim.layout refuses less
 
 
 _IDS = {
     "positions": {"__all__": {"id"}},
     "milestones": {"__all__": {"id"}},
-}  # of rows, which only the database gives
+}  # row ids, which only the database assigns
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What is wrong at one place, such as "positions.2.bench": which thing, what was given, what is allowed."""
+    """Problem at one place, such as "positions.2.bench"; the text names the item, the given and the allowed values."""
 
     place: str
     text: str
 
 
 class SceneRefused(EvaError):
-    """A scene that cannot be written; `faults` has each place."""
+    """The scene is invalid; `faults` lists all places."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         super().__init__("; ".join(fault.text for fault in faults))
@@ -72,7 +70,7 @@ class SceneRefused(EvaError):
 
 
 class ChangedMeanwhile(Conflict):
-    """The scene is not what the writer has seen; `seen` is what it is now, for one who writes over it knowingly."""
+    """The scene has changed since the editor loaded it; `seen` identifies the current version for overwriting."""
 
     def __init__(self, scene: Scene, seen: str) -> None:
         last = LogEntry.objects.filter(object_id=str(scene.pk), content_type__model="scene").first()
@@ -86,11 +84,15 @@ class ChangedMeanwhile(Conflict):
 def scene_write(
     *, user: User, name: str | None, given: Mapping[str, Any], seen: str = ""
 ) -> tuple[Scene, list[str]]:
-    """Write the scene of that name, None for a new one; the scene, and what has to be said of the change.
+    """Write the scene called `name` (None: a new one); return it and remarks on the consequences of the change.
 
-    `seen`: what `seen_of` said when the writer read it. What is there word by word already was written before, and its
-    answer lost: nothing is written again. Raises NotAllowed, SceneRefused with every place that is wrong,
-    ChangedMeanwhile. Nothing is written then.
+    `seen` is the result of `seen_of` when the editor read it. If the content is already identical, the request is a
+    repetition whose answer was lost, and nothing is written.
+
+    Raises:
+        NotAllowed: The user is not an administrator.
+        SceneRefused: Names every invalid place; nothing is written.
+        ChangedMeanwhile: Another user has changed the scene; nothing is written.
     """
     require_role(user, Role.ADMIN)
     wanted = table_of(given)
@@ -120,7 +122,7 @@ def scene_write(
 
 
 def _says(scene: Scene, wanted: SceneTable) -> bool:
-    """True if the scene is word by word what is wanted now; rows that were new then have no id."""
+    """Return True if the scene already equals `wanted`; new rows have no id there."""
     there = SceneTable.model_validate(scene_table(scene))
     pairs = (
         zip(there.positions, wanted.positions, strict=False),
@@ -131,7 +133,7 @@ def _says(scene: Scene, wanted: SceneTable) -> bool:
 
 
 def table_of(given: object) -> SceneTable:
-    """The table in plain values; SceneRefused with every place that is none."""
+    """Return the validated scene. Raises: SceneRefused with every invalid place."""
     try:
         return SceneTable.model_validate(given)
     except ValidationError as error:
@@ -192,7 +194,7 @@ def _position_written(row: Position, asked: Mapping[str, Any], place: str, kept:
 
 
 def _bench_problem(bench: Mapping[str, Any]) -> str:
-    """Why a simulated bench would refuse to lay it, "" where it would not."""
+    """Return why a simulated bench would refuse this layout, "" if it would accept."""
     x_from, x_to, y_from, y_to = AREA
     for name in ("block", "plate"):
         x, y = bench[name][:2] if name in bench else (x_from, y_from)
@@ -236,7 +238,7 @@ def _write_milestones(scene: Scene, wanted: Sequence[MilestoneTable]) -> list[Fa
 
 
 def _make_room(scene: Scene, n: int) -> None:
-    """Move those that stay where none of the first `n` places is theirs: no two have one place at any moment."""
+    """Move rows that are not in the first `n` places out of them, so that the order stays unique at all times."""
     taken = set(scene.milestones.values_list("order", flat=True))
     free = (place for place in count(n + 1) if place not in taken)
     for row in scene.milestones.all():
@@ -244,7 +246,7 @@ def _make_room(scene: Scene, n: int) -> None:
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Texts as every form leaves them: one kind of line end, no blanks around."""
+    """Normalize texts as forms do: one kind of line end, no surrounding blanks."""
     texts = {
         name: value.replace("\r\n", "\n").strip() for name, value in values.items() if isinstance(value, str)
     }
@@ -252,7 +254,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _strangers(wanted: Sequence[Any], rows: Mapping[int, Any], kind: str) -> list[Fault]:
-    """Rows that are written but were never read here, or twice."""
+    """Report rows whose ids are not of this scene, or repeated."""
     ids = [one.id for one in wanted if one.id is not None]
     wrong = [id for id in ids if id not in rows or ids.count(id) > 1]
     return [
@@ -270,7 +272,7 @@ def _twice(wanted: Sequence[PositionTable]) -> list[Fault]:
 
 
 def _pictured(row: Position) -> str:
-    """Reference pictures are bound to positions by evaweb.plans."""
+    """Return the reason to keep a position with reference pictures, which evaweb.plans attaches."""
     return "reference pictures" if row.references.exists() else ""  # type: ignore[attr-defined]
 
 
@@ -295,7 +297,7 @@ def _changed(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> str:
 
 
 def _remarks(scene: Scene, before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> list[str]:
-    """What a change means for what was done with the scene as it was."""
+    """Return remarks on the consequences of the change for existing trials, plans and reference pictures."""
     if before is None or before == after:
         return []
     said = []

@@ -59,22 +59,22 @@ _Named = TypeVar("_Named", bound=Model)
 
 
 def scene_get(*, name: str | int) -> Scene:
-    """The scene of that name or id; NotFound lists those that there are."""
+    """Return the scene of that name or id. Raises: NotFound, which lists the existing ones."""
     return _by_name(Scene.objects.all(), "scene", name)
 
 
 def checkpoint_get(*, name: str | int, sight: Visibility = FULL_VISIBILITY) -> Checkpoint:
-    """The checkpoint of that name or id; NotFound lists those that there are. What is hidden is not there."""
+    """Return the checkpoint of that name or id. Raises: NotFound, also for a hidden one; lists the visible ones."""
     return _by_name(_checkpoints(sight), "checkpoint", name)
 
 
 def evaluation_get(*, name: str | int) -> Evaluation:
-    """The newest version of the evaluation of that name, or the one of that id."""
+    """Return the newest version of the evaluation of that name, or the one with that id."""
     return _by_name(Evaluation.objects.order_by("-version"), "evaluation", name)
 
 
 def position_get(*, scene: Scene, number: int) -> Position:
-    """The position of that number; NotFound lists those of the scene."""
+    """Return the position of that number. Raises: NotFound, which lists those of the scene."""
     found = scene.positions.filter(number=number).first()
     if found is None:
         known = ", ".join(map(str, scene.positions.values_list("number", flat=True))) or "none yet"
@@ -96,28 +96,31 @@ def _by_name(rows: QuerySet[_Named], kind: str, name: str | int) -> _Named:
 
 
 def scene_list(*, all_of_them: bool = False) -> QuerySet[Scene]:
-    """Scenes with their positions and milestones: those offered to operators, or all."""
+    """Return scenes with positions and milestones: the active ones, or all."""
     rows = Scene.objects.prefetch_related("positions", "milestones")
     return rows if all_of_them else rows.filter(active=True)
 
 
 def checkpoint_used(checkpoint: Checkpoint) -> bool:
-    """True if trials, or a plan that was frozen, are of it: alike for all of a plan, whichever was run so far."""
+    """Return True if trials or a frozen plan use the checkpoint.
+
+    A frozen plan counts even before its first trial, so that the answer is the same for all its checkpoints.
+    """
     return bool(checkpoint.trials.exists() or checkpoint.plan_set.exclude(state="draft").exists())
 
 
 def checkpoint_list(
     *, all_of_them: bool = False, tag: str = "", sight: Visibility = FULL_VISIBILITY
 ) -> QuerySet[Checkpoint]:
-    """Checkpoints: those offered to operators, or all; those with that tag, if one is given; none that are hidden."""
+    """Return the visible checkpoints: the active ones or all, optionally only those with `tag`."""
     rows = _checkpoints(sight)
-    if tag:  # between its quotes: a tag has none, and not every database looks into lists
+    if tag:  # match it with its quotes, which tags cannot contain: not every database can query JSON lists
         rows = rows.annotate(written=Cast("tags", TextField())).filter(written__contains=f'"{tag}"')
     return rows if all_of_them else rows.filter(active=True)
 
 
 def _checkpoints(sight: Visibility) -> QuerySet[Checkpoint]:
-    """Those that are not hidden, each without a parent that is."""
+    """Return the visible checkpoints, each without a hidden parent."""
     rows: QuerySet[Checkpoint] = sight.filter_visible(Checkpoint.objects.all(), "pk")
     return rows.prefetch_related(
         Prefetch("parent", queryset=sight.filter_visible(Checkpoint.objects.all(), "pk"))
@@ -125,18 +128,18 @@ def _checkpoints(sight: Visibility) -> QuerySet[Checkpoint]:
 
 
 def evaluation_list() -> QuerySet[Evaluation]:
-    """All evaluations by name and version."""
+    """Return all evaluations by name and version."""
     return Evaluation.objects.select_related("station")
 
 
 def trial_open(station: Station) -> Trial | None:
-    """The trial of a station that is not finished: prepared, running, paused, or ended and not yet scored."""
+    """Return the station's unfinished trial: prepared, running, paused, or ended and not scored."""
     unfinished = Trial.objects.filter(station=station, status__in=UNFINISHED).order_by("-pk")
     return unfinished.select_related(*_NAMED).first()
 
 
 def trial_get(*, id: int) -> Trial:
-    """The trial with all that is known of it."""
+    """Return the trial with its related rows. Raises: NotFound."""
     scores = Score.objects.select_related("rater").prefetch_related("outcomes").order_by("-pk")
     rows = Trial.objects.select_related(*_NAMED, "episode", "voided_by")
     asked = VoidRequest.objects.select_related("by", "answered_by")
@@ -152,13 +155,13 @@ def trial_get(*, id: int) -> Trial:
     return found
 
 
-# The handout is bound to it from above, by evaweb.plans.
+# `handout` is a reverse relation defined by evaweb.plans.
 _NAMED = ("evaluation", "checkpoint", "scene", "position", "station", "operator", "verdict", "handout")
 
 
 @dataclass(frozen=True, slots=True)
 class TrialFilters:
-    """Which trials are meant, each by name; "" where it does not matter. `since`: a day or an ISO time."""
+    """Selection of trials by names, "" for any. `since`: a day or an ISO 8601 time."""
 
     evaluation: str = ""
     checkpoint: str = ""
@@ -168,9 +171,9 @@ class TrialFilters:
     since: str = ""
 
     def apply(self, trials: QuerySet[Trial], sight: Visibility = FULL_VISIBILITY) -> QuerySet[Trial]:
-        """The trials that fit; raises NotFound or EvaError that names what is allowed.
+        """Return the matching trials. Raises: NotFound or EvaError, which names the allowed values.
 
-        A checkpoint that is hidden from `sight` does not exist: a user who may ask which trials are of it knows it.
+        A hidden checkpoint is treated as unknown: filtering by it would reveal its trials.
         """
         if self.evaluation:
             trials = trials.filter(evaluation=evaluation_get(name=self.evaluation))
@@ -188,7 +191,7 @@ class TrialFilters:
 
 
 def trial_list(filters: TrialFilters | None = None, sight: Visibility = FULL_VISIBILITY) -> QuerySet[Trial]:
-    """Trials that fit, the newest first, with what names them."""
+    """Return the matching trials, newest first, with the rows that name them."""
     rows = Trial.objects.select_related(*_NAMED, "verdict__rater").order_by("-prepared_at", "-pk")
     return (filters or TrialFilters()).apply(rows, sight)
 
@@ -196,7 +199,7 @@ def trial_list(filters: TrialFilters | None = None, sight: Visibility = FULL_VIS
 def trials_in_pages(
     filters: TrialFilters, *, sight: Visibility = FULL_VISIBILITY, size: int = 1000
 ) -> Iterator[list[Trial]]:
-    """All trials that fit, the oldest first, a page at a time: for exports of any length."""
+    """Yield all matching trials, oldest first, in lists of at most `size`: for exports of any length."""
     rows = trial_list(filters, sight).order_by("pk").prefetch_related("verdict__outcomes")
     last = 0
     while page := list(rows.filter(pk__gt=last)[:size]):
@@ -205,7 +208,7 @@ def trials_in_pages(
 
 
 def attempts_of(*, trial: Trial) -> QuerySet[Trial]:
-    """All attempts of the same number, this one included, in their order."""
+    """Return all attempts of the trial's number in order, including itself."""
     key = {
         name: getattr(trial, name)
         for name in ("evaluation_id", "checkpoint_id", "scene_id", "position_id", "number")
@@ -215,7 +218,7 @@ def attempts_of(*, trial: Trial) -> QuerySet[Trial]:
 
 
 def commands_of(*, trial: Trial) -> QuerySet[Command]:
-    """The commands given to its station from its preparation until its end, the first one first."""
+    """Return the commands sent to its station from its preparation to its end, oldest first."""
     until = trial.ended_at or (None if trial.status in UNFINISHED else trial.changed_at)
     asked = Command.objects.filter(station=trial.station, issued_at__gte=trial.prepared_at)
     asked = asked.filter(issued_at__lte=until) if until else asked
@@ -228,7 +231,7 @@ def commands_of(*, trial: Trial) -> QuerySet[Command]:
 
 @dataclass(frozen=True, slots=True)
 class StatisticsRow:
-    """One checkpoint at one scene: what its scored trials say, and how many others there are beside them."""
+    """One checkpoint at one scene: summary of its scored trials, and the numbers of other trials."""
 
     scene: Scene
     checkpoint: Checkpoint
@@ -241,9 +244,9 @@ class StatisticsRow:
 def statistics(
     filters: TrialFilters | None = None, sight: Visibility = FULL_VISIBILITY
 ) -> list[StatisticsRow]:
-    """Per scene and checkpoint, both by name: only scored trials count, what else was run is beside them.
+    """Return a row per scene and checkpoint, sorted by both names; only scored trials enter the summary.
 
-    Trials of hidden checkpoints are left out.
+    Trials of hidden checkpoints are omitted.
     """
     which = filters or TrialFilters()
     trials = which.apply(sight.filter_visible(Trial.objects.order_by()), sight)
@@ -269,13 +272,13 @@ def statistics(
 _Cell = tuple[int, int]  # scene, checkpoint
 _Row = tuple[int, datetime, int, int]  # trial, its last change, scene, checkpoint
 _Outcome = tuple[bool, float, float | None, float | None]  # success, score, seconds, smoothness
-_LATE = timedelta(minutes=10)  # a change may be seen so long after its time: clocks differ, transactions last
-_MOST_CHANGED = 2000  # beyond which all cells are made anew
+_LATE = timedelta(minutes=10)  # longest delay until a change is visible: clock differences, long transactions
+_MOST_CHANGED = 2000  # number of changes beyond which all cells are recomputed
 
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """Cells as they were made, and the changes of trials that had been seen by then."""
+    """Cached cells, and the changes of trials that they include."""
 
     cells: dict[_Cell, Summary]
     newest: datetime | None
@@ -286,25 +289,25 @@ _known: FingerprintCache[_Known] = FingerprintCache()
 
 
 def forget() -> None:
-    """Drop what is kept, as where the database was exchanged."""
+    """Clear the cache, as after an exchange of the database."""
     _known.clear()
 
 
 def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
-    """Summaries of the scored among these trials, which the query tells by their own columns alone.
+    """Return the summaries of the scored trials among `trials`, whose query uses only their own columns.
 
-    Whatever a summary is made of, its trial was saved with it, or is marked as changed. The query is what they are kept
-    by, with the ids of what was named: a name may come to mean another row.
+    Every change to data in a summary also saves its trial or marks it as changed. The cache key is the query with the
+    ids of named rows: a name may come to denote another row.
     """
     return _known.renew(str(trials.query), lambda before: _brought_up(before, trials)).cells
 
 
 def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
-    """Only cells with trials that were changed since are made anew."""
+    """Recompute only the cells with trials that have changed since."""
     since = before.newest - _LATE if before and before.newest else None
     rows = Trial.objects.order_by("-changed_at", "-pk")
     named = rows.values_list("pk", "changed_at", "scene_id", "checkpoint_id")
-    # Before the cells are read: what is changed meanwhile is then seen the next time.
+    # Read before the cells, so that concurrent changes are found the next time.
     seen = list((named if since is None else named.filter(changed_at__gte=since))[: _MOST_CHANGED + 1])
     newest = seen[0][1] if seen else None
     recent = frozenset(row for row in seen if newest and row[1] >= newest - _LATE)
@@ -319,7 +322,7 @@ def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
 
 
 def _same(before: Collection[_Row], seen: Collection[_Row]) -> bool:
-    """False where a trial is gone or another one: the database was lost, or its clock went back."""
+    """Return False if a known trial is gone or replaced: the database was lost or its clock set back."""
     return {(pk, scene, checkpoint) for pk, _, scene, checkpoint in before} <= {
         (pk, scene, checkpoint) for pk, _, scene, checkpoint in seen
     }
@@ -369,7 +372,7 @@ def _since(given: str) -> datetime:
     try:
         moment = parse_datetime(given)
         day = parse_date(given) if moment is None else None
-    except ValueError:  # well formed, but no such day
+    except ValueError:  # well-formed, but not a valid date
         moment = day = None
     if day is not None:
         moment = datetime.combine(day, time.min)
@@ -378,5 +381,5 @@ def _since(given: str) -> datetime:
     try:
         moment = moment if timezone.is_aware(moment) else timezone.make_aware(moment)
         return moment.astimezone(UTC)
-    except OverflowError:  # at an end of the calendar: no time in another zone
+    except OverflowError:  # at the end of the calendar, where conversion between zones overflows
         raise EvaError(_SINCE_THERE_NO_SUCH_TIME(given=given)) from None

@@ -1,4 +1,4 @@
-"""Actions on trials: prepare, score, abandon; `voids` takes them out of the count."""
+"""Services for trials: prepare, score, abandon. `voids` has those that void."""
 
 from __future__ import annotations
 
@@ -120,38 +120,39 @@ Check = Callable[[str, Trial, Any], None]
 _checks: list[Check] = []
 _settled: list[Callable[[Trial, Any], None]] = []
 _failing: list[Callable[[Trial], str]] = []
-_TRIES = 5  # to get a number that nobody else takes at the same moment
+_TRIES = 5  # attempts to get a number in spite of concurrent users
 
 
 def register_check(check: Check) -> None:
-    """`check` is asked before a trial is "run", "scored", "voided" or the like, with the trial and the user.
+    """Register a check that runs before an action on a trial, with action, trial and user; it may raise EvaError.
 
-    And of "judged" while the trial is locked, whenever its scene says what is success: scored, corrected, rated again.
-    And of "judged success" or "judged failure" once it is known what a score says.
-    Before a correction that leaves success and milestones as they were it is asked of "scored", then of "reworded".
-
-    It raises EvaError.
+    Actions are "prepared", "run", "scored", "voided", "void agreed" and "void answered"; "judged", with the trial
+    locked, whenever a score uses the scene's definition of success; "judged success" or "judged failure" once the
+    outcome is known. A correction that leaves success and milestones unchanged also runs "reworded" after "scored".
     """
     _checks.append(check)
 
 
 def register_settled(told: Callable[[Trial, Any], None]) -> None:
-    """`told` hears of each trial that was scored, voided or abandoned, with the user, in the same transaction."""
+    """Register a function called with each trial that was scored, voided or abandoned, and the user.
+
+    It is called in the same transaction.
+    """
     _settled.append(told)
 
 
 def declare_failing(rule: Callable[[Trial], str]) -> None:
-    """`rule` says why a trial is a failure whatever was reached in it, "" where that decides."""
+    """Register a rule that returns why a trial is a failure whatever was reached, "" if it is not."""
     _failing.append(rule)
 
 
 def failing(trial: Trial) -> str:
-    """Why it is a failure whatever was reached in it; "" where that decides."""
+    """Return why the trial is a failure whatever was reached; "" if its milestones decide."""
     return next((why for rule in _failing if (why := rule(trial))), "")
 
 
 def run_checks(what: str, trial: Trial, user: Any) -> None:
-    """Ask the declared checks."""
+    """Run the registered checks for action `what`."""
     for check in _checks:
         check(what, trial, user)
 
@@ -168,10 +169,10 @@ def prepare_trial(
     checkpoint: Checkpoint,
     seed: int | None = None,
 ) -> Trial:
-    """The next trial of this checkpoint at this position, on the station's open bench.
+    """Prepare the next trial of this checkpoint at this position, in the station's open bench.
 
-    It repeats the lowest number whose newest attempt does not count, as a new attempt; else it is the next
-    number. Conflict where the station has a trial that is not finished, and says what to do about it.
+    It is a new attempt of the lowest number whose newest attempt does not count; if there is none, the next number.
+    Raises: Conflict, with advice, if the station has an unfinished trial.
     """
     require_role(user, Role.OPERATOR)
     _check_choice(station, scene, position, checkpoint, seed)
@@ -180,12 +181,12 @@ def prepare_trial(
             with transaction.atomic():
                 return _prepared(user, station, scene, position, checkpoint, seed)
         except IntegrityError:
-            continue  # somebody took the number, or the station: both are looked at anew
+            continue  # number or station was taken concurrently: evaluate both again
     raise Conflict(_PREPARED_AT_ONCE(checkpoint=checkpoint, scene=scene))
 
 
 def open_bench(station: Station) -> Evaluation:
-    """The evaluation of the station's trials outside any plan; made when it is first needed."""
+    """Return the evaluation of the station's trials outside any plan; create it if needed."""
     name = f"open bench {station.name}"
     found, _ = Evaluation.objects.get_or_create(
         station=station, kind=Evaluation.Kind.OPEN_BENCH, defaults={"name": name}
@@ -250,14 +251,15 @@ def create_trial(
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
 ) -> Trial:
-    """This very trial, prepared; within a transaction, by a caller who knows that it is the next one.
+    """Create exactly this trial, prepared; call within a transaction, if it is known to be the next one.
 
-    Conflict where the station has a trial that is not finished, and says what to do about it. IntegrityError where
-    there is one of this number and attempt.
+    Raises:
+        Conflict: The station has an unfinished trial; the message has advice.
+        IntegrityError: The number and attempt exist already.
     """
     require_role(user, Role.OPERATOR)
     _check_choice(station, scene, position, checkpoint, seed)
-    Station.objects.select_for_update().get(pk=station.pk)  # one at a time
+    Station.objects.select_for_update().get(pk=station.pk)  # serializes preparation at this station
     require_none_open(station)
     if seed is None and station.simulated:
         seed = seed_of(scene, position, number)
@@ -279,7 +281,7 @@ def create_trial(
 
 
 def require_none_open(station: Station) -> None:
-    """Conflict where the station has a trial that is not finished, with what to do about it."""
+    """Raise Conflict, with advice, if the station has an unfinished trial."""
     unfinished = trial_open(station)
     if unfinished is not None:
         status = TrialStatus(unfinished.status)
@@ -302,7 +304,7 @@ def _next_attempt(key: Mapping[str, Any]) -> tuple[int, int]:
 
 
 def seed_of(scene: Scene, position: Position, number: int) -> int:
-    """The seed of a simulated bench: the same for every checkpoint, so that they meet the same conditions."""
+    """Return the seed of a simulated bench: equal for all checkpoints, so that their conditions are the same."""
     return zlib.crc32(f"{scene.name}/{position.number}/{number}".encode()) & HIGHEST_SEED
 
 
@@ -323,14 +325,19 @@ def score_trial(
     reason: str = "",
     uuid: UUID | str | None = None,
 ) -> Score:
-    """Add a score; of a trial that has one it is a correction, needs a reason, and counts from then on.
+    """Add a score; for a scored trial it is a correction, which needs a reason and counts from then on.
 
-    `milestones`: id -> reached, for every milestone of the scene; `times`: id -> when [s after the start of the run],
-    as far as known; a correction without `times` keeps those of the score that stood. What `failure` and
-    `failure_phase` may be says `failures.check_failure`. Disk first, then the row, then publication.
+    Written to the journal first, then to the database, then published. A repeated `uuid` (or, without one, a score
+    identical to this rater's current one) is a repetition whose answer was lost: the first score is returned.
 
-    The same `uuid` again, or without one word by word what this rater said and counts already, is the first score,
-    whose answer was lost: nothing is added. Conflict for a uuid that is another score's.
+    Args:
+        milestones: Milestone id -> reached, for every milestone of the scene.
+        times: Milestone id -> time of reaching it [s after the start of the run], if known; None in a correction
+            takes those of the current score.
+        failure, failure_phase: See `failures.check_failure`.
+
+    Raises:
+        Conflict: The uuid is that of another score, or the trial cannot be scored.
     """
     require_role(user, Role.OPERATOR)
     if source not in Score.Source.values:
@@ -383,14 +390,14 @@ def score_trial(
 
 
 def abandon_trial(*, user: User, trial: Trial, reason: str = "") -> Trial:
-    """Give up a trial that never ran; its number is given out again as another attempt."""
+    """Abandon a trial that never ran; its number is used again by another attempt."""
     require_role(user, Role.OPERATOR)
     why = clean_text("reason", reason, LONGEST_NOTE) or "abandoned"
     with transaction.atomic():
         held = lock_trial(trial)
         why = f"{why} ({user.get_username()})"
         if (held.status, held.reason) == (TrialStatus.ABANDONED, why):
-            return held  # asked for once more, because the answer was lost
+            return held  # repeated request whose answer was lost
         require_own(held, user)
         lifecycle.apply(held, Transition.ABANDON)
         held.reason = why
@@ -401,31 +408,31 @@ def abandon_trial(*, user: User, trial: Trial, reason: str = "") -> Trial:
 
 
 def request_publication(trial: Trial) -> None:
-    """Have its episode written into the dataset with what counts now."""
+    """Queue the publication of the trial's episode to the dataset with its current score."""
     if trial.episode is not None:
         request_publish(episode=trial.episode)
 
 
 def notify_settled(trial: Trial, user: Any) -> None:
-    """Tell whoever declared to hear of it."""
+    """Call the functions registered by `register_settled`."""
     for told in _settled:
         told(trial, user)
 
 
 def lock_trial(trial: Trial) -> Trial:
-    """The trial's row as it is now, kept from others until the transaction ends."""
+    """Return the trial with its row locked until the transaction ends."""
     return Trial.objects.select_for_update().get(pk=trial.pk)
 
 
 def _require_said_anew(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
-    """Conflict where it may be an earlier score that comes late: it must not take the place of what corrected it."""
+    """Raise Conflict if this equals an earlier score of the rater, as it may be a late copy of a corrected one."""
     before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
     if any(_is_same_score(score, said, found) for score in before):
         raise Conflict(_SAID_BEFORE(trial=trial.pk))
 
 
 def _require_truth(trial: Trial, found: ScoredOutcome) -> None:
-    """EvaError unless the bench of the trial says the same: nobody says more in its name."""
+    """Raise EvaError unless the ground truth agrees, because the score is recorded in its name."""
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
     for milestone, reached, _ in found.reached:
@@ -437,7 +444,7 @@ def _require_truth(trial: Trial, found: ScoredOutcome) -> None:
 
 
 def _is_same_score(score: Score, said: Mapping[str, Any], found: ScoredOutcome) -> bool:
-    """True if that score is word by word what is said now."""
+    """Return True if the score equals the given one."""
     outcomes = {outcome.milestone_id: (outcome.reached, outcome.at_s) for outcome in score.outcomes.all()}
     same = outcomes == {milestone.pk: (reached, at) for milestone, reached, at in found.reached}
     words = all(getattr(score, name) == value for name, value in said.items())
@@ -445,7 +452,7 @@ def _is_same_score(score: Score, said: Mapping[str, Any], found: ScoredOutcome) 
 
 
 def _judges_alike(score: Score | None, found: ScoredOutcome) -> bool:
-    """True if that score has the same milestones and success: what is new are words."""
+    """Return True if the score has the same milestones and success, so that only texts differ."""
     if score is None or score.success != found.success:
         return False
     said = dict(score.outcomes.values_list("milestone_id", "reached"))
@@ -455,7 +462,7 @@ def _judges_alike(score: Score | None, found: ScoredOutcome) -> bool:
 def _times_before(
     trial: Trial, milestones: Sequence[Milestone], ticks: Mapping[object, object]
 ) -> dict[object, float]:
-    """Times of the score that stands, of what is ticked still; none where the scene as it is now forbids them."""
+    """Return the times of the current score for milestones still ticked; {} if the scene now forbids them."""
     outcomes = trial.verdict.outcomes.exclude(at_s=None) if trial.verdict else ()
     known = {outcome.milestone_id: outcome.at_s for outcome in outcomes if outcome.reached}
     ticked = {str(key) for key, reached in ticks.items() if reached is True}
@@ -468,14 +475,14 @@ def _times_before(
 
 
 def require_scorable(trial: Trial, reason: str) -> None:
-    """Conflict or EvaError says why a score, a correction for that `reason`, cannot be added."""
+    """Raise Conflict or EvaError if the trial cannot be scored, or corrected for that `reason`."""
     lifecycle.require(trial, Transition.SCORE)
     if trial.status == TrialStatus.SCORED and not reason:
         raise EvaError(_SCORED_ALREADY(trial=trial.pk))
     if trial.status == TrialStatus.INTERRUPTED and _repeated(trial):
         raise Conflict(_REPEATED_SINCE(trial=trial.pk))
     other = attempts_of(trial=trial).filter(status=TrialStatus.SCORED).exclude(pk=trial.pk).first()
-    if other is not None:  # as where this one had been given up, and its run turns out to have been accepted
+    if other is not None:  # e.g. this trial was abandoned, but its run turns out to have been accepted
         raise Conflict(_ANOTHER_COUNTS(other=other.pk, trial=trial.pk))
     unrecorded = "" if trial.status == TrialStatus.SCORED else why_unrecorded(episode=trial.episode)
     if unrecorded:
@@ -483,7 +490,7 @@ def require_scorable(trial: Trial, reason: str) -> None:
 
 
 def require_own(trial: Trial, user: User) -> None:
-    """NotAllowed where what another has done is to be undone, by who has no business at the station now."""
+    """Raise NotAllowed unless the user is the trial's operator, the station's lease holder or an administrator."""
     if user.pk == trial.operator_id or role_of(user) is Role.ADMIN:
         return
     lease = lease_open(station=trial.station)
@@ -514,7 +521,7 @@ def _outcomes(score: Score, found: ScoredOutcome) -> list[MilestoneOutcome]:
 
 
 def counts_now(trial: Trial, score: Score, outcomes: Sequence[MilestoneOutcome], user: User) -> None:
-    """Keep a new score with its outcomes, which counts from then on: disk first, then the rows, then publication."""
+    """Store a new score with its outcomes, which counts from then on: journal first, then rows, then publication."""
     milestones = [OutcomeLine.written(outcome) for outcome in outcomes]
     JUDGEMENTS.append(journal_uuid(trial), ScoreLine.written(score, milestones=milestones))
     score.save()

@@ -1,6 +1,6 @@
-"""The commands of a trial: what its set-up and its run take with them, and what their answers do to it.
+"""Commands of a trial: arguments of its set-up and run, and effects of their answers on the trial.
 
-Beside them the set-up for a checkpoint without a trial.
+Includes the set-up for a checkpoint without a trial.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ def trial_command(
     uuid: UUID | str | None = None,
     args: Mapping[str, Any] | None = None,
 ) -> Command:
-    """Give a command for a trial; `setup` and `run` get their arguments from it, others keep `args`.
+    """Send a command for a trial; `setup` and `run` get their arguments from the trial, others use `args`.
 
-    Never within a transaction. An accepted run has begun: its episode has a row. Raises Conflict where the
-    trial is not prepared, or the station was last set up for something else.
+    Never call it within a transaction. After an accepted run the trial is running and its episode has a row.
+    Raises: Conflict if the trial is not prepared, or the station was last set up for something else.
     """
     require_role(user, Role.OPERATOR)
     identity = parse_command_uuid(uuid)
@@ -106,9 +106,9 @@ def trial_command(
 def checkpoint_command(
     *, user: User, checkpoint: Checkpoint, kind: str, args: Mapping[str, Any] | None = None, **given: Any
 ) -> Command:
-    """Set a station up for a checkpoint, for no trial; `given` as in `issue_command`.
+    """Set a station up for a checkpoint without a trial; `given` as in `issue_command`.
 
-    Raises EvaError for other commands.
+    Raises: EvaError for other commands.
     """
     require_role(user, Role.OPERATOR)
     if kind != "setup":
@@ -132,14 +132,14 @@ _least: list[Least] = []
 
 
 def register_min_stage_times(find: Least) -> None:
-    """`find` says how long the policy's stages of a trial's set-up last at least, None: as long as they take."""
+    """Register a function that returns least durations of set-up stages [s] for a trial, None for no minimum."""
     _least.append(find)
 
 
 def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
-    """Arguments of the station's set-up for this trial; `reset` names this laying out of a simulated bench.
+    """Return the arguments of the station's set-up for this trial; `reset` identifies this reset of a simulated bench.
 
-    It connects, warms up and asks the policy each time, also where the same checkpoint comes twice.
+    Every set-up connects, warms up and queries the policy, also if the checkpoint is the same as before.
     """
     args: dict[str, Any] = {"task": trial.instruction, **_policy_args(trial.checkpoint)}
     if trial.strategy is not None:
@@ -153,7 +153,7 @@ def setup_args(trial: Trial, reset: UUID) -> dict[str, Any]:
 
 
 def run_args(trial: Trial, user: User) -> dict[str, Any]:
-    """Facts for the episode's manifest, and when the run ends by itself; never simulated or by steps."""
+    """Return the run's arguments: manifest data and time limit; the mode is always continuous."""
     args: dict[str, Any] = {
         "trial": TrialRecord.for_manifest(trial),
         "operator": user.get_username(),
@@ -186,7 +186,7 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
 
 
 def _asked(args: Mapping[str, Any]) -> dict[str, Any]:
-    """Subject of a set-up; how long it lasts at least is drawn anew each time."""
+    """Return the arguments that identify a set-up, without the least durations, which are drawn anew each time."""
     return {key: value for key, value in args.items() if key != "least"}
 
 
@@ -223,7 +223,7 @@ def _require_prepared(trial: Trial, what: str, user: User) -> None:
 
 
 def _require_set_up(trial: Trial) -> None:
-    """Whatever the page thinks: the last set-up of the station that may have been carried out was for this trial."""
+    """Raise Conflict unless the station's last set-up that may have been carried out was for this trial."""
     last = last_set_up(station=trial.station)
     mine = Trial.objects.values_list("setup", flat=True).get(pk=trial.pk)
     if mine is None:
@@ -233,9 +233,10 @@ def _require_set_up(trial: Trial) -> None:
 
 
 def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
-    """Require that the station would run this checkpoint, whichever client, a terminal included, set it up last.
+    """Raise Conflict unless the station has this checkpoint loaded, whichever client set it up last.
 
-    What changes after this look makes the run stale, which the station refuses by itself. How long its policy took.
+    A change after this check makes the run stale, and the station refuses it.
+    Returns: Durations of the policy's set-up stages [s], None if unknown.
     """
     status = connection_to(trial.station.name).status()
     told = status.get("checkpoint") or {}
@@ -252,7 +253,7 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
 
 
 def _require_same(first: Command, trial: Trial, same: bool) -> None:
-    """A uuid that was used before brings back the answer that it had, for the trial that it was used for."""
+    """Raise Conflict if the uuid was used for another trial; a repeated one returns its first answer."""
     if not same:
         raise Conflict(_UUID_OF_ANOTHER(uuid=first.pk, first=first, trial=trial.pk))
 

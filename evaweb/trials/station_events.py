@@ -1,7 +1,7 @@
-"""Effects of a station's events on its trial: begun, paused, resumed, ended, given back, recording closed.
+"""Effects of a station's events on its trial: run started, paused, resumed, ended, not begun, recording closed.
 
-Every event may come more than once, from several web processes, and after a gap: a trial knows the number of
-the newest event that it has taken, and takes none before that again.
+Every event may arrive more than once, from several web processes, and after a gap: a trial stores the number of the
+newest event that it has processed, and ignores older ones.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ log = logging.getLogger(__name__)
 def apply_station_event(
     *, station: Station, event: Mapping[str, Any], boot: str | None = None
 ) -> Trial | None:
-    """Take one row of a station's event log; the trial that it changed, or None.
+    """Apply one row of a station's event log; return the trial that it changed, or None.
 
-    `event`: number, kind, text, time [s, the runtime's clock], data. `boot`: of the runtime that numbered it.
+    Args:
+        event: number, kind, text, time [s, the runtime's clock], data.
+        boot: Boot id of the runtime that numbered the event; None: the station's current one.
     """
     boot = boot if boot is not None else station.boot
     kind, data = event.get("kind"), event.get("data") or {}
@@ -51,9 +53,9 @@ def apply_station_event(
 
 
 def begin_run(trial: Trial, *, command: Command, episode: UUID | None) -> None:
-    """The station has accepted the command to run: at the answer, or where that was lost, at the event.
+    """Start the trial's run, which the station has accepted: on the answer or, if that was lost, on the event.
 
-    The caller holds the trial's row. Taken twice it changes nothing, nor does that of a run that never began.
+    The caller holds a lock on the trial's row. Idempotent; ignores a run whose recording could not be opened.
     """
     if Command.objects.filter(pk=command.pk).exclude(unopened="").exists():
         return
@@ -85,12 +87,12 @@ def _episode(trial: Trial, uuid: UUID) -> Episode:
         checkpoint=trial.checkpoint.name,
         operator=trial.operator.get_username(),
         kind="rollout",
-        mode="continuous",  # as run_args asks for
+        mode="continuous",  # as in run_args
     )
 
 
 def _find_trial_of(station: Station, episode: UUID | None) -> None:
-    """Bind an episode to its trial where the answer that named it was lost: the runtime is asked once more."""
+    """Assign an episode to its trial if the answer that named it was lost, by querying the runtime again."""
     if episode is None or Trial.objects.filter(episode_id=episode).exists():
         return
     trial = Trial.objects.filter(station=station, episode=None, run__isnull=False).order_by("-pk").first()
@@ -105,7 +107,7 @@ def _find_trial_of(station: Station, episode: UUID | None) -> None:
 
 
 def _begun(station: Station, event: Mapping[str, Any], boot: str) -> Trial | None:
-    """The event of an accepted `run`: from its number on the station's events are about this trial."""
+    """Apply the event of an accepted `run`: later events of the station concern this trial."""
     data = event.get("data") or {}
     before, after = (SessionState.meaning_of(str(data.get(end))) for end in ("from", "to"))
     if after is None or not after.going or (before is not None and before.going):
@@ -135,7 +137,7 @@ def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Tri
     if trial.run_event is None or event["number"] <= trial.run_event:
         return None
     move = _transition_for(state, data.get("unbegun") or {})
-    if not lifecycle.allows(trial, move):  # it is there already
+    if not lifecycle.allows(trial, move):  # already in that state
         return None
     if move is Transition.GIVE_BACK:
         _reset_to_prepared(trial, _reason(event))
@@ -147,7 +149,10 @@ def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Tri
 
 
 def _transition_for(state: str, unbegun: Mapping[str, Any]) -> Transition:
-    """A run that never began is no attempt: it is made again as it is where nothing of it was opened, else repeated."""
+    """Return the transition for a state of the station.
+
+    A run that never began is not an attempt: the trial is prepared again if no recording was opened, else repeated.
+    """
     if unbegun:
         return Transition.GIVE_BACK if unbegun.get("unopened") else Transition.INTERRUPT
     session = SessionState.meaning_of(state)
@@ -157,7 +162,7 @@ def _transition_for(state: str, unbegun: Mapping[str, Any]) -> Transition:
 
 
 def _reset_to_prepared(trial: Trial, reason: str) -> None:
-    """It is as it was before its run was asked for, and says why."""
+    """Reset the trial to its state before the run command, with the reason."""
     lifecycle.apply(trial, Transition.GIVE_BACK)
     trial.run = trial.run_event = trial.run_since = trial.episode = None
     trial.started_at = trial.duration_s = trial.ended_by = None
@@ -165,7 +170,7 @@ def _reset_to_prepared(trial: Trial, reason: str) -> None:
 
 
 def _runtime_restarted(trial: Trial) -> Trial:
-    """Its events are lost: what the recording says counts."""
+    """End the trial of an earlier boot; its events are lost, so its recording decides how."""
     episode = trial.episode
     if episode is not None and episode.status == EpisodeStatus.FINISHED and episode.frames:
         _apply_transition(trial, Transition.END, episode.reason or "ended while the web was away", None)
@@ -177,7 +182,7 @@ def _runtime_restarted(trial: Trial) -> Trial:
 
 
 def _apply_transition(trial: Trial, move: Transition, reason: str, time: float | None) -> None:
-    """Apply the move; the clock stands while the trial is paused. `time` [s] None: not known."""
+    """Apply a transition and add the running time; the clock stops during a pause. `time` [s] may be None."""
     if trial.run_since is not None and time is not None:
         trial.duration_s = (trial.duration_s or 0.0) + max(0.0, time - trial.run_since)
     lifecycle.apply(trial, move)
@@ -185,12 +190,12 @@ def _apply_transition(trial: Trial, move: Transition, reason: str, time: float |
     trial.reason = "" if move is Transition.RESUME else reason
     if move in (Transition.END, Transition.INTERRUPT):
         trial.ended_at = timezone.now()
-        # What ended the run stays, whatever becomes of its recording.
+        # The cause of the end is final, whatever happens to the recording.
         trial.ended_by = trial.ended_by or ending_of(move is Transition.INTERRUPT, reason)
 
 
 def _record_truth(station: Station, event: Mapping[str, Any]) -> Trial | None:
-    """Note the state of the simulated bench at the end of an episode."""
+    """Store the ground truth at the end of an episode."""
     data = dict(event.get("data") or {})
     trial = _lock_latest(station=station, episode_id=_uuid(data.get("episode")))
     if (
@@ -205,10 +210,10 @@ def _record_truth(station: Station, event: Mapping[str, Any]) -> Trial | None:
 
 
 def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
-    """The recording is on disk: its duration is the exact one, and what is not whole is interrupted."""
+    """Apply the closing of a recording: it has the exact duration; an incomplete one interrupts the trial."""
     data = event.get("data") or {}
     trial = _lock_latest(station=station, episode_id=_uuid(data.get("uuid")))
-    if trial is None or data.get("waits"):  # for room on the disk: it is told again when it is closed
+    if trial is None or data.get("waits"):  # waits for disk space: the event is repeated when it is closed
         return None
     if data.get("rows") == 0 and lifecycle.allows(trial, Transition.INTERRUPT):
         _apply_transition(
@@ -219,7 +224,7 @@ def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
         trial.duration_s = trial.episode.duration_s
     trial.save()
     if trial.episode is not None and trial.status in lifecycle.SCORED_STATES:
-        request_publish(episode=trial.episode)  # it was judged before its recording was on disk
+        request_publish(episode=trial.episode)  # it was scored before its recording was on disk
     return trial
 
 
@@ -232,7 +237,7 @@ def _closed_as(trial: Trial, status: str, reason: str, time: float | None) -> No
 
 
 def _lock_latest(**key: Any) -> Trial | None:
-    """The newest such trial, its row kept from others until the transaction ends."""
+    """Return the newest such trial with its row locked until the transaction ends."""
     if any(value is None for name, value in key.items() if name in ("uuid", "episode_id")):
         return None
     return Trial.objects.select_for_update().filter(**key).order_by("-pk").first()
@@ -251,6 +256,6 @@ def _time(event: Mapping[str, Any]) -> float | None:
 
 
 def _reason(event: Mapping[str, Any]) -> str:
-    """Of a command "stop by ann: accepted" the part before the colon, of a state "a -> b: why" the part after."""
+    """Return "stop by ann" of a command event "stop by ann: accepted", "why" of a state event "a -> b: why"."""
     before, _, after = str(event.get("text") or "").partition(": ")
     return before if event.get("kind") == "command" else after or before

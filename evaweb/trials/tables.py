@@ -1,4 +1,4 @@
-"""Checks tables that an administrator writes as JSON: how a policy is reached and asked, how a bench is laid out."""
+"""Validators of JSON tables written by administrators: policies, strategies, benches."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from runtime.config.schema import policy_tables, strategy_tables
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
 _PLACES = {"block": ("x", "y", "yaw in degrees"), "plate": ("x", "y")}
 _OBJECT_NAME = re.compile(r"[^\W_](?:[\w .-]{0,38}[\w.-])?")
-_SMALLEST, _LARGEST = 0.005, 1.0  # m, of an object's side
+_SMALLEST, _LARGEST = 0.005, 1.0  # side of an object [m]
 _OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
 
 
 def check_policy(given: object) -> None:
-    """ValidationError unless `given` fits on top of a deployment's [policy] table of some kind."""
+    """Raise ValidationError unless `given` can override the [policy] table of a deployment, for some kind."""
     _check_kinds(given, _kinds(), '{"url": "ws://127.0.0.1:8000"}')
 
 
 def check_strategy(given: object) -> None:
-    """ValidationError unless `given` is None, or fits on top of a deployment's [strategy] table of some kind."""
+    """Raise ValidationError unless `given` is None or can override the [strategy] table of a deployment."""
     if given is not None:
         _check_kinds(given, _strategies(), '{"kind": "rtc", "inference_rate": 5}')
 
@@ -45,7 +45,7 @@ def _check_kinds(given: object, kinds: Mapping[str, type[pydantic.BaseModel]], e
 
 
 def check_tags(given: object) -> None:
-    """ValidationError unless `given` is a list of different short words."""
+    """Raise ValidationError unless `given` is a list of distinct short words."""
     words = isinstance(given, list) and all(isinstance(tag, str) and _TAG.fullmatch(tag) for tag in given)
     if not words:
         raise ValidationError(_sentence(given, "words of at most 40 letters a to z, digits and ._:/+-"))
@@ -53,11 +53,11 @@ def check_tags(given: object) -> None:
         raise ValidationError(_sentence(given, "each tag once"))
 
 
-TRUTHS = ("grasped", "lifted", "over_plate", "placed")  # milestones that our simulated benches report
+TRUTHS = ("grasped", "lifted", "over_plate", "placed")  # milestones that the simulated bench reports
 
 
 def check_term(given: str) -> None:
-    """ValidationError where a phase or cause of failure would be taken for another one, or for none."""
+    """Raise ValidationError if a failure phase or cause could be confused with another or with "not specified"."""
     if given != given.strip():
         raise ValidationError(_sentence(given, "words without blanks around them"))
     if is_not_said(given):
@@ -67,7 +67,7 @@ def check_term(given: str) -> None:
 
 
 def check_milestones(texts: Sequence[str]) -> None:
-    """ValidationError where two milestones of a scene have the same words: in results they could not be told apart."""
+    """Raise ValidationError if two milestones of a scene have the same text: results could not distinguish them."""
     twice = next((text for text in texts if texts.count(text) > 1), None)
     if twice is not None:
         raise ValidationError(
@@ -76,10 +76,10 @@ def check_milestones(texts: Sequence[str]) -> None:
 
 
 def check_bench(given: object) -> None:
-    """ValidationError unless `given` says where things lie: "block": [x, y, yaw], "plate": [x, y].
+    """Raise ValidationError unless `given` is a layout: "block": [x, y, yaw], "plate": [x, y].
 
-    These are the simulated bench's. "objects" are those of any bench, which people lay: name -> [x, y, yaw, width,
-    depth], all but the yaw in metres.
+    These two are for simulated benches. "objects" are for benches laid out by people: name -> [x, y, yaw, width,
+    depth]; lengths in metres, yaw in degrees.
     """
     if given is None:
         return
@@ -99,7 +99,7 @@ def check_bench(given: object) -> None:
 
 
 def simulated_bench(given: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """What of a position's bench a simulated one lays by itself."""
+    """Return the part of a position's layout that a simulated bench can reset itself."""
     return None if given is None else {key: given[key] for key in _PLACES if key in given}
 
 
@@ -132,7 +132,7 @@ def _is_number(value: object) -> bool:
 
 
 def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
-    """Errors of it as a table of that kind; what is missing comes from the deployment."""
+    """Return the errors of `given` as a table of that kind; missing keys come from the deployment."""
     kind = config.model_fields["kind"].default
     try:
         config.model_validate({**given, "kind": kind})
@@ -143,7 +143,7 @@ def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
 
 
 def _matching_keys(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
-    """Number of keys that are, or nearly are, those of this kind; of two alike, the kind with more keys."""
+    """Return the number of keys that (nearly) belong to this kind, and its size to break ties."""
     near = [key for key in given if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)
 
@@ -153,13 +153,13 @@ def _problem(error: Any, config: type[pydantic.BaseModel], kind: str) -> str:
     if error["type"] == "extra_forbidden":
         table = _table(config, error["loc"][:-1])
         return f"{key}: unknown key for kind {kind!r}; allowed: {', '.join(table.model_fields)}"
-    if error["type"] == "secret":  # not shown, and not in any log
+    if error["type"] == "secret":  # keep the value out of pages and logs
         return f"{key}: {error['msg']}"
     return f"{key} = {error['input']!r:.80}: {error['msg'].removeprefix('Value error, ')}"
 
 
 def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
-    """The table within `config` to which the keys of `way` lead."""
+    """Return the nested model that the keys of `way` lead to."""
     for key in way:
         field = config.model_fields.get(str(key))
         parts = (field.annotation, *get_args(field.annotation)) if field else ()
@@ -171,7 +171,7 @@ def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type
 @cache
 def _kinds() -> dict[str, type[pydantic.BaseModel]]:
     kinds = {config.model_fields["kind"].default: config for config in policy_tables()}
-    return {kind: config for kind, config in kinds.items() if kind != "none"}  # no policy is no checkpoint
+    return {kind: config for kind, config in kinds.items() if kind != "none"}  # a checkpoint needs a policy
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Addresses of the pages of trials."""
+"""URLs of the pages of trials."""
 
 from __future__ import annotations
 

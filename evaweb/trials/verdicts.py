@@ -1,4 +1,4 @@
-"""Verdict of a rater's ticks: pure arithmetic on the milestones of a scene."""
+"""Outcome of a trial from a rater's milestones; pure functions."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ _REACHED_AFTER_S_BEFORE_ONE = Pattern(
     "{text!r} was reached after {at:g} s, before the one that comes first",
 )
 
-LONGEST_NOTE = 8000  # characters
+LONGEST_NOTE = 8000  # longest note [characters]
 LONGEST_FAILURE = 60
 LONGEST_RUN_S = 24 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
 class ScoredOutcome:
-    """Which milestones were reached and when [s], the share of their points, and whether that is a success."""
+    """Milestones with whether and when they were reached [s], the fraction of their points, and success."""
 
     reached: tuple[tuple[Milestone, bool, float | None], ...]
     score: float
@@ -80,14 +80,18 @@ def score_outcome(
     ordered: bool = False,
     fails: bool = False,
 ) -> ScoredOutcome:
-    """The verdict on one trial from `ticks`: milestone id -> reached, one for each of the scene's milestones.
+    """Return the outcome of one trial from `ticks`: milestone id -> reached, for each of the scene's milestones.
 
-    `times`: milestone id -> when it was reached [s after the start of the run], as far as that is known; one reached
-    after its time limit does not count and has to be unticked. `ordered`: none without all before it.
+    A trial is a success if all required milestones are reached. If none is required, `success` must be given.
 
-    Success is: all required milestones are reached. Where none is required it has to be given. `fails`: it is a failure
-    whatever was reached, unless somebody says otherwise. EvaError says which ids are missing or not the scene's, and
-    what contradicts itself.
+    Args:
+        times: Milestone id -> time of reaching it [s after the start of the run], if known. A milestone reached
+            after its time limit does not count and must not be ticked.
+        ordered: Whether each milestone requires all before it.
+        fails: The trial counts as a failure whatever was reached, unless `success` is given as True.
+
+    Raises:
+        EvaError: Milestones are missing or unknown, or the answers contradict each other.
     """
     answers = _answers(milestones, ticks)
     when = _times(milestones, answers, times or {})
@@ -104,7 +108,7 @@ def score_outcome(
 
 
 def reached_in_truth(truth: Mapping[str, Any], milestone: Milestone) -> bool | None:
-    """Whether a simulated bench says that it was reached in time, None where it says nothing of it."""
+    """Return whether the ground truth reports the milestone as reached in time; None if it does not cover it."""
     known = truth.get("milestones", {}).get(milestone.truth)
     at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
     late = at is not None and limit is not None and at > limit

@@ -1,4 +1,4 @@
-"""The result pages: what the trials say, and one trial with everything that is known of it."""
+"""Result pages: statistics of trials, and one trial in detail."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PER_PAGE = 50
 
 @require_GET
 def result(request: HttpRequest) -> HttpResponse:
-    """Success per scene and checkpoint, then the trials; filters and order are in the address."""
+    """Show success per scene and checkpoint, then the trials; filters and order are in the URL."""
     seen = visibility_for_request(request)
     listing = Listing(request.GET, _columns(seen), _filters(seen))
     filters = TrialFilters(**listing.chosen)
@@ -38,7 +38,9 @@ def result(request: HttpRequest) -> HttpResponse:
     except EvaError as fault:
         listing.refuse(fault)
         filters = TrialFilters()
-    rows = selectors.statistics(replace(filters, status=""), seen)  # which is about the list of trials
+    rows = selectors.statistics(
+        replace(filters, status=""), seen
+    )  # the status filters only the list of trials
     context = {
         "figures": scene_figures(rows),
         "page": listing.page(selectors.trial_list(filters, seen), PER_PAGE),
@@ -50,13 +52,13 @@ def result(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def trial(request: HttpRequest, id: int) -> HttpResponse:
-    """One trial."""
+    """Show one trial."""
     return _trial_page(request, id)
 
 
 @require_POST
 def score(request: HttpRequest, id: int) -> HttpResponse:
-    """Score it, or correct its score; what was typed stays where that cannot be done."""
+    """Score a trial or correct its score; on an error the form keeps the typed values."""
     found = selectors.trial_get(id=id)
     ticked = set(request.POST.getlist("milestone"))
     milestones = {key: str(key) in ticked for key in found.scene.milestones.values_list("pk", flat=True)}
@@ -78,7 +80,7 @@ def score(request: HttpRequest, id: int) -> HttpResponse:
 
 @require_POST
 def void(request: HttpRequest, id: int) -> HttpResponse:
-    """Take it out of the count."""
+    """Void a trial."""
     reason = request.POST.get("void_reason", "")
     try:
         voids.void_trial(
@@ -93,7 +95,7 @@ def void(request: HttpRequest, id: int) -> HttpResponse:
 
 @require_POST
 def void_answer(request: HttpRequest, id: int) -> HttpResponse:
-    """Agree to its void, or refuse it."""
+    """Agree to a void request, or refuse it."""
     try:
         voids.answer_void(
             user=request.user,  # type: ignore[arg-type]
@@ -107,7 +109,7 @@ def void_answer(request: HttpRequest, id: int) -> HttpResponse:
 
 
 def _truth(trial: Trial) -> list[tuple[str, Any]]:
-    """What the simulated bench says of its milestones; a blind trial's operator scores before hearing it."""
+    """Return the milestones in the ground truth; hidden from a blind trial's operator before scoring."""
     return sorted((trial.truth or {}).get("milestones", {}).items())
 
 
@@ -137,7 +139,7 @@ def _trial_page(
         "void_requests": list(found.void_requests.all()),
         "may_answer": operator and voids.can_answer_void(found, request.user),
         "attempts": selectors.attempts_of(trial=found),
-        # When a set-up was asked for and the run could begin tells how long a policy warms up.
+        # Times of set-up and run would reveal how long a policy warms up.
         "commands": () if hidden else selectors.commands_of(trial=found),
         "hidden": hidden,
         "laid_out": bench_images(found),
@@ -145,13 +147,13 @@ def _trial_page(
         "fault": fault,
         "typed": typed,
         "failures": failures.failure_choices(typed),
-        "uuid": uuid4(),  # of the score that may be sent from this page, and then be sent again
+        "uuid": uuid4(),  # uuid of this page's score, so that sending it again is recognised
     }
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
 
 
 def _words_alone(trial: Trial, user: Any) -> str:
-    """Why this user may correct words of its score and not its verdict; "" where they may do both."""
+    """Return why this user may correct only texts of the score; "" if they may also change its outcome."""
     try:
         services.require_own(trial, user)
     except NotAllowed as refused:
@@ -160,7 +162,7 @@ def _words_alone(trial: Trial, user: Any) -> str:
 
 
 def bench_images(trial: Trial) -> list[Any]:
-    """Pictures of the cameras before the run, the newest look at each; bound to trials by evaweb.plans."""
+    """Return the newest camera images before the run, one per camera; evaweb.plans attaches them to trials."""
     newest: dict[str, Any] = {}
     for row in trial.achieved.select_related("reference", "by").order_by("pk"):
         newest[row.camera] = row
@@ -168,7 +170,7 @@ def bench_images(trial: Trial) -> list[Any]:
 
 
 def _is_checked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
-    """True if its box is ticked: as it was typed, else as it was last scored."""
+    """Whether the milestone's box is ticked: as typed, else as last scored."""
     if typed and "milestones" in typed:
         return bool(typed["milestones"].get(milestone))
     outcomes = trial.scores.all()[0].outcomes.all() if trial.verdict_id else ()
@@ -176,7 +178,7 @@ def _is_checked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -
 
 
 def _as_scored(trial: Trial) -> dict[str, Any]:
-    """A correction begins with what was said before."""
+    """Return the current score as initial form values of a correction."""
     verdict = trial.verdict
     if verdict is None:
         return {}
@@ -185,7 +187,7 @@ def _as_scored(trial: Trial) -> dict[str, Any]:
 
 
 def _filters(sight: Visibility) -> list[Filter]:
-    """What the list of trials is narrowed by; TrialFilters says what it does not know."""
+    """Return the filters of the list of trials; TrialFilters reports unknown values."""
     scenes = selectors.scene_list(all_of_them=True).prefetch_related(None)
     checkpoints = selectors.checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None)
     evaluations = [(str(row.pk), str(row)) for row in selectors.evaluation_list()]
@@ -205,7 +207,7 @@ def _filters(sight: Visibility) -> list[Filter]:
 
 
 def _columns(sight: Visibility) -> list[Column]:
-    """By checkpoint it is sorted only where none is hidden: the order of codes would tell which are of one."""
+    """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
     return [
         Column("trial", "Trial", ("pk",), down=True),
         Column("prepared", "Prepared", ("prepared_at",), down=True),

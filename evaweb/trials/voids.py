@@ -1,8 +1,8 @@
-"""Trials taken out of the count; of a blind plan, where a trial has a score, by two operators.
+"""Voiding of trials; in a blind plan, a scored trial needs two operators.
 
-Whoever knows how a trial was scored can choose by it. So the first operator asks, the trial is repeated meanwhile, and
-a second one who is as blind agrees or refuses. What is not answered in time is not voided: the trial counts again, and
-its repetition does not.
+An operator who knows a trial's score could select by it. So the first operator requests the void, the trial is repeated
+meanwhile, and a second, equally blind operator agrees or refuses. A request that is not answered in time lapses: the
+trial counts again, and its repetition does not.
 """
 
 from __future__ import annotations
@@ -58,25 +58,25 @@ _rules: list[Callable[[Trial], bool]] = []
 
 
 def register_two_person_rule(rule: Callable[[Trial], bool]) -> None:
-    """`rule` says of a trial that has a score whether two operators have to agree that it is voided."""
+    """Register a rule that returns whether voiding a scored trial needs a second operator."""
     _rules.append(rule)
 
 
 def needs_two_people(trial: Trial) -> bool:
-    """Whether two operators have to agree that the trial is voided."""
+    """Whether voiding the trial needs the agreement of a second operator."""
     return trial.verdict_id is not None and any(rule(trial) for rule in _rules)
 
 
 def can_answer_void(trial: Trial, user: User) -> bool:
-    """Whether a void of the trial was asked for, which this user may answer."""
+    """Whether the trial has an open void request that this user may answer."""
     asked = trial.void_requests.filter(answer="").first()
     return asked is not None and _why_not(asked, user) is None
 
 
 def void_trial(*, user: User, trial: Trial, reason: str) -> Trial:
-    """Take a trial out of the count, or ask for it where a second operator has to agree.
+    """Void a trial, or request it if a second operator has to agree.
 
-    Void is not fail: the trial stays in the record with its reason, and is repeated.
+    A void is not a failure: the trial stays in the record with the reason, and is repeated.
     """
     require_role(user, Role.OPERATOR)
     why = require_reason(reason, "a trial is voided")
@@ -97,7 +97,7 @@ def void_trial(*, user: User, trial: Trial, reason: str) -> Trial:
 
 
 def answer_void(*, user: User, trial: Trial, agree: bool, reason: str = "") -> Trial:
-    """Agree to a void that another operator asked for, or refuse it with a reason."""
+    """Agree to another operator's void request, or refuse it with a reason."""
     require_role(user, Role.OPERATOR)
     why = reason if agree and not reason.strip() else require_reason(reason, "a void is refused")
     with transaction.atomic():
@@ -120,14 +120,14 @@ def answer_void(*, user: User, trial: Trial, agree: bool, reason: str = "") -> T
 
 
 def open_void_requests(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
-    """What nobody has answered yet, the oldest first."""
+    """Return the unanswered void requests of these trials, oldest first."""
     return VoidRequest.objects.filter(trial__in=trials, answer="").select_related("trial__handout", "by")
 
 
 def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
-    """Have those of `trials` count again whose void nobody has answered in time; with `now` all of them.
+    """Restore trials whose void request was not answered in time, or all with `now`; call within a transaction.
 
-    One whose repetition is under way waits for its end. Within a transaction.
+    Those with an open repetition wait for its end.
     """
     asked = open_void_requests(trials)
     if not now:
@@ -136,13 +136,13 @@ def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = Fals
         held = lock_trial(each.trial)
         each.refresh_from_db(fields=("answer",))
         if each.answer:
-            continue  # with one before it, whose repetition this trial is
+            continue  # answered in this loop with the trial that this one repeats
         if not _repetitions(held).filter(status__in=lifecycle.OPEN_STATES).exists():
             _restore_counting(held, each, VoidRequest.Answer.LAPSED, user, "")
 
 
 def _why_not(asked: VoidRequest, user: User) -> EvaError | None:
-    """Why this user cannot answer it; None where they can."""
+    """Return the error for a user who may not answer the request; None if they may."""
     if asked.by_id == user.pk:
         return NotAllowed(_ASKED_BY_YOU(trial_id=asked.trial_id))
     if asked.at + ANSWERED_WITHIN < timezone.now():
@@ -178,7 +178,7 @@ def _void(held: Trial, by: User, why: str) -> None:
 
 
 def _restore_counting(held: Trial, asked: VoidRequest, answer: str, user: User, why: str) -> None:
-    """The trial counts again; what was made in its place does not."""
+    """Make the trial count again and void its repetitions."""
     for other in _repetitions(held):
         if other.status in lifecycle.OPEN_STATES:
             raise Conflict(
@@ -201,7 +201,7 @@ def _repetitions(trial: Trial) -> QuerySet[Trial]:
 
 
 def _already_requested(held: Trial, user: Any, why: str) -> bool:
-    """Asked for once more, because the answer was lost."""
+    """Return True if this repeats a request whose answer was lost."""
     if held.status == TrialStatus.VOID_ASKED:
         return held.void_requests.filter(answer="", by=user, reason=why).exists()
     return (held.status, held.reason, held.voided_by_id) == (TrialStatus.VOIDED, why, user.pk)

@@ -1,4 +1,4 @@
-"""Formats of times on the Collect page."""
+"""Template filters for times on the Collect page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _MINUTE = 60
 
 @register.filter
 def left(seconds: float | str | None) -> str:
-    """Time left, roughly as a person would say it; templates say "" for what is not known."""
+    """Return the remaining time, rounded, as text; templates pass "" if it is unknown."""
     if not isinstance(seconds, float | int):
         return "time left not known yet"
     if seconds < 1:
@@ -22,5 +22,5 @@ def left(seconds: float | str | None) -> str:
 
 @register.filter
 def lasting(seconds: float | str | None) -> str:
-    """Seconds with one decimal; a dash where they are not known."""
+    """Return seconds with one decimal; a dash if unknown."""
     return f"{seconds:.1f} s" if isinstance(seconds, float | int) else "–"

@@ -1,4 +1,4 @@
-"""Formats of numbers on the result pages."""
+"""Template filters and tags for numbers on the result pages."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ register = template.Library()
 
 @register.filter
 def percent(share: float | str | None) -> str:
-    """A share as whole percent; a dash where it is not known (templates say "" for that)."""
+    """Return a fraction as whole percent; a dash if it is unknown (templates pass "" then)."""
     return figures.format_percent(share) if isinstance(share, float | int) else "–"
 
 
 @register.filter
 def seconds(value: float | str | None) -> str:
-    """Seconds with one decimal and the unit; a dash where they are not known."""
+    """Return a duration in seconds with one decimal and unit; a dash if it is unknown."""
     return f"{value:.1f} s" if isinstance(value, float | int) else "–"
 
 
@@ -33,7 +33,7 @@ _LABELS = {"failure_phase": "Phase", "failure": "Cause"}
 
 @register.simple_tag(takes_context=True)
 def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
-    """Those of the filters `names` that the address applies: `words`, and the address's query `without` each."""
+    """Return the active filters among `names`: text `words`, and the query string `without` each."""
     given = context["request"].GET
     chips = []
     for name in names.split():
@@ -51,19 +51,19 @@ def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
 
 @register.filter
 def interval(found: Proportion) -> str:
-    """The ends of the interval in whole percent."""
+    """Return the ends of the interval in whole percent."""
     return figures.format_interval(found)
 
 
 @register.filter
 def averaged(found: Average | None, of: int) -> str:
-    """A mean with its interval and of how many; a dash where there is none."""
+    """Return a mean with its interval and count; a dash if there is none."""
     return figures.average_words(found, of) or "–"
 
 
 @register.filter
 def control_figures(control: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Timing figures of the control loop: label, and value with its unit; those that the episode has."""
+    """Return the timing figures of the control loop that the episode has: label, and value with unit."""
     found = ((label, unit, control.get(key)) for key, (label, unit) in _CONTROL.items())
     return [(label, f"{_short(value)} {unit}".strip()) for label, unit, value in found if value is not None]
 
@@ -86,23 +86,23 @@ def _short(value: Any) -> str:
 
 @register.filter
 def spaced(name: str) -> str:
-    """A name of the code in words: over_plate, over plate."""
+    """Return a code name with spaces: over_plate becomes "over plate"."""
     return name.replace("_", " ")
 
 
 @register.filter
 def words(text: str) -> list[str]:
-    """The words of a text."""
+    """Return the words of a text."""
     return text.split()
 
 
 @register.filter
 def tone(status: str) -> str:
-    """The colour of a trial's status, by the name the style sheets have for it."""
+    """Return the style sheets' colour name for a trial status."""
     return TrialStatus(status).tone
 
 
 @register.filter
 def what_next(status: str) -> str:
-    """Advice to a person on a trial in this status."""
+    """Return advice to the user on a trial in this status."""
     return advice(status)

@@ -1,4 +1,4 @@
-"""manage.py dataset: what is done to the lab's datasets, at once and here; the database follows."""
+"""manage.py dataset: operations on the lab's datasets, executed at once in this process."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ONLY_LOOK = ("list", "check", "push")
 
 
 class Command(BaseCommand):
-    """Names are those of the pages: cups is DATA/datasets/cups. A path that begins with / or . is taken as it is."""
+    """Names are those of the pages: cups is DATA/datasets/cups. A path that starts with / or . is used as given."""
 
     help = "Publishes, imports, converts, merges, splits, prunes, repairs, checks, lists and pushes datasets."
 
@@ -120,7 +120,7 @@ def _state(checked: dataset_jobs.LatestCheck) -> str:
 
 
 def _folder(given: str) -> Path:
-    """The folder that a name means."""
+    """Return the folder of a dataset name or path."""
     if given.startswith(("/", ".")):
         return Path(given)
     try:

@@ -1,4 +1,4 @@
-"""manage.py reconcile: reads the data folder into the database."""
+"""manage.py reconcile: synchronises the database with the data folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaweb.episodes.reconcile import reconcile
 
 
 class Command(BaseCommand):
-    """Can be run at any time, also while everything is running; a second run changes nothing."""
+    """Can be run at any time, also while everything is running; idempotent."""
 
     help = "Makes the database say what the data folder holds: episodes, datasets, scores."
 

@@ -1,4 +1,4 @@
-"""manage.py worker: does the jobs of some queues until it is told to end."""
+"""manage.py worker: executes the jobs of some queues until it is stopped."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from evaweb.jobs.workers import queue_names
 
 
 class Command(BaseCommand):
-    """One process, one job at a time, at the lowest priority."""
+    """Worker process: one job at a time, at the lowest priority."""
 
-    requires_system_checks = (Tags.security, Tags.compatibility)  # those of addresses load every page
+    requires_system_checks = (Tags.security, Tags.compatibility)  # the URL checks would import every page
     help = "Does the jobs that wait: previews and datasets of finished episodes."
 
     def add_arguments(self, parser: CommandParser) -> None:

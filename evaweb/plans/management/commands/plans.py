@@ -1,4 +1,4 @@
-"""manage.py plans: scenes, checkpoints and plans as files."""
+"""manage.py plans: import and export of scenes, checkpoints and plans."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from evaweb.trials.models import Checkpoint, Scene
 
 
 class Command(BaseCommand):
-    """`import FILE --user NAME` takes a file, `export [NAME ...] [--archive FILE.zip]` writes one."""
+    """`import FILE --user NAME` imports a file, `export [NAME ...] [--archive FILE.zip]` writes one."""
 
     help = (
         "Imports and exports scenes, checkpoints and plans as TOML, or with reference pictures as an archive."

@@ -1,4 +1,4 @@
-"""manage.py gate: where stations on other computers connect."""
+"""manage.py gate: entrance for stations on other computers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 
 class Command(BaseCommand):
-    """Makes stations on other computers look to the web like those of this one."""
+    """Connects stations on other computers, so that the web uses them like local ones."""
 
-    requires_system_checks = (Tags.security, Tags.compatibility)  # those of addresses load every page
+    requires_system_checks = (Tags.security, Tags.compatibility)  # the URL checks would import every page
     help = "Lets stations on other computers connect, until it is told to end."
 
     def add_arguments(self, parser: CommandParser) -> None:
@@ -32,7 +32,7 @@ class Command(BaseCommand):
     def handle(
         self, *args: Any, host: str, port: int, second_port: int | None, lifeline: bool, **options: Any
     ) -> None:
-        from evaweb.episodes.arriving import owner_of  # not before models are there
+        from evaweb.episodes.arriving import owner_of  # imports models, which need loaded apps
         from evaweb.stations import gate
 
         if second_port is None:
