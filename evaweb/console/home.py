@@ -136,7 +136,7 @@ def alarms() -> Iterator[Item]:
             )
         elif (
             stands.get("tone") == "danger"
-        ):  # the cause may reveal the checkpoint: only the station's own page shows it
+        ):  # its cause may reveal the checkpoint: only the station's page shows it
             words = f"{station} is {stands['label']}"
             yield Item(words, reverse("station-eval", args=[station.name]), "Its page", grave=True)
         if lost := _cameras_lost(feed.state) if feed.link.ok else "":
