@@ -1,4 +1,4 @@
-"""`python -m benchmarks NAME [--json [FILE]]`: measure, print a table, write JSON, or print that alone."""
+"""`python -m benchmarks NAME [--json [FILE]]`: measure, print a table, and write or print JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SECONDS = 20.0
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Exit code 0 where every wanted figure holds, 1 where one does not."""
+    """Run a benchmark; return 0 if every figure with a requirement meets it, else 1."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("name", choices=_BENCHMARKS)
     parser.add_argument(

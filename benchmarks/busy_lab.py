@@ -1,7 +1,7 @@
-"""A lab for measurements: `python -m benchmarks.busy_lab READY_FILE --set KEY=VALUE ...`; ends with Ctrl-C.
+"""Lab for measurements: `python -m benchmarks.busy_lab READY_FILE --set KEY=VALUE ...`; ends with Ctrl-C.
 
-The tabletop bench with three cameras of 640x480 at 30 Hz, a policy whose gesture never ends, web and worker; all
-processes are those of every lab. The data lie in EVA_DATA_DIR.
+Tabletop bench with three cameras of 640x480 at 30 Hz, a policy whose motion never ends, web and worker, with the
+processes of any lab. Data are in EVA_DATA_DIR.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from robots.broken_pipe import exit_on_broken_pipe
 ROBOT = "agilex_piper"
 _ROOT = Path(__file__).parents[1]
 _POLICY = ("--robot", ROBOT, "--port", "0", "--latency-ms", "80")
-# A machine that stalls must not end the run that measures how it stalls: what is late is only late here.
+# Tolerant limits: a machine that stalls must not end the run that measures the stall.
 PATIENT = (
     "safety.joint_age_s=10.0",
     "safety.picture_age_s=10.0",
@@ -35,7 +35,7 @@ PATIENT = (
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Stay up until a signal comes."""
+    """Run the lab until a signal."""
     import django
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -51,7 +51,7 @@ def main() -> int:
         with open_lab("127.0.0.1", 0) as lab:
             _up(lab, given)
             lab.watch()
-    except StopRequested:  # as it should
+    except StopRequested:  # the normal end
         return 0
     return 1
 

@@ -1,9 +1,10 @@
-"""A lab whose processes are killed while trials are run and scored at it: what it acknowledged is counted at the end.
+"""Lab whose processes are killed while trials are run and scored; at the end everything that it acknowledged is
+counted.
 
-Lab and one station with a simulated robot are linked over loopback, each with a data folder of its own. By seed a
-process of either is killed (SIGKILL), or the link is stopped for some seconds (SIGSTOP), which stands for one that is
-cut. Not killed: the lab's and the station's supervisors, who restart the rest, and the simulated robot and policy. A
-station that loses a sixth process within a minute ends for good: four of its processes are killed in one at the most.
+Lab and one station with a simulated robot are connected over loopback, each with its own data folder. Depending on the
+seed, processes of either are killed (SIGKILL), or the link is stopped for seconds (SIGSTOP), as if it were cut. Never
+killed are the supervisors of lab and station, which restart the others, and the simulated robot and policy. A station
+whose processes end six times within a minute ends for good, so at most four are killed per minute.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ SECONDS = 600.0
 _PAUSE_S = (3.0, 9.0)  # between two kills
 _STOPPED_S = (1.0, 4.0)
 _RUN_S = (1.0, 6.0)
-_MOST_OF_STATION = 4  # killed in a minute
+_MOST_OF_STATION = 4  # kills per minute
 _AGAIN_S = 0.3
 _PATIENCE_S = 90.0
 _REST_S = 180.0
@@ -50,7 +51,7 @@ _OF_STATION = ("control", "coordinator", "reception", "media", "guard", "link")
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """What was acknowledged with a 2xx: `prepare`, `run` with its episode, or `score` with its uuid."""
+    """Request acknowledged with 2xx: `prepare`, `run` with its episode, or `score` with its uuid."""
 
     kind: str
     trial: int
@@ -60,23 +61,23 @@ class Act:
 
 @dataclass(slots=True)
 class Found:
-    """What database and data folders hold at the end."""
+    """Contents of database and data folders at the end."""
 
     trials: dict[int, str] = field(default_factory=dict)  # status
     scores: list[tuple[int, str]] = field(default_factory=list)  # trial, uuid
-    rows: set[str] = field(default_factory=set)  # of episodes
+    rows: set[str] = field(default_factory=set)  # episodes
     trial_episodes: list[str] = field(default_factory=list)
-    folders: set[str] = field(default_factory=set)  # of episodes, at the lab, with an outcome
-    at_home: set[str] = field(default_factory=set)  # at the station
-    unopened: set[str] = field(default_factory=set)  # runs of which the lab says that they never began
-    refusing: list[str] = field(default_factory=list)  # stations that take no new trial
+    folders: set[str] = field(default_factory=set)  # episodes with an outcome at the lab
+    at_home: set[str] = field(default_factory=set)  # episodes at the station
+    unopened: set[str] = field(default_factory=set)  # runs that never began according to the lab
+    refusing: list[str] = field(default_factory=list)  # stations that refuse new trials
 
 
 _OVER = ("scored", "voided", "abandoned")
 
 
 def counted(acts: Iterable[Act], found: Found) -> dict[str, list[str]]:
-    """What is wrong, by the name of its figure: each thing lost, there twice, or stuck."""
+    """Return the faults by figure: everything lost, duplicated or stuck."""
     acts = list(acts)
     runs = {act.episode: act for act in acts if act.kind == "run" and act.uuid not in found.unopened}
     scores = {act.uuid for act in acts if act.kind == "score"}
@@ -100,14 +101,14 @@ def counted(acts: Iterable[Act], found: Found) -> dict[str, list[str]]:
 
 
 class _Operator(threading.Thread):
-    """Prepares, runs, ends and scores one trial after the other over REST, and keeps what was acknowledged."""
+    """Thread that prepares, runs, ends and scores trials over REST, and records what was acknowledged."""
 
     def __init__(self, running: RunningLab, chance: random.Random) -> None:
         super().__init__(daemon=True)
         self.acts: list[Act] = []
-        self.said: Counter[str] = Counter()  # refusals and lost answers
+        self.said: Counter[str] = Counter()  # refusals and missing answers
         self.over = threading.Event()
-        self.voided = 0  # at rest, because no score was taken
+        self.voided = 0  # at the end, because scores were refused
         self._visitor = RestClient(running.visitor.url)
         self._password = running.announced["passwords"]["operator"]
         self._chance, self._page, self._logged_in = chance, uuid4().hex, False
@@ -117,16 +118,18 @@ class _Operator(threading.Thread):
             self.once()
 
     def once(self) -> bool:
-        """One trial, or whatever is open, to its end; True where it came to one."""
+        """Run one trial, or finish the open one; return True if it was completed."""
         try:
             return self._trial()
-        except DemoFailed as fault:  # refused, or no answer came for long: as a person, look anew
+        except (
+            DemoFailed
+        ) as fault:  # refused, or unanswered for long: start again from the current state, as a person would
             self.said[str(fault)[:160]] += 1
             time.sleep(_AGAIN_S)
             return False
 
     def leave_none(self, number: int) -> str:
-        """Score a trial that was left behind, or void it where that is refused; "" or why neither could be done."""
+        """Score a trial that was left open, or void it; return "" or why neither was possible."""
         try:
             self._end(number)
             return ""
@@ -143,7 +146,7 @@ class _Operator(threading.Thread):
         opened = self._look()["trial"]
         number = int(opened["id"] if opened else self._prepare()["id"])
         if not opened or opened["status"] == "prepared":
-            self._act(Act("prepare", number))  # also where the answer was lost: the page shows it
+            self._act(Act("prepare", number))  # also if the answer was lost: a page would show the trial
             self._command("setup", number)
             self._state("ready", "idle", "faulted")
             self._begin(number)
@@ -196,7 +199,7 @@ class _Operator(threading.Thread):
             self.acts.append(act)
 
     def _ask(self, verb: str, *given: Any, again: bool = True) -> Mapping[str, Any]:
-        """The answer; where none came, or it says that the outcome is not known (504), the same once more."""
+        """Return the answer; requests without an answer, or with unknown outcome (504), are repeated."""
         until = time.monotonic() + _PATIENCE_S
         while True:
             try:
@@ -211,7 +214,7 @@ class _Operator(threading.Thread):
                 if not (unknown and again) or time.monotonic() > until:
                     raise
                 self.said["no answer: the same again"] += 1
-            except OSError as fault:  # the connection broke where urllib does not wrap it
+            except OSError as fault:  # broken connections that urllib does not wrap
                 if not again or time.monotonic() > until:
                     raise NoReply(str(fault)) from None
                 self.said["no answer: the same again"] += 1
@@ -219,7 +222,7 @@ class _Operator(threading.Thread):
 
 
 def _name(process: psutil.Process) -> str:
-    """Which of ours it is, "" for none."""
+    """Return the name of a process of lab or station, "" for others."""
     words = process.cmdline()
     found = [name for name in _OF_LAB if any(one.endswith("manage.py") for one in words) and name in words]
     found += [name for name in _OF_STATION if f"runtime.processes.{name}.process" in words]
@@ -228,7 +231,7 @@ def _name(process: psutil.Process) -> str:
 
 
 def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
-    """Those that are there now, by name; the first of each."""
+    """Return the current processes by name, the first of each."""
     found: dict[str, psutil.Process] = {}
     for parent in parents:
         for child in parent.children(recursive=False):
@@ -241,7 +244,7 @@ def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
 
 
 def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Random) -> Counter[str]:
-    """Kill and stop until the time is over; how often what."""
+    """Kill and stop processes for `seconds`; return the counts by name."""
     done: Counter[str] = Counter()
     of_station: list[float] = []
     until = time.monotonic() + seconds
@@ -267,7 +270,9 @@ def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Ra
 
 
 def measure(seconds: float, seed: int | None = None) -> Report:
-    """`lost_episodes`, `lost_scores`, `lost_trials`, `doubled`, `stuck_trials`, `lost_after_delete` after `seconds`."""
+    """Measure `lost_episodes`, `lost_scores`, `lost_trials`, `doubled`, `stuck_trials`, `lost_after_delete`
+    after `seconds`.
+    """
     seed = secrets.randbelow(2**31) if seed is None else seed
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory(prefix="chaos") as name:
@@ -312,7 +317,7 @@ def measure(seconds: float, seed: int | None = None) -> Report:
 
 
 def _rows(policy: str) -> None:
-    """Scene and checkpoint of the trials."""
+    """Create scene and checkpoint of the trials."""
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     import django
 
@@ -324,7 +329,7 @@ def _rows(policy: str) -> None:
 
 
 def _at_rest(operator: _Operator, robot: Path, data: Path) -> Found:
-    """One more trial, which shows that the station takes one; wait for what travels, end what was left, reconcile."""
+    """Run one more trial, wait for transfers, finish what was left, reconcile, and return the contents."""
     from evaweb.stations.models import Command
     from evaweb.trials.models import Score, Trial
 

@@ -1,7 +1,7 @@
-"""How many stations, and how many pages on one of them, a lab bears: twice as many each time, until one is too late.
+"""Number of stations, and of pages on one of them, that a lab supports: doubled until an answer is too late.
 
-Everything is on this machine: the lab, each station with a simulated robot of its own, the pages. What is full there
-at the rung that fails was not necessarily the lab.
+Everything is on this machine: the lab, stations with simulated robots, pages. The bottleneck at the failing step need
+not be the lab.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from benchmarks.estop_presses import OpenPage
 from benchmarks.labs import RunningLab, machine_used, named, watch
 from benchmarks.report import Figure
 
-RUNGS = (1, 2, 4, 8, 16, 32)  # stations
+RUNGS = (1, 2, 4, 8, 16, 32)  # numbers of stations
 MOST_STATIONS = RUNGS[-1]
 _MOST_VIEWERS = 640
 _ESTOP_MS, _VIEWER_MS = 200.0, 250.0
-_FULL = 90.0  # percent of a core
+_FULL = 90.0  # [% of a core]
 _PAUSE_S = 0.05  # between two presses
-_STATION_BYTES = 500e6  # that one more takes, with its robot
+_STATION_BYTES = 500e6  # memory per additional station, with its robot
 
 
 @dataclass(frozen=True, slots=True)
 class _Rung:
-    """So many stations or pages, what presses and pages waited for, and what the processors did."""
+    """Step with a number of stations or pages: delays of presses and pages, and processor load."""
 
     count: int
     estop_p99_ms: float
     viewer_p99_ms: float
     machine_percent: float
-    fullest: str  # the process that took most of a core, and how much
+    fullest: str  # process with the highest load of a core
     fullest_percent: float
 
     @property
     def holds(self) -> bool:
-        """True if neither is too late."""
+        """True if both delays are within their limits."""
         return self.estop_p99_ms <= _ESTOP_MS and self.viewer_p99_ms <= _VIEWER_MS
 
     @property
     def saturated(self) -> str:
-        """What was late, and what was full."""
+        """What was too late, and which resource was saturated."""
         late = "presses" if self.estop_p99_ms > _ESTOP_MS else "pages"
         if self.machine_percent >= _FULL * (psutil.cpu_count() or 1):
             return (
@@ -57,7 +57,7 @@ class _Rung:
         return f"{late}, with no processor full"
 
     def row(self, what: str) -> dict[str, Any]:
-        """For the report."""
+        """Return the row of the report."""
         return {
             what: self.count,
             **{name: getattr(self, name) for name in self.__slots__ if name != "count"},
@@ -67,9 +67,9 @@ class _Rung:
 def stations(
     running: RunningLab, add: Callable[[str], None], names: list[str], seconds: float
 ) -> tuple[list[Figure], list[Mapping[str, Any]]]:
-    """`stations_max`: presses go round all of them, each has one page open; the first of `names` is up already.
+    """Measure `stations_max`: presses alternate between the stations, each of which has one open page.
 
-    `add` brings up one more.
+    The first of `names` is running already; `add` starts one more.
     """
     rungs: list[Any] = []
     up = 1
@@ -86,7 +86,7 @@ def stations(
 
 
 def viewers(running: RunningLab, name: str, seconds: float) -> tuple[list[Figure], list[Mapping[str, Any]]]:
-    """`viewers_max`: so many pages draw one station, which is pressed meanwhile."""
+    """Measure `viewers_max`: a growing number of pages shows one station, which is pressed meanwhile."""
     rungs, count = [], 10
     while count <= _MOST_VIEWERS:
         rungs.append(_rung(running, [name], count, count, seconds))
@@ -105,7 +105,7 @@ def _told(what: str, rungs: list[_Rung], otherwise: str) -> tuple[list[Figure], 
 
 
 def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds: float) -> _Rung:
-    """`pages` on each of `names` for so long, and presses round and round; then what became of them."""
+    """Open `pages` on each of `names` for `seconds`, press in turn, and return the measured step."""
     watching = [watch(running.visitor, seconds, station=name, reading=pages) for name in names]
     open_pages = [OpenPage(running.visitor, running.announced["stops"], name) for name in names]
     taken: list[float] = []
@@ -132,12 +132,12 @@ def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds
 
 
 def _used() -> dict[str, float]:
-    """Processor time of every process by its name and number [s]; that of the whole machine under ""."""
+    """Return the processor time of every process by name and id [s]; that of the whole machine under ""."""
     found: dict[str, float] = {}
     for process in psutil.process_iter():
         try:
             name, times = named(process.cmdline()), process.cpu_times()
-        except psutil.Error:  # it has ended, or nobody may ask
+        except psutil.Error:  # it has ended, or access is denied
             continue
         found[f"{name} {process.pid}"] = times.user + times.system
     found[""] = machine_used()

@@ -1,4 +1,4 @@
-"""A station in lockstep at the simulated conveyor: node, transport and policy in this process, without sockets."""
+"""Station in lockstep at the simulated conveyor: node, transport and policy in this process, without sockets."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from runtime.station.checks import check_deployment
 
 HORIZON = 50  # rows of a chunk
 _WIDTH, _HEIGHT = 320, 240
-_KEPT = 4  # frames of which a picture can still be drawn
+_KEPT = 4  # frames whose image can still be rendered
 
 
 @cache
 def _renderer(robot: str) -> Renderer:
-    """Draws the overhead camera's pictures of the conveyor; the same for every station of this process."""
+    """Return the renderer of the overhead camera, shared by all stations of this process."""
     made = robots.load_robot(robot)
     above = tuple(camera for camera in made.cameras if camera_arm(made, camera) is None)
     return Renderer(replace(made, cameras=above), CONVEYOR, _WIDTH, _HEIGHT)
@@ -45,13 +45,13 @@ def _renderer(robot: str) -> Renderer:
 
 @cache
 def _places(robot: str) -> PlaceMap:
-    """Joints of a robot for the places of the belt; the same for every station of this process."""
+    """Return the joints of a robot for positions of the belt, shared by all stations of this process."""
     assert CONVEYOR.belt is not None
     return PlaceMap(robots.load_robot(robot), CONVEYOR.belt)
 
 
 class DeferredPicturesEnvironment(Environment):
-    """The conveyor, with a stamp for each picture: the number of its frame, of which `render` draws the picture."""
+    """Conveyor environment whose images are stamps with the frame number; `render` draws the image on demand."""
 
     def __init__(self, robot: Robot, conveyor: Conveyor) -> None:
         self.conveyor = conveyor
@@ -60,11 +60,11 @@ class DeferredPicturesEnvironment(Environment):
         self._frames: OrderedDict[int, tuple[Float64, BenchState]] = OrderedDict()
 
     def move(self, plant: Plant, seconds: float) -> None:
-        """The plant moves, and what its fingers touch."""
+        """Advance the plant, and objects that its fingers touch."""
         self.conveyor.advance(plant, seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """A stamp for each camera, uint8 [4, 4, 3]."""
+        """Return a stamp for each camera, uint8 [4, 4, 3]."""
         self._frames[frame] = q.copy(), self.conveyor.state()
         if len(self._frames) > _KEPT:
             self._frames.popitem(last=False)
@@ -72,33 +72,33 @@ class DeferredPicturesEnvironment(Environment):
         return {key: np.broadcast_to(digits[:, None, None], (4, 4, 3)).copy() for key in self._keys}
 
     def render(self, stamp: UInt8) -> dict[str, UInt8]:
-        """The picture from above, RGB [H, W, 3] by its key, of the frame that a stamp names."""
+        """Return the overhead image of the frame in a stamp, RGB [H, W, 3] by key."""
         q, state = self._frames[int.from_bytes(stamp[:, 0, 0].tobytes(), "big")]
         drawn = self._renderer.draw(q, state)
         return {key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in drawn.items()}
 
     def truth(self) -> dict[str, object]:
-        """Ground truth of the belt's ride, and of how well it is followed."""
+        """Return the ground truth of the belt's motion, and of the tracking."""
         return self.conveyor.truth()
 
     def reset(self, wish: ResetRequest) -> None:
-        """Another course."""
+        """Reset the conveyor with another course."""
         self.conveyor.reset(wish)
 
 
 class ScriptPolicy(Policy):
-    """A script as a policy in this process, which is shown developed pictures."""
+    """Script as a policy in this process, with rendered images."""
 
     def __init__(self, script: ChaseScript, gallery: DeferredPicturesEnvironment) -> None:
         self._script, self._gallery = script, gallery
         self._answer = script.begin()
 
     def connect(self) -> PolicyInfo:
-        """Nothing to reach."""
+        """Return the policy's properties; there is no server."""
         return PolicyInfo("chase", action_space="joint", horizon=HORIZON, supports_rtc=True)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The rows of the script for this observation, after those that the robot is committed to."""
+        """Return the script's rows for this observation, after the committed rows of the conditioning."""
         pictures = self._gallery.render(observation.pictures[self._script.overhead.key])
         rows = self._answer(observation.qpos.astype(np.float64), pictures, observation.prompt)
         if conditioning is not None:
@@ -107,15 +107,15 @@ class ScriptPolicy(Policy):
         return ActionChunk(rows)
 
     def reset(self) -> None:
-        """It has seen nothing."""
+        """Restart the script."""
         self._answer = self._script.begin()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there are no resources."""
 
 
 def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> tuple[Conveyor, Lockstep]:
-    """The belt whose course is that of `seed`, and a station at it; nothing is recorded."""
+    """Return the conveyor with the course of `seed`, and a station at it that records nothing."""
     tree: dict[str, Any] = {
         "station": "conveyor",
         "robot": "agilex_piper",

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals that are shown hold the truth, from the fewest trials on and with lopsided outcomes."""
+"""Coverage of the displayed 95 % intervals, from the smallest number of trials and for skewed outcomes."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ from evaweb.statistics.rates import rate
 SECONDS = 10.0
 _WANTED = ">= 0.93"
 _SIZES = (2, 5, 10, 20, 50)
-_RUNS_PER_SECOND = 100  # asked for, so that the same seconds give the same figures on any machine
+_RUNS_PER_SECOND = 100  # fixed, so that equal seconds give equal figures on any machine
 _DRAWS = 1000
 Chance = np.random.Generator
 
 
 class Case(NamedTuple):
-    """A way in which outcomes come about: does the interval of `n` of them hold the truth, from which n on it is
-    shown, and how often it should; "" where that is only told.
+    """Way of generating outcomes.
+
+    `holds` is whether the interval of `n` outcomes contains the truth, `fewest` the smallest n with an interval, and
+    `wanted` the requirement, "" if the coverage is only reported.
     """
 
     holds: Callable[[Chance, int, int], bool]
@@ -39,8 +41,9 @@ class Case(NamedTuple):
 
 
 def measure(seconds: float) -> Report:
-    """`coverage.NAME.N`: the share of runs whose interval holds the truth, of N trials (each scene), conditions, pairs
-    or, of rates per hour, events to be expected.
+    """Measure `coverage.NAME.N`: the share of runs whose interval contains the truth.
+
+    N is the number of trials (per scene), conditions or pairs; for rates per hour the expected number of events.
     """
     figures, rows, runs = [], [], max(1, round(_RUNS_PER_SECOND * seconds))
     for name, case in CASES.items():
@@ -52,13 +55,13 @@ def measure(seconds: float) -> Report:
 
 
 def covered(case: Case, n: int, *, runs: int, draws: int) -> float:
-    """The share of `runs` whose interval holds the truth."""
+    """Return the share of `runs` whose interval contains the truth."""
     chance = np.random.default_rng(n)
     return sum(case.holds(chance, n, draws) for _ in range(runs)) / runs
 
 
 def _mean(truth: float, draw: Callable[[Chance, int], NDArray[np.float64]]) -> Case:
-    """Scores of one checkpoint."""
+    """Return the case of scores of one checkpoint."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         outcomes = draw(chance, n).tolist()
@@ -68,7 +71,7 @@ def _mean(truth: float, draw: Callable[[Chance, int], NDArray[np.float64]]) -> C
 
 
 def _scenes(*rates: float) -> Case:
-    """Successes over scenes, so many trials in each."""
+    """Return the case of successes over scenes, n trials in each."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         scenes = {str(i): (chance.random(n) < rate).tolist() for i, rate in enumerate(rates)}
@@ -79,7 +82,7 @@ def _scenes(*rates: float) -> Case:
 
 
 def _conditions(first: float, second: float, spread: float, trials: int) -> Case:
-    """Successes of two checkpoints from conditions in which the first one's rate differs by up to `spread`."""
+    """Return the case of two checkpoints over conditions in which the first one's rate varies by up to `spread`."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = first + spread * chance.uniform(-1, 1, n)
@@ -94,7 +97,7 @@ def _conditions(first: float, second: float, spread: float, trials: int) -> Case
 
 
 def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
-    """Successes of two checkpoints, rates drawn evenly."""
+    """Return the case of successes of two checkpoints with uniform random rates."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = chance.random(2)
@@ -107,7 +110,7 @@ def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
 def _rate(
     interval: Callable[[int, int], Interval | None], given: float | None = None, wanted: str = _WANTED
 ) -> Case:
-    """Successes of one checkpoint, at a rate that is drawn evenly or is `given`."""
+    """Return the case of successes of one checkpoint, at a uniform random or `given` rate."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         truth = chance.random() if given is None else given
@@ -122,7 +125,7 @@ def _per_hour(chance: Chance, n: int, draws: int) -> bool:
 
 
 def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, wanted: str) -> Case:
-    """Figures that each trial has one of."""
+    """Return the case of one number per trial."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         found = average(draw(chance, n).tolist())
@@ -132,7 +135,9 @@ def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, w
 
 
 def _anytime(first: float, second: float) -> Case:
-    """Successes of two checkpoints, pair by pair: held after every pair so far, for what is left out stays out."""
+    """Return the case of successes of two checkpoints in pairs; valid after every pair, because exclusion is
+    permanent.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         one, other = (chance.random((2, n)) < [[first], [second]]).astype(float)
@@ -143,8 +148,10 @@ def _anytime(first: float, second: float) -> Case:
 
 
 def _preferred(chance: Chance, n: int, draws: int) -> bool:
-    """Comparisons of two checkpoints, one worth e times the other; where nothing is ranked nothing is shown."""
-    weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's, with as many ties
+    """Return whether the interval holds for comparisons of two checkpoints, one worth e times the other; if
+    it is shown.
+    """
+    weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's weights with frequent ties
     said = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()
     turned: dict[str, Any] = {"first": "second", "tie": "tie", "second": "first"}
     rows = [

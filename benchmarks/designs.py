@@ -1,7 +1,7 @@
-"""How each design of a comparison errs and what it finds: exact where outcomes are successes and failures, simulated
-else; and the coverage of every interval that is shown beside it.
+"""Error and power of each design of a comparison, and coverage of the intervals that are shown with it.
 
-Source of the anchors: STEP (Snyder et al. 2025), a near-optimal sequential test of two policies, as measured by us.
+Exact for successes and failures, simulated otherwise. Reference values: STEP (Snyder et al. 2025), a near-optimal
+sequential test of two policies, as measured by us.
 """
 
 from __future__ import annotations
@@ -44,19 +44,21 @@ ROOT = Path(__file__).parents[1]
 SIZES = (50, 100)  # pairs
 ALPHA, LOOSE = 0.05, 0.1
 MARGIN = 0.2
-_STEPS = 3  # milestones of a trial with partial credit: its score is how many of them were reached
+_STEPS = 3  # milestones of a trial with partial credit: its score is the share reached
 _SOME_RATES = (0.2, 0.5, 0.8)
-_RATES = tuple(round(0.05 * i, 2) for i in range(1, 20))  # at which simulated designs err
-_RUNS_OF_RATES, _SIMULATED = 4000, 0.003  # of `courses`, and what standard error that has at alpha .05
+_RATES = tuple(
+    round(0.05 * i, 2) for i in range(1, 20)
+)  # rates at which errors of simulated designs are measured
+_RUNS_OF_RATES, _SIMULATED = 4000, 0.003  # runs of `courses`, and their standard error at alpha 0.05
 _RUNS = 1000
 _CHOICES = ((0.5, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5, 0.7), (0.5, 0.5, 0.5, 0.8))  # rates of four checkpoints
-_GRID, _ROUNDS = 15, 6  # of the search over drifts
+_GRID, _ROUNDS = 15, 6  # grid and refinements of the search over drifts
 Rates = tuple[float, float]
 Courses = list[dict[str, object]]
 
 
 class Case(NamedTuple):
-    """A design as it is frozen, but for its number of pairs; `every` so many of them there is a look.
+    """Design without its number of pairs; there is a look after `every` this many pairs.
 
     `random`: two checkpoints in random order, in blocks of two trials at ten conditions.
     """
@@ -70,7 +72,7 @@ class Case(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Power, the median number of pairs, and the standard error of the power where it was simulated."""
+    """Power, median number of pairs, and standard error of a simulated power."""
 
     power: float
     median: float
@@ -98,13 +100,18 @@ DRIFTING = {
     "early_margin_at_0.1": (Case("early", LOOSE, MARGIN), 30),
 }
 DIFFERENT: tuple[tuple[Rates, int], ...] = (((0.5, 0.7), 50), ((0.5, 0.8), 50), ((0.5, 0.7), 100))
-SAME: tuple[tuple[Rates, int], ...] = (((0.7, 0.7), 50), ((0.7, 0.7), 100))  # what a margin asks about
+SAME: tuple[tuple[Rates, int], ...] = (
+    ((0.7, 0.7), 50),
+    ((0.7, 0.7), 100),
+)  # equal rates, for designs with a margin
 STEP = {((0.5, 0.7), 50): (0.464, 50), ((0.5, 0.8), 50): (0.838, 29), ((0.5, 0.7), 100): (0.780, 68)}
 
 
 def measure(seconds: float, long: bool = False) -> Report:
-    """`type1.DESIGN.N`, `power.`, `median_pairs.` and `bias.WHAT.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and those of
-    `coverage`; `long` has designs of 250 pairs too, and goes on where one before it was ended.
+    """Measure `type1.DESIGN.N`, `power.`, `median_pairs.` and `bias.WHAT.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and
+    coverage.
+
+    With `long` designs of 250 pairs too; an interrupted measurement is continued.
     """
     rows: Courses = []
     kept = Kept() if long else None
@@ -113,7 +120,7 @@ def measure(seconds: float, long: bool = False) -> Report:
         for figure in kept.once(name, part, rows) if kept else part(rows):
             print(
                 f"{figure.name} {figure.value:.4g}", file=sys.stderr, flush=True
-            )  # all of them take minutes
+            )  # progress, because all figures take minutes
             figures.append(figure)
     covered = coverage.measure(seconds)
     return Report("designs", [*figures, *covered.figures], [*rows, *covered.rows])
@@ -131,7 +138,9 @@ def _parts(sizes: Sequence[int]) -> Iterator[tuple[str, Part]]:
 
 
 class Kept:
-    """What is done of a long measurement, so that one that was ended goes on where it was; by what computes it."""
+    """Store of the completed parts of a long measurement, which can then be continued; keyed by a hash of its
+    sources.
+    """
 
     def __init__(self) -> None:
         sources = [Path(__file__), *sorted((ROOT / "evaweb" / "statistics").glob("*.py"))]
@@ -142,7 +151,7 @@ class Kept:
         self._done: dict[str, dict[str, Any]] = {part["name"]: part for part in map(json.loads, lines)}
 
     def once(self, name: str, part: Part, rows: Courses) -> list[Figure]:
-        """Figures of a part, with its rows; as they were where it was made before."""
+        """Return the figures of a part and add its rows; computed only if not stored."""
         if name not in self._done:
             own: Courses = []
             figures = [asdict(figure) for figure in part(own)]
@@ -154,8 +163,9 @@ class Kept:
 
 
 def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
-    """The largest error over all common rates, with a bound between them; simulated ones may be above alpha by three
-    standard errors.
+    """Yield the largest error over all common rates, with a bound between them.
+
+    Simulated errors may exceed alpha by three standard errors.
     """
     if exact := boundary_of(case, n):
         largest, bound = exact.error()
@@ -169,8 +179,9 @@ def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
 
 
 def powers(rows: Courses) -> Iterator[Figure]:
-    """Of each design, with scipy's Barnard beside: *late* is wanted within .05 of a fixed number's, *early* within
-    .02 of STEP's after at most a tenth more pairs.
+    """Yield the power of each design, and of scipy's Barnard test for comparison.
+
+    Required: *late* within 0.05 of a fixed number's, *early* within 0.02 of STEP's with at most a tenth more pairs.
     """
     for name, case in DESIGNS.items():
         for rates, n in SAME if case.margin else DIFFERENT:
@@ -189,8 +200,10 @@ def powers(rows: Courses) -> Iterator[Figure]:
 
 
 def estimates(rows: Courses) -> Iterator[Figure]:
-    """How far the difference is off on average, raw and corrected for stopping early, and how often the interval of the
-    latter holds: weighed over every table at which the design ends.
+    """Yield the bias of the difference, raw and corrected for early stopping, and the coverage of the corrected
+    interval.
+
+    Computed exactly, over every table at which the design ends.
     """
     for name in ("late", "early"):
         exact = boundary_of(DESIGNS[name], SIZES[0])
@@ -210,7 +223,7 @@ def estimates(rows: Courses) -> Iterator[Figure]:
 
 
 def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, int], float]]:
-    """Every table at which the design ends (successes and trials of both arms) with its probability."""
+    """Yield every table at which the design ends (successes and trials of both arms) with its probability."""
     pairs = exact.looks[-1].first
     alive = np.zeros((pairs + 1, pairs + 1))
     alive[0, 0] = 1.0
@@ -226,8 +239,9 @@ def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, 
 
 
 def drifts(rows: Courses) -> Iterator[Figure]:
-    """The largest error that a search over common rates which change through the day came to: reported, for the
-    designs claim constant rates alone. `type1` beside it is that of constant ones.
+    """Yield the largest error found for common rates that change over time; only reported.
+
+    The designs assume constant rates; `type1` is their error for these.
     """
     for name, (case, n) in DRIFTING.items():
         exact = boundary_of(case, n)
@@ -239,7 +253,9 @@ def drifts(rows: Courses) -> Iterator[Figure]:
 
 @lru_cache(maxsize=64)
 def boundary_of(case: Case, pairs: int) -> Boundary | None:
-    """What stops it, as an exact boundary; None of an e-process, or of scores. Barnard's test is one of one look."""
+    """Return the design's exact boundary; None for an e-process, or for scores. Barnard's test is a boundary
+    with one look.
+    """
     if case.rule == ANYTIME or case.outcome == SCORE:
         return None
     if case.rule == FIXED and case.margin is None:
@@ -264,8 +280,9 @@ def _in_random_order(blocks: int) -> list[Unit]:
 
 
 def families(rows: Courses) -> Iterator[Figure]:
-    """How often any of several comparisons of equal checkpoints is significant, simulated, with dropped ones and
-    without; allowed are three standard errors above alpha.
+    """Yield how often any of several comparisons of equal checkpoints is significant, with and without dropping.
+
+    Simulated; allowed are three standard errors above alpha.
     """
     three = ((0, 1), (0, 2), (1, 2))
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
@@ -285,9 +302,10 @@ def families(rows: Courses) -> Iterator[Figure]:
 
 
 def choices(rows: Courses) -> Iterator[Figure]:
-    """Of several checkpoints that are all compared, all trials made or those dropped that are found worse: how often
-    one is called the best that is not, how often the best one is, how often the choice by the highest rate among those
-    that are left is another than the best one, and the median number of trials. Of equal ones none is the best.
+    """Yield figures on choosing the best of several checkpoints, with all trials made or with dropping.
+
+    How often a wrong checkpoint is called the best, how often the best one is, how often the highest rate among the
+    remaining ones is not that of the best, and the median number of trials. Among equal checkpoints none is the best.
     """
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
     for rates in _CHOICES:
@@ -319,7 +337,7 @@ def choices(rows: Courses) -> Iterator[Figure]:
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:
-    """The least extreme table that Barnard's test says something of: it says it of all that are more so."""
+    """Return the least extreme table that is significant in Barnard's test; all more extreme ones are too."""
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),
         key=lambda table: operator.truediv(*extremeness_of(table[0], n, table[1], n, None)),
@@ -333,9 +351,9 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
 
 
 def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
-    """The largest error found, and the rates at start, middle and end between which the common rate is linear.
+    """Return the largest error found, and the rates at start, middle and end of its piecewise linear course.
 
-    Straight lines from a grid of angles, then ever finer steps of all three around the best one.
+    Straight lines from a grid of angles, then successively finer steps of all three around the best.
     """
     angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
     lines = [(one, (one + other) / 2, other) for one, other in product(angles, repeat=2)]
@@ -359,8 +377,9 @@ def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, 
 
 
 def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Errors where the common rate, before each pair, is one of `rates` [courses, pairs]: float64 [courses]; with a
-    margin both rates keep it, the second `1 - margin` of it.
+    """Return the errors for courses of the common rate before each pair, `rates` [courses, pairs]: float64 [courses].
+
+    With a margin both rates differ by it: the second is `1 - margin` times the course.
     """
     margin = exact.margin or 0.0
     pairs = exact.looks[-1].first
@@ -370,7 +389,7 @@ def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64
     for pair in range(1, pairs + 1):
         common = (1 - margin) * rates[:, pair - 1, None, None]
         for axis, rate in ((1, margin + common), (2, common)):
-            alive = alive * (1 - rate) + np.roll(alive * rate, 1, axis=axis)  # nothing is at the last one yet
+            alive = alive * (1 - rate) + np.roll(alive * rate, 1, axis=axis)  # the last entry is still empty
         if pair in looks:
             region = looks[pair]
             there = alive[:, : pair + 1, : pair + 1]
@@ -389,7 +408,7 @@ def _runs(case: Case) -> int:
 
 @lru_cache(maxsize=256)
 def _found(case: Case, rates: Rates, pairs: int) -> Found:
-    """How it ends at these rates, exact where it can be."""
+    """Return power and median at these rates, exact if possible."""
     if exact := boundary_of(case, pairs):
         ended = exact.operating_characteristics(*rates)
         return Found(ended.power, ended.median // 2)
@@ -400,7 +419,7 @@ def _found(case: Case, rates: Rates, pairs: int) -> Found:
 
 
 def _simulated(case: Case, rates: Rates, pairs: int) -> Found:
-    """Of scores, each the share of milestones that were reached, at these chances each."""
+    """Return power and median for scores that are shares of milestones, each reached with these probabilities."""
     chance = np.random.default_rng(pairs)
     planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, outcome=case.outcome)
     scores = chance.binomial(_STEPS, rates, size=(_RUNS, pairs, 2)) / _STEPS
@@ -418,7 +437,7 @@ def _error(share: float, runs: int) -> float:
 
 
 def _of_scipy(rates: Rates, n: int) -> float:
-    """Power of scipy's test, table by table; what is as extreme by symmetry is asked once."""
+    """Return the power of scipy's test, by enumeration; tables that are equal by symmetry are tested once."""
     from scipy.stats import barnard_exact, binom
 
     first, second = (binom.pmf(np.arange(n + 1), n, rate) for rate in rates)

@@ -1,10 +1,8 @@
-"""Time of an e-stop under attack, attack by attack.
+"""Time until an e-stop takes effect under each attack.
 
-A page presses over its websocket and at the process for stops at once, and the first answer counts; beside it each of
-the two ways alone is measured.
-
-Each attack meets a lab of its own: real web, a station with a simulated robot under way, another station. Attackers are
-programs of their own at nice 19 (`benchmarks.attacks`).
+A page presses over its websocket and at the process for stops simultaneously, and the first answer counts; both ways
+are also measured alone. Each attack has its own lab: a real web, a station with a running simulated robot, and another
+station. Attackers are separate programs at nice 19 (`benchmarks.attacks`).
 """
 
 from __future__ import annotations
@@ -51,17 +49,17 @@ ATTACKS = (
     "database_hangs",
 )
 WAYS = ("estop", "socket", "rest")  # a page, its websocket alone, REST at the process for stops
-SECONDS = 30.0  # of presses per attack, a third of them over each way
+SECONDS = 30.0  # of presses per attack, a third for each way
 _WANTED_MS = 200
 _RECOVERED_S, _GIVEN_UP_S = 10, 60.0
 _PAUSE_S = 0.05  # between two presses
-_FEWEST = 3  # presses over each way, however long they take
+_FEWEST = 3  # presses per way, however long they take
 _ENDING_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """A lab, the operator's session, the station; `database` is the folder of its PostgreSQL server, if it has one."""
+    """Lab, operator's session and station; `database` is the folder of its PostgreSQL server, if it has one."""
 
     lab: RunningLab
     ready_file: Path
@@ -71,7 +69,7 @@ class Bench:
 
 
 def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
-    """`WAY_p99_ms.ATTACK` of each way, what was lost, whether station and web came through."""
+    """Measure `WAY_p99_ms.ATTACK` of each way, lost presses, and whether station and web survive."""
     rows = []
     for attack in attacks:
         with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as found:
@@ -96,7 +94,7 @@ def _on_postgresql(seconds: float) -> dict[str, Any]:
 
 @contextmanager
 def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator[Bench]:
-    """A lab that is up, in a folder; on the PostgreSQL server in `database` at `url`, or on SQLite."""
+    """Yield a running lab in a folder, on the PostgreSQL server in `database` at `url`, or on SQLite."""
     folder.mkdir(exist_ok=True)
     ready = folder / "ready.json"
     environment = {"DJANGO_SETTINGS_MODULE": "evaweb.settings", "DATABASE_URL": url}
@@ -110,7 +108,9 @@ def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator
 def measure_attack(
     found: Bench, attack: str, seconds: float, share: float = 1.0, moving: bool = True
 ) -> dict[str, Any]:
-    """A run that goes on if `moving`, the attack, presses for `seconds`; `share` of the attack in its full strength."""
+    """Measure presses for `seconds` during an attack of relative strength `share`, with a run in progress if
+    `moving`.
+    """
     facts = found.lab.announced
     program = RestPresser(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
     with closing(OpenPage(found.operator, facts["stops"])) as page:
@@ -121,7 +121,7 @@ def measure_attack(
             found.station.run()
         watching = StationWatch(found.station, facts["pids"]["web"])
         with _under(found, attack, share) as did:
-            time.sleep(seconds / 4.0)  # for which nobody presses, and the run is to go on
+            time.sleep(seconds / 4.0)  # without presses: the run must continue
             pressed = {
                 name: _presses(found.station, press, seconds / len(ways)) for name, press in ways.items()
             }
@@ -139,7 +139,7 @@ def measure_attack(
 
 
 def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
-    """Do everything once: the first costs are neither lateness nor growth."""
+    """Do everything once, so that first-time costs count neither as delay nor as memory growth."""
     for press in ways:
         press("to begin with")
     page_load_time(found.operator, _GIVEN_UP_S)
@@ -154,7 +154,7 @@ def _interruption(station: Station) -> str:
 
 @contextmanager
 def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
-    """The attack, from when it is under way to its end; then what the attackers did is in the map."""
+    """Run the attack during the block; the yielded map has the attacker's counts afterwards."""
     did: dict[str, int] = {}
     if attack == "none":
         yield did
@@ -180,7 +180,7 @@ def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
 
 
 def _presses(station: Station, press: Callable[[str], Press], seconds: float) -> dict[str, Any]:
-    """Press and release by turns for so long; where it is not released, each comes on top of the last."""
+    """Press and release alternately for `seconds`; if a release fails, presses accumulate."""
     made: list[Press] = []
     lost, releases = 0, True
     until = time.monotonic() + seconds
@@ -191,13 +191,13 @@ def _presses(station: Station, press: Callable[[str], Press], seconds: float) ->
         elif releases:
             releases = (
                 station.release() or station.release()
-            )  # a press's copy may come late, by the other way
+            )  # the copy of a press may arrive late by the other way
         time.sleep(_PAUSE_S)
     return summarize_presses(made, lost) | {"released": releases}
 
 
 def summarize_presses(presses: Sequence[Press], lost: int) -> dict[str, Any]:
-    """Results of presses, `lost` of which the station never had."""
+    """Return the results of presses, of which the station did not receive `lost`."""
     ms = np.array([press.ms for press in presses])
     undone = [
         f"{press.status or 'unanswered'}: {press.reason}" for press in presses if press.status != "done"
@@ -214,7 +214,7 @@ def summarize_presses(presses: Sequence[Press], lost: int) -> dict[str, Any]:
 
 
 def figures(row: dict[str, Any]) -> Iterator[Figure]:
-    """Of one attack."""
+    """Yield the figures of one attack."""
     attack = row["attack"]
     for way in WAYS:
         found = row[way]

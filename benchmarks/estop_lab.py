@@ -1,6 +1,7 @@
-"""A lab whose e-stop is pressed: `python -m benchmarks.estop_lab READY_FILE`; ends with Ctrl-C.
+"""Lab whose e-stop is pressed: `python -m benchmarks.estop_lab READY_FILE`; ends with Ctrl-C.
 
-Web, worker, a station with a simulated robot and a policy whose gesture never ends, and a second one without a robot.
+Web, worker, a station with a simulated robot and a policy whose motion never ends, and a second station without a
+robot.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from robots.broken_pipe import exit_on_broken_pipe
 
 PRESSED, OTHER = "pressed-1", "other-1"
 GUESSED_ACCOUNT = (
-    "guessed"  # a viewer whose password is guessed: other attackers log in while that name is locked
+    "guessed"  # viewer whose password is guessed; other attackers log in while this name is locked
 )
 _ROBOT = "agilex_piper"
 _DEPLOYMENTS = Path(__file__).parents[1] / "deployments"
-_FILES = 1024  # that Debian lets a process have open, where its administrator says nothing
+_FILES = 1024  # Debian's default limit of open files per process
 _NOWHERE = "tcp://127.0.0.1:1"
 _SETTINGS = (
     "run.duration_s=600",
@@ -33,7 +34,7 @@ _SETTINGS = (
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Stay up until a signal comes."""
+    """Run the lab until a signal."""
     import django
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -49,7 +50,7 @@ def main() -> int:
         with open_lab("127.0.0.1", 0) as lab:
             _up(lab, given.ready_file)
             lab.watch()
-    except StopRequested:  # as it should
+    except StopRequested:  # the normal end
         return 0
     return 1
 
@@ -71,7 +72,7 @@ def _up(lab: Any, ready_file: Path) -> None:
     )
     serving = ("-m", "runtime.sim.serve", "openpi", "--robot", _ROBOT, "--port", "0", "--latency-ms", "80")
     policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
-    # Programs are named after their files: each station has one of its own.
+    # Programs are named after deployment files: each station needs its own.
     pressed = _bench("demo.toml", PRESSED, node["obs_endpoint"], node["action_endpoint"], policy["url"])
     other = _bench("tabletop.toml", OTHER, _NOWHERE, _NOWHERE, "ws://127.0.0.1:1")
     url = lab.start([Bench(*pressed), Bench(*other)])
@@ -84,7 +85,7 @@ def _bench(file: str, station: str, observations: str, actions: str, policy: str
 
 
 def _people() -> dict[str, Any]:
-    """One of each role and GUESSED with fresh passwords, and a token of the operator's."""
+    """Create accounts of each role and GUESSED_ACCOUNT with new passwords, and a token of the operator."""
     from django.contrib.auth.models import User
 
     from evaweb.api.tokens import create_token

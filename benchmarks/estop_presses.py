@@ -1,4 +1,4 @@
-"""Presses of an e-stop as people and programs make them, and how long each takes until it is done."""
+"""E-stop presses by pages and programs, and the time until each is executed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DONE = "done"
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One press: what became of it ("" where nobody answered), why, and after how long [ms]."""
+    """Press with its result ("" without an answer), reason, and duration [ms]."""
 
     status: str
     reason: str
@@ -32,17 +32,17 @@ class Press:
 
     @property
     def ms(self) -> float:
-        """Until it was done [ms]; what was not done counts as if it had taken all of the patience."""
+        """Time until it was executed [ms]; otherwise the complete timeout."""
         return self.took_ms if self.status == _DONE else PATIENCE_S * 1000.0
 
     @property
     def failed(self) -> bool:
-        """Answered, and not done."""
+        """Answered, but not executed."""
         return self.status not in (_DONE, "")
 
 
 class _Page(LivePage):
-    """A page that hears what becomes of its presses."""
+    """Page that receives the acknowledgements of its presses."""
 
     def __init__(self, visitor: RestClient, station: str) -> None:
         self._acks: dict[str, queue.SimpleQueue[tuple[float, Mapping[str, Any]]]] = {}  # by uuid
@@ -71,9 +71,9 @@ class _Page(LivePage):
 
 
 class OpenPage:
-    """An operator's page on the station, which presses over its socket and at the process for stops, as a browser does.
+    """Operator's page at the station, which presses over its socket and at the process for stops, as in a browser.
 
-    Where its connection breaks it is opened again.
+    A broken connection is reopened.
     """
 
     def __init__(self, visitor: RestClient, stops: str, station: str = PRESSED) -> None:
@@ -83,7 +83,7 @@ class OpenPage:
         self._way.ready()
 
     def press(self, why: str) -> Press:
-        """Press both ways under one uuid; what is done counts first."""
+        """Press both ways with one uuid; the first executed press counts."""
         identity, answers = str(uuid4()), queue.SimpleQueue[Press]()
         ways = (self.over_the_socket, self._way.press)
         for way in ways:
@@ -95,7 +95,7 @@ class OpenPage:
         return next((press for press in pressed if press.status == _DONE), pressed[0])
 
     def over_the_socket(self, why: str, identity: str = "") -> Press:
-        """Press there alone, and wait for the answer."""
+        """Press over the websocket alone, and wait for the answer."""
         with self._opening:
             if self._page.broken:
                 self.close()
@@ -111,14 +111,14 @@ class OpenPage:
 
 
 class RestPresser:
-    """A program with these headers, which opens a connection for each press."""
+    """Program with these headers that opens a connection for each press."""
 
     def __init__(self, url: str, headers: Mapping[str, str], station: str = PRESSED) -> None:
         self._address, self._station = urlsplit(url).netloc, station
         self._headers = {**headers, "Content-Type": "application/json"}
 
     def ready(self) -> None:
-        """Ask whether this way stands, as a page does that is opened."""
+        """Request whether this way works, as a page does when it opens."""
         self.ask("GET", "estop")
 
     def press(self, why: str, identity: str = "") -> Press:
@@ -133,7 +133,7 @@ class RestPresser:
         return Press(said.get("status", "refused") if answered else "", str(said)[:200], took * 1000.0)
 
     def ask(self, method: str, what: str, body: str = "") -> dict[str, Any]:
-        """The answer to what is asked of `estop` or `commands`."""
+        """Return the answer to a request to `estop` or `commands`."""
         with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
             connection.request(method, f"/api/v1/stations/{self._station}/{what}", body, self._headers)
             found: dict[str, Any] = json.loads(connection.getresponse().read())
@@ -141,7 +141,7 @@ class RestPresser:
 
 
 def page_load_time(visitor: RestClient, seconds: float) -> float | None:
-    """After how long the station's page is there [s]; None: not within `seconds`."""
+    """Return the time until the station's page is loaded [s]; None if not within `seconds`."""
     begun = time.monotonic()
     while time.monotonic() - begun < seconds:
         try:

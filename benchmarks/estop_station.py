@@ -1,4 +1,4 @@
-"""The station whose e-stop is pressed: its run, its releases, whether the coordinator speaks, and how memory grows."""
+"""Station whose e-stop is pressed: its run, releases, responsiveness of the coordinator, and memory growth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FAMILY = ("coordinator", "guard")
 
 
 class Station:
-    """Commanded from a terminal, past the web."""
+    """Station commanded directly, bypassing the web."""
 
     def __init__(self, data: Path) -> None:
         self._folder = data / "stations" / PRESSED
@@ -33,21 +33,25 @@ class Station:
         self._newest_event = 0
 
     def another_client(self) -> StationClient:
-        """One for a thread of its own, with the same lease."""
+        """Return another client with the same lease, for use in a thread."""
         return StationClient(self._folder, _HOLDER)
 
     @property
     def latched(self) -> bool:
-        """True if the e-stop is latched, as its latch on the disk says."""
+        """True if the e-stop is latched on disk."""
         return Latch(self._folder).read() is not None
 
     def pids(self) -> list[int]:
-        """Of those that answer clients."""
+        """Return the process ids of coordinator and guard."""
         found = Endpoints(self._folder).read("supervisor")
         return [int(found[name]) for name in _FAMILY]
 
     def wait_until_up(self) -> Mapping[str, Any]:
-        """Its status, as soon as it answers; raises the RuntimeFault of the last try."""
+        """Return the status as soon as the station answers.
+
+        Raises:
+            RuntimeFault: If it does not answer in time.
+        """
         until = time.monotonic() + _READY_S
         while True:
             try:
@@ -58,7 +62,7 @@ class Station:
                 time.sleep(0.1)
 
     def run(self) -> None:
-        """Set up, and begin a run that goes on until somebody stops it; tried again where the machine was late."""
+        """Set up and begin a run without end; retried if the machine was late."""
         why = ""
         for _ in range(_TRIES):
             try:
@@ -73,7 +77,7 @@ class Station:
         raise SystemExit(f"{PRESSED} does not run: {why}")
 
     def _tried(self) -> Mapping[str, Any]:
-        """State after a second of a run, or wherever it came to instead."""
+        """Return the state one second after the start of a run, or the state reached instead."""
         state_is = self.wait_until_up()["state_is"]
         if state_is["latched"]:
             self.release()
@@ -90,7 +94,7 @@ class Station:
         )
 
     def release(self) -> bool:
-        """Release the e-stop; False where the coordinator does not."""
+        """Release the e-stop; return False if the coordinator does not."""
         try:
             self.client.wait(lambda status: status["state_is"]["latched"], _RELEASE_S)
             self.client.command("release")
@@ -100,7 +104,11 @@ class Station:
         return True
 
     def interruption(self) -> str:
-        """Event that ended the run before the press, "" for none; raises RuntimeFault where all is mute."""
+        """Return the event that ended the run before the press, "" if none.
+
+        Raises:
+            RuntimeFault: If the station does not answer.
+        """
         self.wait_until_up()
         events = self.client.events_since(self._newest_event)
         left = [event["text"] for event in events if event["kind"] in ("state", "family_died")]
@@ -111,15 +119,15 @@ class Station:
 
 
 class AttackLoad(NamedTuple):
-    """Measures of web and station during an attack."""
+    """Measurements of web and station during an attack."""
 
-    main_late_ms: float  # the longest that a snapshot was overdue
+    main_late_ms: float  # longest delay of a snapshot
     web_growth_mb: float
     station_growth_mb: float
 
 
 class StationWatch:
-    """Listens to the coordinator, keeps the lease and looks at memory until it is ended."""
+    """Watch of the coordinator's snapshots and of memory, which also renews the lease, until `end`."""
 
     def __init__(self, station: Station, web: int) -> None:
         self._heard = [time.monotonic()]
@@ -139,7 +147,7 @@ class StationWatch:
             thread.start()
 
     def end(self) -> AttackLoad:
-        """End the watch and return its measures."""
+        """End the watch and return its measurements."""
         self._ended.set()
         for thread in self._threads:
             thread.join()
@@ -154,7 +162,9 @@ class StationWatch:
                     self._heard.append(time.monotonic())
 
     def _claim(self, client: StationClient) -> None:
-        """As a page does that is open; whether the run goes on is judged by what the station says of it."""
+        """Renew the lease like an open page; errors are ignored, because the station's events show whether
+        the run continues.
+        """
         with closing(client):
             while not self._ended.wait(RENEW_S):
                 with suppress(RuntimeFault):
@@ -167,7 +177,7 @@ class StationWatch:
 
 
 def _memory(pids: list[int]) -> float:
-    """Memory of processes [bytes]; one that has ended holds nothing."""
+    """Return the memory of processes [bytes]; 0 for ended ones."""
     found = 0.0
     for pid in pids:
         try:

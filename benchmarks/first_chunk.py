@@ -1,6 +1,6 @@
-"""A process that imports everything, builds one robot's kinematics, solves one chunk, and tells what that took.
+"""Process that imports everything, builds one robot's kinematics, solves one chunk, and reports the cost.
 
-`python -m benchmarks.first_chunk KIND ROBOT` prints JSON: `rss_mb` when the chunk, of home's own poses, is solved.
+`python -m benchmarks.first_chunk KIND ROBOT` prints JSON: `rss_mb` after solving a chunk of the home pose.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from runtime.core.plugins import variants
 
 
 def main(kind: str, name: str) -> None:
-    """Solves, then prints."""
+    """Solve, then print."""
     robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[kind]
     kinematics = module.build(module.Config(), robot)

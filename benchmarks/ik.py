@@ -1,7 +1,6 @@
-"""Chunks of poses into joints: how long, how exact, how fast the joints, for all robots and installed backends.
+"""Conversion of chunks of poses to joints: duration, accuracy and joint speeds, for all robots and installed backends.
 
-On one core, because a station has others for the rest. All backends are asked for the same chunks in turns, a slow one
-less often.
+On one core, because a station uses the others. All backends solve the same chunks in turns, slow ones less often.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ from runtime.kinematics.base import IkFlag, IkResult, Kinematics
 
 SECONDS = 0.5
 _DEFAULT = "compiled"
-_FEWEST = 3  # calls of a backend for each chunk
-_PATIENCE_S = 1.0  # for those; after it one for each chunk is enough
+_FEWEST = 3  # calls of a backend per chunk
+_PATIENCE_S = 1.0  # time for these; after it, one call per chunk is enough
 _STARTS = 3
 _RECORDED = "agilex_piper"  # the robot of $EVA_SAMPLE_EPISODE
 _EPISODE = "EVA_SAMPLE_EPISODE"
 
 
 def measure(seconds: float) -> Report:
-    """`chunk_ms.ROBOT.TRAJECTORY` and what the solutions are worth; of other backends behind their kind's name."""
+    """Measure `chunk_ms.ROBOT.TRAJECTORY` and the quality of solutions; other backends' figures end with their kind."""
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     try:
@@ -57,7 +56,7 @@ def measure(seconds: float) -> Report:
 
 
 def _robot(name: str, seconds: float) -> list[dict[str, Any]]:
-    """A row per trajectory and backend."""
+    """Return a row per trajectory and backend."""
     robot = robots.load_robot(name)
     cases = invented(robot)
     folder = os.environ.get(_EPISODE)
@@ -72,12 +71,12 @@ def _robot(name: str, seconds: float) -> list[dict[str, Any]]:
 
 
 def _joints(robot: Robot) -> int:
-    """Of the arm that has most."""
+    """Return the largest number of joints of an arm."""
     return max(len(arm.joint_dims) for arm in robot.arms)
 
 
 def _backends(robot: Robot) -> dict[str, Kinematics]:
-    """Those that can be built here, ready to solve."""
+    """Return the backends that are available here, ready to solve."""
     built = {}
     for kind, module in variants("runtime.kinematics").items():
         try:
@@ -90,7 +89,7 @@ def _backends(robot: Robot) -> dict[str, Kinematics]:
 def _case(
     robot: Robot, backends: Mapping[str, Kinematics], chunks: Sequence[Chunk], seconds: float
 ) -> list[dict[str, Any]]:
-    """The backends solve the chunks in turns; each drops out when it had its time and its calls."""
+    """Let the backends solve the chunks in turns; each stops after its time and number of calls."""
     solved = {kind: [_solved(backend, chunk) for chunk in chunks] for kind, backend in backends.items()}
     times: dict[str, list[_Call]] = {kind: [] for kind in backends}
     while due := [kind for kind in backends if not _enough(times[kind], len(chunks), seconds)]:
@@ -106,14 +105,14 @@ def _case(
 
 
 class _Call(NamedTuple):
-    """Times of one chunk [s]: by the clock, and of processors."""
+    """Duration of a call [s]: wall time and processor time."""
 
     took: float
     used: float
 
 
 def _enough(calls: Sequence[_Call], chunks: int, seconds: float) -> bool:
-    """True if a backend had its time, and each chunk its calls."""
+    """Return True if a backend has used its time, and solved each chunk often enough."""
     took = sum(call.took for call in calls)
     if len(calls) < _FEWEST * chunks:
         return len(calls) >= chunks and took >= _PATIENCE_S
@@ -135,10 +134,10 @@ def _timed(calls: Sequence[_Call], arms: int) -> dict[str, float]:
 
 
 def _judged(robot: Robot, chunks: Sequence[Chunk], solved: Sequence[IkResult]) -> dict[str, float]:
-    """Quality of the solutions, over all chunks; the first row's speed counts from the seed.
+    """Return the quality of the solutions over all chunks; the first row's speed is relative to the seed.
 
-    Errors of targets that joints have are those of frames that no wall holds back: neither a joint limit nor
-    a velocity. The share that is held back, and its errors, stand beside them.
+    Errors of reachable targets count only frames that are limited neither by a joint limit nor by a velocity; the
+    share of limited frames and their errors are reported separately.
     """
     dims = arm_dims(robot)
     q = np.stack([result.q for result in solved])[..., dims]
@@ -166,7 +165,7 @@ def _ours(row: Mapping[str, Any]) -> bool:
 
 
 def _figures(row: Mapping[str, Any]) -> list[Figure]:
-    """Wanted of the default backend alone."""
+    """Return the figures of a row; only the default backend has requirements."""
     case = f"{row['robot']}.{row['trajectory']}" + ("" if _ours(row) else f".{row['kind']}")
     reachable = row["trajectory"] != OUT_OF_REACH
     wanted = {"chunk_ms": "<= 0.5" if reachable else "<= 1", "velocity_ratio": "<= 1"}
@@ -196,9 +195,9 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 
 
 def _postures(name: str) -> list[Figure]:
-    """Figures of the default backend on loops and on long paths; shares are of arms and paths.
+    """Return figures of the default backend on loops and long paths, as shares of arms and paths.
 
-    `far` paths are of one leg anywhere within the limits. In chunks a path is seen no farther than its chunk.
+    `far` paths have one leg anywhere within the limits. In chunks, only the current chunk of a path is known.
     """
     robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[_DEFAULT]
@@ -222,9 +221,9 @@ def _postures(name: str) -> list[Figure]:
 
 
 def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Processor time of the other backends, as a multiple of the default backend's.
+    """Return the processor time of the other backends as a multiple of the default backend's.
 
-    By the clock a busy machine would stretch their calls, which are long, and hardly those of the default backend.
+    Wall time would depend on the machine's load, and more so for long calls.
     """
     ours = {(row["robot"], row["trajectory"]): row["chunk_cpu_ms"] for row in rows if _ours(row)}
     return [
@@ -237,7 +236,7 @@ def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
 
 
 def _fk() -> list[Figure]:
-    """Distances of the recorded joints' poses from the recorded poses."""
+    """Return the distance between the recorded poses and the poses of the recorded joints."""
     folder = os.environ.get(_EPISODE)
     if not folder:
         print(f"the recorded episode is not measured: {_EPISODE} is not set", file=sys.stderr)
@@ -255,9 +254,9 @@ def _fk() -> list[Figure]:
 
 
 def _starts() -> list[Figure]:
-    """From the start of a process to its first chunk, with an empty cache and with what that has left there.
+    """Measure the time from the start of a process to its first chunk, with empty and with filled cache.
 
-    Processor time stands beside it: on a busy machine that is what a start costs.
+    Processor time is reported too: it is independent of the machine's load.
     """
     name = _RECORDED if _RECORDED in robots.robot_names() else robots.robot_names()[0]
     with tempfile.TemporaryDirectory() as folder:
@@ -287,6 +286,6 @@ def _first_chunk(name: str, cache: str) -> dict[str, float]:
 
 
 def _children_s() -> float:
-    """Processor time of the children that have ended."""
+    """Return the processor time of children that have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime

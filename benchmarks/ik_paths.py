@@ -1,4 +1,4 @@
-"""Chunks of end-effector poses to solve: smooth ones, near and through singularities, out of reach, recorded ones."""
+"""Chunks of end-effector poses: smooth, near and through singularities, out of reach, and recorded."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from robots import Group, Robot
 
 ROWS = 50
 OUT_OF_REACH = "out_of_reach"
-CHUNKS = 8  # of each kind: the same chunk again and again would flatter the branch predictor
-_UNHURRIED = 0.4  # of a joint's speed limit is the most that a path asks for
-_TURN = 1.0  # rad (m) that a joint moves in a chunk at most
-_BEYOND = 1.2  # m that targets out of reach go, outwards
-_NEAR = 0.01  # smallest singular value that `singular` chunks come by
+CHUNKS = 8  # chunks per kind; repeating one chunk would favour the branch predictor
+_UNHURRIED = 0.4  # largest share of a joint's speed limit that a path requires
+_TURN = 1.0  # [rad, m] largest motion of a joint per chunk
+_BEYOND = 1.2  # [m] distance of unreachable targets, outwards
+_NEAR = 0.01  # smallest singular value of `singular` chunks
 _SEARCHES = 400
-_ENDLESS = 3.0  # rad to either side in which joints without limits are moved
+_ENDLESS = 3.0  # [rad] range to either side of joints without limits
 
 Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Targets [T, arms, 7] for rows `dt` apart, the joints [D] they are solved from, and whether joints have them."""
+    """Targets [T, arms, 7] of rows `dt` apart, joints [D] from which to solve, and whether joints exist for
+    the targets.
+    """
 
     targets: Float64
     seed: Float64
@@ -36,9 +38,9 @@ class Chunk:
 
 
 def invented(robot: Robot) -> dict[str, list[Chunk]]:
-    """Chunks of every kind for any robot, all but those out of reach the poses of an unhurried joint path.
+    """Return chunks of every kind for a robot; except those out of reach they are poses of a slow joint path.
 
-    `singular` ones come close to a singularity in the middle, `through` ones go through it.
+    `singular` chunks approach a singularity in the middle, `through` chunks pass through it.
     """
     chance = np.random.default_rng(5)
     kinds = ("smooth", "singular", "through", OUT_OF_REACH)
@@ -60,7 +62,7 @@ def _chunk(robot: Robot, path: Float64) -> Chunk:
 
 
 def _leaving(chunk: Chunk) -> Chunk:
-    """Beginning where the chunk begins, and going away from where the arms stand."""
+    """Return a chunk from the same start that moves away from the arms' bases."""
     first = chunk.targets[0, :, :3]
     targets = np.repeat(chunk.targets[:1], ROWS, axis=0)
     outwards = first / np.linalg.norm(first, axis=-1, keepdims=True)
@@ -70,19 +72,19 @@ def _leaving(chunk: Chunk) -> Chunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A recorded episode: joints [T, D] and poses [T, arms, 7] that the robot measured at the same time."""
+    """Recorded episode: joints [T, D] and poses [T, arms, 7] that the robot measured simultaneously."""
 
     joints: Float64
     poses: Float64
 
     def chunks(self, robot: Robot) -> list[Chunk]:
-        """All of it, each chunk from the joints that were measured at its first row."""
+        """Return the complete recording as chunks, each from the joints measured at its first row."""
         rows = [slice(at, at + ROWS) for at in range(0, len(self.joints) - ROWS + 1, ROWS)]
         return [Chunk(self.poses[row], self.joints[row.start], 1 / robot.control_rate, True) for row in rows]
 
 
 def recorded(folder: Path) -> Recording:
-    """The first episode of a LeRobot dataset with joints and poses of two arms."""
+    """Return the first episode of a LeRobot dataset with joints and poses of two arms."""
     file = min(folder.glob("data/*/*.parquet"))
     table = pyarrow.parquet.read_table(file, columns=["observation.qpos", "observation.eef"])
     joints, eef = (np.array(column.to_pylist(), dtype=np.float64) for column in table.columns)
@@ -90,7 +92,7 @@ def recorded(folder: Path) -> Recording:
 
 
 def arm_dims(robot: Robot) -> NDArray[np.intp]:
-    """The places of all joints that kinematics solves."""
+    """Return the indices of all joints that kinematics solves."""
     return np.concatenate([arm.joint_dims for arm in robot.arms])
 
 
@@ -99,7 +101,7 @@ def _bounds(robot: Robot) -> tuple[Float64, Float64]:
 
 
 def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64:
-    """A posture whose arm joints keep a margin [share of their range] from limits; all else as at home."""
+    """Return a posture with arm joints at a margin [share of their range] from limits, other joints as at home."""
     low, high = _bounds(robot)
     posture = robot.poses["home"].copy()
     dims = arm_dims(robot)
@@ -108,7 +110,7 @@ def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64
 
 
 def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
-    """Joints [T, D] that speed up and slow down from `start` towards `end`, as far as is unhurried."""
+    """Return joints [T, D] that accelerate and decelerate from `start` towards `end`, as far as speed limits allow."""
     way = end - start
     dims = arm_dims(robot)
     steepest = math.pi / 2 * robot.control_rate / (ROWS - 1)
@@ -120,7 +122,7 @@ def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
 
 
 def _with_singular_value(robot: Robot, chance: np.random.Generator, wanted: float) -> Float64:
-    """A posture in which every arm's Jacobian has nearly that smallest singular value, found by trying."""
+    """Return a posture in which every arm's Jacobian has nearly that smallest singular value, by random search."""
     low, high = _bounds(robot)
     low, high = low + 0.1 * (high - low), high - 0.1 * (high - low)
     posture = _within(robot, chance, 0.1)
@@ -144,7 +146,7 @@ def _smallest(arm: Group, posture: Float64) -> float:
 
 
 def _ends_around(robot: Robot, middle: Float64, towards: Float64) -> tuple[Float64, Float64]:
-    """Two postures with `middle` halfway between them, both within the limits."""
+    """Return two postures with `middle` halfway between them, both within the limits."""
     low, high = _bounds(robot)
     way = np.minimum(np.abs(towards - middle), np.minimum(middle - low, high - middle)) * np.sign(
         towards - middle

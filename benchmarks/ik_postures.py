@@ -1,4 +1,4 @@
-"""Drift of postures: joints after loops of the same circle, and long paths that joints are known to have."""
+"""Drift of postures: joints after repeated circles, and long paths with known joints."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from benchmarks.ik_paths import ROWS, arm_dims
 from robots import Robot
 from runtime.kinematics.base import IkResult, Kinematics
 
-RADIUS = 0.05  # m of the circles, which begin and end at home
+RADIUS = 0.05  # [m] radius of the circles, which begin and end at home
 LOOPS = 12
-SETTLED = 2  # loops after which the joints are to come back to where they were
+SETTLED = 2  # loops after which joints should return to the same values
 PATHS = 30
 LEGS = 3
 _LOOP_S = 4.0
 _PLANES = ((0, 1), (1, 2), (0, 2))
-_HURRY = 0.4  # of a joint's speed limit is the most that a path asks for
-_ROOM = 0.05  # rad (m) that paths keep from limits
-_LEG = 1.0  # rad (m) that a joint moves on a leg at most, where legs are short
-_ENDLESS = 3.0  # rad to either side in which joints without limits are moved
+_HURRY = 0.4  # largest share of a joint's speed limit that a path requires
+_ROOM = 0.05  # [rad, m] margin of paths to limits
+_LEG = 1.0  # [rad, m] largest motion of a joint per short leg
+_ENDLESS = 3.0  # [rad] range to either side of joints without limits
 
 Float64 = NDArray[np.float64]
 
 
 def redundant(robot: Robot) -> bool:
-    """True if an arm has more joints than a pose holds."""
+    """Return True if an arm has more than six joints."""
     return any(len(arm.joint_dims) > 6 for arm in robot.arms)
 
 
 def followed(kinematics: Kinematics, robot: Robot, targets: Float64, start: Float64, rows: int) -> IkResult:
-    """Poses [T, arms, 7] in chunks of `rows`, each from the last command of the one before."""
+    """Solve poses [T, arms, 7] in chunks of `rows`, each from the last command of the previous chunk."""
     dt, at, parts = 1 / robot.control_rate, start, []
     for begin in range(0, len(targets), rows):
         parts.append(kinematics.solve(targets[begin : begin + rows], at, dt, at, 0))
@@ -46,7 +46,7 @@ def followed(kinematics: Kinematics, robot: Robot, targets: Float64, start: Floa
 
 
 def drift(robot: Robot, kinematics: Kinematics) -> Float64:
-    """rad [planes, LOOPS]: by how much the joints differ from the end of one loop to that of the next, at most."""
+    """Return the largest joint difference between the ends of consecutive loops, rad [planes, LOOPS]."""
     home, dims = robot.poses["home"], arm_dims(robot)
     rows = round(_LOOP_S * robot.control_rate)
     angles = np.tile(np.arange(1, rows + 1) / rows * 2 * math.pi, LOOPS)
@@ -62,7 +62,7 @@ def drift(robot: Robot, kinematics: Kinematics) -> Float64:
 
 
 def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Float64:
-    """Joints [T, D] over random postures, easing in and out of each; the same ones for the same number."""
+    """Return joints [T, D] through random postures with smooth acceleration; deterministic for a number."""
     chance, dims = np.random.default_rng([0, number]), arm_dims(robot)
     low = np.maximum(robot.lower + _ROOM, -_ENDLESS)[dims]
     high = np.minimum(robot.upper - _ROOM, _ENDLESS)[dims]
@@ -82,7 +82,7 @@ def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Floa
 
 
 def worst(robot: Robot, kinematics: Kinematics, joints: Float64, rows: int | None = None) -> Float64:
-    """m [arms]: how far off the poses of a joint path [T, D] are at most, in chunks of `rows` or in one."""
+    """Return the largest position error of a joint path [T, D], m [arms], in chunks of `rows` or in one chunk."""
     targets = kinematics.forward(joints)
     missed: Float64 = followed(kinematics, robot, targets, joints[0], rows or len(joints)).position_error.max(
         axis=0

@@ -1,7 +1,7 @@
-"""A lab with stations on other computers: e-stop, what an idle one costs, a lost link, an episode on its way, a climb.
+"""Lab with stations on other computers: e-stop, idle cost, lost link, transfer of an episode, and limits.
 
-Lab and station are processes of this machine with data folders of their own, linked over loopback: what the network
-adds is not in it.
+Lab and station are processes of this machine with separate data folders, linked over loopback: the network's share is
+not included.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Found = TypeVar("Found")
 
 
 class _Page(LivePage):
-    """An open page that keeps what it is told of the link."""
+    """Open page that records the state of the link."""
 
     link_ok = False
 
@@ -57,11 +57,11 @@ class _Page(LivePage):
 
 
 def measure(seconds: float) -> Report:
-    """`estop_p99_ms` from a page through the link, `estop_here_p99_ms` on the station's own computer, `lost_shown_s`.
+    """Measure `estop_p99_ms` from a page through the link, `estop_here_p99_ms` at the station, and `lost_shown_s`.
 
-    Of an idle station, with its link, and of the lab's gate `cpu_percent` and `memory_mb`. `seconds` of presses, and of
-    looking at it idle. Of an episode that travels as fast as it may: `upload_mb_s`, what both ends take for it, and
-    presses meanwhile. `stations_max` and `viewers_max` as by `benchmarks.climb`, with half of `seconds` for each rung.
+    Also `cpu_percent` and `memory_mb` of an idle station with its link, and of the lab's gate; `seconds` of presses,
+    and of idling. During a transfer at full speed: `upload_mb_s`, processor time of both ends, and presses.
+    `stations_max` and `viewers_max` as in `benchmarks.climb`, with half of `seconds` per step.
     """
     os.environ["EVA_UPLOAD_MB_S"] = "50"
     with tempfile.TemporaryDirectory() as name:
@@ -94,7 +94,7 @@ def measure(seconds: float) -> Report:
 
 @contextmanager
 def _linked(running: RunningLab, folder: Path, name: str) -> Iterator[StartedStation]:
-    """A station of that name with a simulated robot, enrolled at the lab, on what stands for a computer of its own."""
+    """Yield a station with a simulated robot, enrolled at the lab, in a data folder of its own."""
     folder.mkdir()
     bench = Lab(folder)
     try:
@@ -109,7 +109,7 @@ def _linked(running: RunningLab, folder: Path, name: str) -> Iterator[StartedSta
 
 
 def _shown(running: RunningLab, name: str) -> None:
-    """Wait until a page sees the station."""
+    """Wait until a page shows the station as connected."""
     page = _Page(running.visitor, name)
     _until(lambda: page.link_ok, f"the link of {name}")
     page.close()
@@ -147,7 +147,7 @@ def _measured(
 
 
 def _idle(processes: Mapping[str, psutil.Process], seconds: float) -> dict[str, float]:
-    """Percent of one core and proportional share of memory, of what nobody uses."""
+    """Return the load of idle processes [% of a core] and their proportional memory [MB]."""
     before = {name: sum(process.cpu_times()[:2]) for name, process in processes.items()}
     time.sleep(seconds)
     found: dict[str, float] = {}
@@ -159,7 +159,7 @@ def _idle(processes: Mapping[str, psutil.Process], seconds: float) -> dict[str, 
 
 
 def _presses(running: RunningLab, seconds: float) -> list[Press]:
-    """Presses of an open page, both ways at once, one after the other."""
+    """Press from an open page, both ways at once, repeatedly."""
     pressed: list[Press] = []
     page = OpenPage(running.visitor, running.announced["stops"])
     until = time.monotonic() + seconds
@@ -171,7 +171,7 @@ def _presses(running: RunningLab, seconds: float) -> list[Press]:
 
 
 def _presses_here(robot: Path, seconds: float) -> list[float]:
-    """The same at the station's own socket [ms]."""
+    """Press at the station's own socket, repeatedly; return the durations [ms]."""
     taken: list[float] = []
     client = StationClient(robot / "stations" / PRESSED, "benchmark")
     until = time.monotonic() + seconds
@@ -187,7 +187,7 @@ def _presses_here(robot: Path, seconds: float) -> list[float]:
 def _upload(
     running: RunningLab, robot: Path, processes: Mapping[str, psutil.Process]
 ) -> tuple[float, dict[str, float]]:
-    """Presses while an episode travels, p99 [ms]; how fast it was, and the processor time of a GB at either end."""
+    """Return p99 of presses during a transfer [ms]; its speed, and processor time per GB at either end."""
     folder = robot / "episodes" / str(uuid4())
     folder.mkdir(parents=True)
     (folder / "manifest.json").write_text(json.dumps({"uuid": folder.name, "station": PRESSED}))
@@ -210,7 +210,7 @@ def _upload(
 
 
 def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
-    """How long after the link fell silent (SIGSTOP) an open page says that it is lost [s]."""
+    """Return the times from the silence of the link (SIGSTOP) until an open page shows that it is lost [s]."""
     page, shown = _Page(running.visitor, PRESSED), []
     try:
         for _ in range(_CUTS):
@@ -228,7 +228,7 @@ def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
 
 
 def enrol(robot: Path, words: Sequence[str]) -> None:
-    """Make this station's computer one of the lab; the family starts its link by itself."""
+    """Enrol this station's computer at the lab; the supervisor then starts its link."""
     for command in (["new"], ["enrol", *words]):
         keys = [sys.executable, "-m", "runtime.keys", "--data-dir", str(robot), *command]
         subprocess.run(keys, cwd=ROOT, env=os.environ, check=True, stdout=subprocess.DEVNULL)
@@ -252,7 +252,7 @@ def _until(found: Callable[[], Found], what: str) -> Found:
 
 
 def two_free_ports() -> int:
-    """A port that is free as the next one is; somebody may take it meanwhile, and the lab says so."""
+    """Return a free port whose next port is free too; another program may still use them before the lab does."""
     while True:
         with socket.socket() as first:
             first.bind(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""A whole lab in processes of its own, as benchmarks bring it up, use it from outside, and end it."""
+"""Complete lab in separate processes: started, used from outside, and ended by benchmarks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _END_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class RunningLab:
-    """A lab that is up, somebody logged in to it, and what it announced."""
+    """Running lab, a logged-in client, and the facts that it announced."""
 
     visitor: RestClient
     announced: Mapping[str, Any]
@@ -40,9 +40,9 @@ class RunningLab:
 def lab(
     program: Sequence[str], ready_file: Path, extra: Mapping[str, str] | None = None
 ) -> Iterator[RunningLab]:
-    """Start `python PROGRAM`, which is to announce its lab in `ready_file`; its data lie beside that file.
+    """Start `python PROGRAM`, which announces its lab in `ready_file`; its data folder is next to that file.
 
-    `extra` is for its environment.
+    `extra` is added to its environment.
     """
     data = ready_file.parent / "data"
     environment = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "WARNING"} | dict(extra or {})
@@ -63,9 +63,9 @@ def lab(
 
 @contextmanager
 def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Iterator[RunningLab]:
-    """The lab of `benchmarks.busy_lab`, with these settings on top of its deployment.
+    """Yield the lab of `benchmarks.busy_lab`, with these overrides of its deployment.
 
-    `without` names measures of runtime.core.realtime that its control is to do without, separated by commas.
+    `without` is a comma-separated list of measures of runtime.core.realtime that its control process omits.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     ready = folder / "ready.json"
@@ -78,7 +78,7 @@ def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Ite
 def watch(
     visitor: RestClient, seconds: float, station: str = STATION, **counts: int
 ) -> subprocess.Popen[str]:
-    """Pages open on the station for so long, in a process of their own; `reading` or `stalled` of them."""
+    """Open pages at the station in a separate process, the given numbers `reading` or `stalled`."""
     options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
     command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, station, visitor.cookies]
     command += ["--streams", ",".join(STREAMS), "--seconds", str(seconds), *options]
@@ -86,7 +86,7 @@ def watch(
 
 
 class ProcessorUsage:
-    """Processor time of the processes of a lab, and of all others of the machine, from now on."""
+    """Processor usage of a lab's processes, and of all others of the machine, since creation."""
 
     def __init__(self, lab: psutil.Process) -> None:
         self._lab = lab
@@ -94,10 +94,10 @@ class ProcessorUsage:
         self._before = self._times()
 
     def percent(self) -> dict[str, float]:
-        """By process, of one processor [%].
+        """Return the usage by process [% of one processor].
 
-        `lab` is the sum of its processes, `measuring` the benchmark's own (pages and loops beside it), `others`
-        everything else on this machine.
+        `lab` is the sum of its processes, `measuring` the benchmark's own (pages and comparison loops), `others`
+        everything else.
         """
         seconds = time.monotonic() - self._begun
         now, before = self._times(), self._before
@@ -107,7 +107,7 @@ class ProcessorUsage:
         return {**taken, "lab": lab, "measuring": ours - lab, "others": busy - ours}
 
     def _times(self) -> dict[str, float]:
-        """Processor time of the lab's processes by their name, of all of ours, of the machine [s]."""
+        """Return the processor time of the lab's processes by name, of all our processes, and of the machine [s]."""
         lab = _used([self._lab, *self._lab.children(recursive=True)])
         me = psutil.Process()
         return {
@@ -118,19 +118,19 @@ class ProcessorUsage:
 
 
 def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
-    """User and system time by what a process runs [s]."""
+    """Return user and system time by program [s]."""
     found: dict[str, float] = {}
     for process in processes:
         try:
             name, times = named(process.cmdline()), process.cpu_times()
-        except psutil.NoSuchProcess:  # it has ended since it was listed: nothing of it can be asked
+        except psutil.NoSuchProcess:  # it has ended since it was listed
             continue
         found[name] = found.get(name, 0.0) + times.user + times.system
     return found
 
 
 class Scheduling:
-    """The kernel's scheduling of one process of a lab from now on."""
+    """Kernel scheduling of one process of a lab since creation."""
 
     def __init__(self, lab: psutil.Process, module: str) -> None:
         (self._process,) = (p for p in lab.children(recursive=True) if named(p.cmdline()) == module)
@@ -138,7 +138,7 @@ class Scheduling:
         self._before = self._counts()
 
     def figures(self) -> dict[str, float]:
-        """Per second: time on a processor and waiting for one [ms], switches against its will, page faults."""
+        """Return per second: time running and waiting for a processor [ms], involuntary switches, page faults."""
         seconds = time.monotonic() - self._begun
         now = self._counts()
         return {name: (value - self._before[name]) / seconds for name, value in now.items()}
@@ -162,14 +162,14 @@ def machine_used() -> float:
 
 
 def named(command: Sequence[str]) -> str:
-    """The module or the management command that a process runs."""
+    """Return the module or the management command that a process runs."""
     if "-m" in command:
         return command[command.index("-m") + 1]
     return next((part for part in command[1:] if not part.startswith("-") and "/" not in part), "?")
 
 
 def set_up(page: LivePage) -> Mapping[str, Any]:
-    """Take the station and set it up; its state when it is ready."""
+    """Take the station and set it up; return its state when it is ready."""
     page.wait(lambda state: state["state_is"]["connected"], 60.0, "waiting for the station")
     page.claim()
     page.wait(lambda state: state["lease"]["epoch"] == page.epoch, 10.0, "waiting for the lease")
@@ -181,7 +181,7 @@ def set_up(page: LivePage) -> Mapping[str, Any]:
 
 
 def only_episode(data: Path, seconds: float = 30.0) -> Episode:
-    """The one episode of a data folder, once it is closed."""
+    """Return the only episode of a data folder, when it is closed."""
     deadline = time.monotonic() + seconds
     while not (found := list(data.glob("episodes/*/outcome.json"))):
         if time.monotonic() > deadline:

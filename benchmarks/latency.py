@@ -1,14 +1,17 @@
-"""Latency from end to end while everything runs: control at 30 Hz, cameras, recording, five pages.
+"""End-to-end latency under full load: control at 30 Hz, cameras, recording, five pages.
 
-`command_ms`: a page presses Halt over its websocket, until it has the acknowledgement, given when the
-order is on its way to control and the answer is in its journal. `node_ms`: from the same press until control hands
-the first changed command to the socket towards the node; at 30 Hz a tick comes every 33 ms, so about half of that is
-waiting for the next one. `renew_ms`: the same way there and back, 20 times a second, without a change of state.
-`rest_ms`: Resume over REST, with its row in the database. `observation_ms`: from the node's stamp until the policy is
-asked about it. `muxed_ms`: from the node's stamp until the frame's packet went to the muxer.
+* `command_ms`: from Halt pressed on a page, over its websocket, to the acknowledgement, which is sent when the order
+  is on its way to control and the answer is in its journal.
+* `node_ms`: from the same press until control passes the first changed command to the socket towards the node; at 30
+  Hz a tick lasts 33 ms, so about half of that is waiting for the next tick.
+* `renew_ms`: the same round trip 20 times per second, without a change of state.
+* `rest_ms`: Resume over REST, with its database row.
+* `observation_ms`: from the node's stamp to the policy request with this observation.
+* `muxed_ms`: from the node's stamp until the frame's packet is passed to the muxer.
 
-The runtime maps the node's clock onto ours such that the fastest message took no time (runtime.core.clock.ClockMap).
-Here both are one clock: the shortest way is measured, and added to what counts from the node's stamp.
+The runtime maps the node's clock onto ours such that the fastest message has no delay (runtime.core.clock.ClockMap).
+Here both clocks are the same, so the shortest delay is measured, and added to durations that begin at the node's
+stamp.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ SECONDS = 60.0
 VIEWERS = 5
 _MARGIN_S = 4.0
 _RENEWALS_HZ = 20.0
-_RUNS_S = 0.4  # between a resume and the next halt
+_RUNS_S = 0.4  # from a resume to the next halt
 _ACK_S = 5.0
 _LISTENED_S = 2.0
 _WANTED = {
@@ -47,17 +50,17 @@ _WANTED = {
 
 
 class PressingPage(LivePage):
-    """A page that knows when it pressed and when it had the answer, on the monotonic clock [s]."""
+    """Page that records when it pressed and when it received the answers, on the monotonic clock [s]."""
 
     def __init__(self, visitor: RestClient, station: str) -> None:
-        self._answers: dict[str, tuple[float, str]] = {}  # when, and the status, by uuid
+        self._answers: dict[str, tuple[float, str]] = {}  # by uuid: time and status
         self._answered = threading.Condition()
         self._renewed = threading.Event()
         self.renewals: list[float] = []
         super().__init__(visitor, station)
 
     def press(self, kind: str) -> tuple[float, float]:
-        """Stop or halt through the socket: when it was pressed and when the acknowledgement was here."""
+        """Send stop or halt through the socket; return the times of the press and of its acknowledgement."""
         identity = str(uuid.uuid4())
         pressed = time.monotonic()
         self._send({"type": kind, "uuid": identity, "epoch": self.epoch})
@@ -81,7 +84,7 @@ class PressingPage(LivePage):
         super()._on_message(message)
 
     def _renew(self) -> None:
-        """More often than a page does, and each only when the one before was answered."""
+        """Renew more often than a page does, each time after the previous answer."""
         while not self._failure:
             time.sleep(1.0 / _RENEWALS_HZ)
             if not self.epoch:
@@ -94,7 +97,7 @@ class PressingPage(LivePage):
 
 
 def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
-    """Percentiles of every way, in ms."""
+    """Measure percentiles of all latencies [ms]."""
     with tempfile.TemporaryDirectory() as folder:
         settings = ["control.rate=30.0", "recording.fps=30.0", *assignments]
         with busy_lab(Path(folder), settings) as lab:
@@ -116,7 +119,7 @@ def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
 
 
 def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], dict[str, float]]:
-    """Halt and resume for so long; the ways measured by the page [ms], when it pressed, processor time."""
+    """Halt and resume for `seconds`; return latencies measured by the page [ms], times of presses, processor load."""
     commands, resumes, presses = [], [], []
     with closing(PressingPage(lab.visitor, STATION)) as page:
         set_up(page)
@@ -150,7 +153,7 @@ def _resume(page: LivePage) -> float:
 
 
 def _shortest_way(endpoint: str) -> float:
-    """The shortest time from the node's stamp to a process that listens to it [s]."""
+    """Return the shortest time from the node's stamp to a subscriber in this process [s]."""
     ways = []
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.SUBSCRIBE, b"")
@@ -169,7 +172,7 @@ def _shortest_way(endpoint: str) -> float:
 
 
 def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[str, Any]:
-    """Figures from the recording [ms]: arrays, and percentiles where it keeps only these."""
+    """Return latencies from the recording [ms]: arrays, or percentiles if only these are recorded."""
     assert episode.outcome is not None
     outcome: Mapping[str, Any] = episode.outcome
     muxed = outcome["muxed_ms"].values()
@@ -183,7 +186,7 @@ def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[st
 
 
 def _to_the_node(episode: Episode, presses: Sequence[float]) -> list[float]:
-    """From each press until the first command that is not the policy's was handed to the socket [s]."""
+    """Return the time from each press to the first command that is not the policy's [s]."""
     ticks = episode.ticks
     sent = ticks.column("sent").to_numpy() + episode.manifest["started_monotonic"]
     ours = np.array(ticks.column("control_source").to_pylist()) != "policy"

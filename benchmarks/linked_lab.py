@@ -1,4 +1,4 @@
-"""`python -m benchmarks.linked_lab READY_FILE`: a lab whose stations are on other computers; until a signal."""
+"""`python -m benchmarks.linked_lab READY_FILE`: a lab whose stations are on other computers; runs until a signal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ROBOT = "agilex_piper"
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Bring it up, announce addresses, people and a code for each of STATIONS."""
+    """Start the lab; announce addresses, accounts, and an enrolment code for each of STATIONS."""
     import django
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -1,9 +1,9 @@
-"""The control loop under its real load, at 30, 100 and 200 Hz: how late ticks begin, and whether any is missed.
+"""Control loop under its real load, at 30, 100 and 200 Hz: lateness and missed ticks.
 
-Per rate a whole lab runs: a bench that renders and sends three 640x480 cameras at 30 Hz, recording, previews,
-inference back to back, the web, a worker, five pages that watch everything. Beside it, each in a process of its
-own, run a loop that does nothing but sleep to absolute deadlines, in the class that control got, and the loop of
-most client libraries, which sleeps what is left of the period: all three see the same machine at the same time.
+Per rate a complete lab runs: a bench that renders and sends three 640x480 cameras at 30 Hz, recording, previews,
+continuous inference, web, worker, and five pages that watch everything. Two comparison loops run in parallel, each in
+a process of its own: one that only sleeps to absolute deadlines, in control's scheduling class, and the loop of most
+client libraries, which sleeps for the remaining period. So all three experience the same machine at the same time.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ VIEWERS = 5
 _PRIORITY = 20
 _SATURATED = 95.0 * (
     os.cpu_count() or 1
-)  # [% of one processor]; without a class of its own nobody is on time there
-_MARGIN_S = 3.0  # pages are open before the run and after it
+)  # [% of one processor] load above which only a real-time class is on time
+_MARGIN_S = 3.0  # pages are open before and after the run
 _QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 Times = NDArray[np.float64]
@@ -51,7 +51,7 @@ Steps = NDArray[np.int64]
 
 
 def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
-    """`lateness_*_ms.HZ`, `missed_ticks.HZ`, `rate_error_ppm.HZ`, `ratio_to_bare_loop.HZ`; all of them per tick."""
+    """Measure `lateness_*_ms.HZ`, `missed_ticks.HZ`, `rate_error_ppm.HZ`, `ratio_to_bare_loop.HZ`, per tick."""
     rows = [case(rate, seconds, assignments) for rate in RATES]
     return Report("loop", [figure for row in rows for figure in _figures(row)], rows)
 
@@ -77,7 +77,7 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 
 
 def case(rate: float, seconds: float, assignments: Sequence[str], without: str = "") -> dict[str, Any]:
-    """One lab, one run; `without` takes measures away from control: see benchmarks.measures."""
+    """Run one lab at a rate; `without` disables measures in control, see benchmarks.measures."""
     settings = [f"control.rate={rate}", "recording.fps=30.0", f"run.duration_s={seconds}", *assignments]
     with tempfile.TemporaryDirectory() as folder:
         with busy_lab(Path(folder), settings, without) as lab:
@@ -91,7 +91,7 @@ def case(rate: float, seconds: float, assignments: Sequence[str], without: str =
 def _run(
     lab: RunningLab, sleepers: Sequence[Sequence[str]], seconds: float
 ) -> tuple[Mapping[str, Any], list[Any], dict[str, Any]]:
-    """One run that is watched; the state afterwards, what the loops beside it measured, what it took."""
+    """Run once with viewers; return the final state, the results of the comparison loops, and the usage."""
     with closing(LivePage(lab.visitor, STATION)) as shared:
         set_up(shared)
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)
@@ -112,7 +112,7 @@ def _run(
 
 
 def _sleeper(arguments: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
-    """A loop beside ours, with the same measures."""
+    """Start a comparison loop."""
     command = [sys.executable, "-m", "benchmarks.sleeper", *arguments]
     return subprocess.Popen(command, cwd=ROOT, env=dict(environment), stdout=subprocess.PIPE, text=True)
 
@@ -153,6 +153,6 @@ def _spread(seconds: Times) -> dict[str, float]:
 
 
 def _rate(steps: Steps, times: Times, rate: float) -> dict[str, float]:
-    """The fitted rate, and by how many parts per million it differs from `rate`."""
+    """Return the fitted rate, and its deviation from `rate` [ppm]."""
     found = 1.0 / float(np.polyfit(steps, times, 1)[0])
     return {"effective_rate_hz": found, "rate_error_ppm": (found / rate - 1.0) * 1e6}

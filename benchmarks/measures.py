@@ -1,6 +1,6 @@
-"""Effects of the measures for a steady tick: `loop` at one rate, with runtime.core.realtime's taken away.
+"""Effects of the measures for steady ticks: `loop` at one rate, with measures of runtime.core.realtime disabled.
 
-The bare loop beside it does without them too.
+The bare comparison loop omits them too.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from benchmarks.report import Figure, Report
 
 SECONDS = 20.0
 _RATE = 200.0
-# Which are taken away; without the real-time class control asks for a short slice, without that it is ordinary.
+# Disabled measures; without the real-time class control requests a short time slice, without both it is ordinary.
 _VARIANTS = ("", "lock", "gc", "fifo", "fifo,timers", "fifo,gc", "fifo,slice", "fifo,slice,lock,gc,timers")
 
 
 def measure(seconds: float) -> Report:
-    """`lateness_*_ms.WITHOUT`, `missed_ticks.WITHOUT`, `waited_ms.WITHOUT` (for a processor, per second)."""
+    """Measure `lateness_*_ms.WITHOUT`, `missed_ticks.WITHOUT`, `waited_ms.WITHOUT` (for a processor, per second)."""
     figures, rows = [], []
     for without in _VARIANTS:
         row = case(_RATE, seconds, [], without)

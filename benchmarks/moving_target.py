@@ -1,21 +1,21 @@
-"""A target that moves: the block rides on the simulated conveyor, and each strategy is to stay beside it.
+"""Moving target: a block rides on the simulated conveyor, and each strategy should keep the fingertips next to it.
 
-Everything is the product's own, in lockstep and deterministic: the node with its gate, plant and messages
-(runtime/sim), the whole station (media, the coordinator, control, safety), the strategies. Only time is virtual and the
-sockets are left out. What was chosen, and why:
+All components are those of the product, in lockstep and deterministic: node with gate, plant and messages
+(runtime/sim), the complete station (media, coordinator, control, safety), and the strategies. Only time is virtual,
+and there are no sockets. Design decisions:
 
-* The policy (runtime/sim/chase.py) sees a picture for each request, takes the block to go on as it does, and answers
-  50 rows at 30 Hz. It knows what robots lag behind, and the ends of the belt; not when the belt will turn.
-* The belt changes its speed every 2.6 s on average, at 60 to 100 mm/s: a slow one, far below what the arm can do,
-  so that nothing but time decides. On target means: fingertips at most half of a block's edge, 20 mm, from
-  their place beside it. Success: for two thirds of the 20 s of the course, a bar that was set when the shares were
-  known, between those of `async` at 8 and at 15 ticks; sync is far below it wherever it fails. For any other bar the
-  shares of every course are there.
-* A strategy that moves asks back to back, but at most 10 times a second. `sync` executes 10 rows, a third of a
-  second, of each chunk: with fewer it stands most of the time, with more it sees too late that the belt has turned.
-  Everything else has its default.
-* Pictures are drawn when the policy asks, and then of the very frame that it asks about: the station carries a
-  stamp with the number of the frame in the place of each picture. An episode takes about a second like this.
+* The policy (runtime/sim/chase.py) gets an image per request, extrapolates the block's motion, and answers with 50
+  rows at 30 Hz. It knows the lag of robots and the ends of the belt, but not when the belt will turn.
+* The belt changes its speed every 2.6 s on average, at 60 to 100 mm/s: far below the arm's limits, so that only timing
+  matters. On target: fingertips at most half of a block's edge, 20 mm, from their place next to it. Success: on target
+  for two thirds of the 20 s of the course. This threshold was set when the shares were known, between those of `async`
+  at 8 and at 15 ticks; sync is far below it wherever it fails. The shares of every course are reported for any other
+  threshold.
+* A strategy that requests during motion does so back to back, but at most 10 times per second. `sync` executes 10
+  rows, a third of a second, of each chunk: with fewer it mostly waits, with more it notices too late that the belt has
+  turned. All other parameters have their defaults.
+* Images are rendered when the policy requests, of exactly the requested frame: the station carries a stamp with the
+  frame number instead of each image. So an episode takes about a second.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ STRATEGIES: Mapping[str, Mapping[str, Any]] = {
 }
 SEEDS = 3
 _WANTED = {"success_rate.sync.8": "== 0", "success_rate.async.8": "== 1", "success_rate.rtc.8": "== 1"}
-_PER_SEED_S = 20.0  # of wall time, about
-_ARRIVING_S = 10.0  # until fingertips have to be beside the block that stands
+_PER_SEED_S = 20.0  # wall time per seed, about
+_ARRIVING_S = 10.0  # until fingertips must be next to the standing block
 
 
 @dataclass(frozen=True, slots=True)
 class ChaseResult:
-    """One episode: lengths in mm, `share` of the time of the course on target, `state` of the station at its end.
+    """Result of an episode: lengths in mm, `share` of the course's time on target, final `state` of the station.
 
     `acceleration` [rad/s2] is that of the joint whose commands change most, exceeded in 5 % of the ticks.
     """
@@ -73,7 +73,9 @@ class ChaseResult:
 
 
 def measure(seconds: float) -> Report:
-    """`success_rate.STRATEGY.DELAY`, `on_target.STRATEGY.DELAY` (share of the time); the rest is in the rows."""
+    """Measure `success_rate.STRATEGY.DELAY` and `on_target.STRATEGY.DELAY` (share of the time); details are
+    in the rows.
+    """
     rows = table(seconds)
     figures = [
         Figure(f"{name}.{cell}", row[name], "", _WANTED.get(f"{name}.{cell}", ""))
@@ -84,9 +86,9 @@ def measure(seconds: float) -> Report:
 
 
 def table(seconds_budget: float) -> list[dict[str, Any]]:
-    """A row for each strategy and delay [ticks]; distances in mm, means over the episodes.
+    """Return a row for each strategy and delay [ticks]; distances in mm, means over the episodes.
 
-    Three courses for each, more where the budget allows it: the same for the same budget on every machine.
+    Three courses for each, more if the budget allows: the same for the same budget on every machine.
     """
     seeds = range(max(SEEDS, int(seconds_budget / _PER_SEED_S)))
     asked = list(product(STRATEGIES, DELAYS, seeds))
@@ -117,7 +119,7 @@ def _chased(asked: tuple[str, int, int]) -> ChaseResult:
 
 
 def run_chase(strategy: Mapping[str, Any], delay: int, seed: int) -> ChaseResult:
-    """One episode in lockstep, to the end of the course; one that never begins has no share of it."""
+    """Run one episode in lockstep to the end of the course; its share is 0 if it never begins."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         course, made = station_at(Path(folder), strategy, delay, seed)
@@ -139,7 +141,7 @@ def run_chase(strategy: Mapping[str, Any], delay: int, seed: int) -> ChaseResult
 
 
 def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
-    """Set up, run until the course is over; returns the arms' commands [ticks, D] of the course."""
+    """Set up and run until the course is over; return the arms' commands [ticks, D] during the course."""
     session, commanded = station.coordinator.session, []
     station.connect()
     station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
@@ -158,6 +160,6 @@ def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
 
 
 def _acceleration(commanded: Float64) -> float:
-    """Of commands [ticks, n], per tick and tick; 0 where there are too few to have one."""
+    """Return the acceleration of commands [ticks, n], per tick squared; 0 if there are too few."""
     changes = np.abs(np.diff(commanded, 2, axis=0))
     return float(np.quantile(changes.max(axis=1), 0.95)) if len(changes) else 0.0

@@ -1,8 +1,8 @@
-"""Pages in Debian's Chromium over a lab of 100,000 trials, one page at a time, while nothing runs on the station.
+"""Pages in Debian's Chromium with a lab of 100,000 trials, one at a time, while the station is idle.
 
-Each page is loaded five times by a browser that has kept nothing. LCP, CLS and event durations are those of Chromium's
-own PerformanceObserver, what leads to another document included; pages that draw in 3D do so in software here, and have
-their own wanted values.
+Each page is loaded five times by a new browser. LCP, CLS and event durations are from Chromium's PerformanceObserver,
+including events that lead to another document. Pages with 3D drawing use software rendering here, and have their own
+requirements.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from evaweb.lab.once import TrialChoice, run_one_trial
 PLANS, TRIALS = 200, 100_000
 LOADS = 5
 _AXE = ROOT / "node_modules" / "axe-core" / "axe.min.js"
-_LATER_MS = 1000  # after a page has loaded, in which what it shows last is seen
+_LATER_MS = 1000  # wait after loading for late content
 _VIEWPORT: Any = {"width": 1440, "height": 900}
-_SEEKS = (0.3, 0.7, 0.1, 0.9, 0.5)  # of an episode
-# Runs before a page's own scripts. A press that leads away is told at the page's end, and known to the next one.
+_SEEKS = (0.3, 0.7, 0.1, 0.9, 0.5)  # positions in an episode
+# Runs before a page's own scripts. An event that leads away is recorded at the page's end, and read on the next page.
 _WATCH = """
 window.seen = { fcp: 0, lcp: 0, cls: 0, inp: Number(sessionStorage.getItem("inp")) };
 const watch = (type, each, more = {}) => {
@@ -62,10 +62,10 @@ _PLAYABLE = """() => {
   return videos.length > 0 && videos.every(({ readyState, seeking }) => readyState >= 2 && !seeking);
 }"""
 _PAINTED = (
-    "new Promise((done) => requestAnimationFrame(() => setTimeout(done, 100)))"  # events are told after it
+    "new Promise((done) => requestAnimationFrame(() => setTimeout(done, 100)))"  # events come after a frame
 )
-# From the press to the picture: every camera stands at the row that was asked for. Chromium does not tell of each frame
-# that it shows: what was sought and has been painted since is there too.
+# From the event to the image: every camera shows the requested row. Chromium does not report each displayed frame, so
+# a video that was sought and painted counts too.
 _SEEK = """async (share) => {
   const range = document.querySelector("#scrub"), videos = [...document.querySelectorAll("video[data-camera]")];
   const shown = (video) => new Promise((done, late) => {
@@ -83,12 +83,12 @@ _SEEK = """async (share) => {
 
 
 Control = Callable[[Any], None]
-"""What somebody does on a page of Playwright's."""
+"""Action of a user on a Playwright page."""
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """An address, its commonest controls, those that lead to another document apart, and whether it draws in 3D."""
+    """Address with its most common controls, controls that lead to another document, and whether it draws in 3D."""
 
     name: str
     address: str
@@ -98,17 +98,17 @@ class Page:
 
 
 def click(selector: str) -> Control:
-    """A press of the first such element."""
+    """Return a click on the first matching element."""
     return lambda page: page.locator(selector).first.click()
 
 
 def press(selector: str, key: str) -> Control:
-    """A key while the first such element has the focus."""
+    """Return a key press with the focus on the first matching element."""
     return lambda page: page.locator(selector).first.press(key)
 
 
 def drag(selector: str) -> Control:
-    """The first such element, a bit to the side."""
+    """Return a short sideways drag of the first matching element."""
 
     def dragged(page: Any) -> None:
         page.locator(selector).first.hover()
@@ -121,7 +121,7 @@ def drag(selector: str) -> Control:
 
 
 def narrow(name: str, words: str = "") -> Control:
-    """A list to what is typed, else to the next choice, until it shows that."""
+    """Return a filter of a list by the typed words, else by the next choice, until the list shows it."""
 
     def narrowed(page: Any) -> None:
         with page.expect_response(lambda answer: f"{name}=" in answer.url):
@@ -136,7 +136,7 @@ def narrow(name: str, words: str = "") -> Control:
 
 
 def pages(episode: str, trial: int) -> Sequence[Page]:
-    """The pages that are measured."""
+    """Return the measured pages."""
     menu = click(".bar-user summary")
     find = (click("[data-open-find]"), press("#find-words", "b"), press("#find-words", "Escape"))
     curves, above = click("#joint-next"), click("[data-view=top]")
@@ -187,7 +187,7 @@ def pages(episode: str, trial: int) -> Sequence[Page]:
 
 
 def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS) -> Report:
-    """`fcp_ms.PAGE` and the others; `seconds` bounds nothing here, because loads are counted."""
+    """Measure `fcp_ms.PAGE` and others; `seconds` is ignored, because the number of loads is fixed."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _seed(folder / "data", plans, trials)
@@ -199,7 +199,7 @@ def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS) -> Report:
 
 
 def figures(rows: Sequence[Mapping[str, Any]]) -> Iterator[Figure]:
-    """Of the loads of each page."""
+    """Yield the figures of each page."""
     for name in dict.fromkeys(row["page"] for row in rows):
         own = [row for row in rows if row["page"] == name]
         kind, lcp, inp = ("_3d", 2500, 200) if own[0]["draws"] else ("", 1000, 100)
@@ -212,7 +212,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Iterator[Figure]:
 
 
 def _seed(data: Path, plans: int, trials: int) -> None:
-    """A database as after years, by a program of its own: this one has no Django of that folder."""
+    """Create a database as after years, in a separate program with Django set up for that folder."""
     data.mkdir()
     program = (
         "import django; django.setup()\n"
@@ -229,7 +229,7 @@ def _seed(data: Path, plans: int, trials: int) -> None:
 
 
 def _visits(demo: RunningLab, wanted: Sequence[Page]) -> tuple[list[dict[str, Any]], float]:
-    """A row per load, and the median time of a seek in the episode [ms]."""
+    """Return a row per load, and the median duration of a seek in the episode [ms]."""
     from playwright.sync_api import sync_playwright
 
     url = demo.announced["url"]
@@ -264,7 +264,7 @@ def _login(browser: Any, url: str, password: str) -> Any:
 
 
 def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[str, Any]]:
-    """Five loads of a page after one that warms up the web; the last is looked at by axe-core in both themes."""
+    """Yield five loads of a page after a warm-up; the last one is checked by axe-core in both themes."""
     for load in range(LOADS + 1):
         page = fresh()
         page.add_init_script(_WATCH)
@@ -281,7 +281,7 @@ def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[st
         for selector in wanted.onward:
             with page.expect_event("load"):
                 page.locator(selector).first.click()
-            row["inp"] = page.evaluate("seen.inp")  # it knows the page before
+            row["inp"] = page.evaluate("seen.inp")  # includes events of the previous page
         page.context.close()
         if load:
             yield row

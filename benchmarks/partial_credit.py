@@ -1,9 +1,9 @@
-"""How soon partial credit tells two policies apart: our e-process beside NSCORE's supermartingale, on the same pairs.
+"""Pairs until partial credit separates two policies: our e-process and NSCORE's supermartingale, on the same pairs.
 
-NSCORE (Snyder et al.) is no part of the product, and pulls in cvxpy and matplotlib: it is asked in an environment of
-its own, which is made by hand, and left out where there is none.
+NSCORE (Snyder et al.) is not part of the product, and requires cvxpy and matplotlib: it runs in a separate
+environment, which is created manually, and is omitted if that does not exist.
 
-    python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
+  python -m venv build/peers/nscore && build/peers/nscore/bin/python -m pip install nscore==0.1.2
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from benchmarks.report import Figure, Report
 from evaweb.statistics.sequential import ALPHA, score_evidence
 
 PEER = Path(__file__).parents[1] / "build" / "peers" / "nscore" / "bin" / "python"
-SECONDS = 0.0  # cases bound it
-RUNS, PAIRS, STEPS = 60, 60, 3  # steps: milestones of a trial, each reached by the checkpoint's chance
+SECONDS = 0.0  # the number of cases limits it
+RUNS, PAIRS, STEPS = 60, 60, 3  # steps: milestones of a trial, each reached with the checkpoint's probability
 CHANCES = ((0.5, 0.5), (0.5, 0.6), (0.5, 0.7), (0.5, 0.8))
-# Two one-sided tests at alpha/2 each, as ours are; it takes scores by their place among all that there are.
+# Two one-sided tests at alpha/2 each, like ours; the peer takes scores as indices of the list of scores.
 _ASKED = """
 import json, sys
 import numpy as np
@@ -44,8 +44,10 @@ print(json.dumps(found))
 
 
 def measure(seconds: float) -> Report:
-    """`found.WHO.P0.P1`, the share of runs that tell both apart (of equal ones: wrongly), and `pairs.WHO.P0.P1`, the
-    median number of pairs after which they do, those that never do counted as all; WHO is ours or nscore.
+    """Measure `found.WHO.P0.P1` and `pairs.WHO.P0.P1` for WHO = ours, nscore.
+
+    The share of runs that separate both (wrongly, if equal), and the median number of pairs until then, with all pairs
+    for runs that never do.
     """
     scores = [step / STEPS for step in range(STEPS + 1)]
     figures: list[Figure] = []

@@ -1,9 +1,9 @@
-"""Costs of recording, and losses by a kill: a station's recorder, LeRobot's beside it, kill -9, a long list.
+"""Cost of recording, and losses by kills: a station's recorder, LeRobot's writer, kill -9, a long list.
 
-One station records three cameras of 640x480 at 30 Hz, ends and publishes; others record beside busy loops. Then the
-recorder alone and LeRobot's own writer are given the same frames at the same pace, if an interpreter with LeRobot is
-there: this one, or one that EVA_LEROBOT_PYTHONS names. Then processes are killed at random moments, and the page of
-10,000 episodes is asked for.
+One station records three cameras of 640x480 at 30 Hz, ends and publishes; others record in parallel to busy loops.
+Then our recorder alone and LeRobot's own writer receive the same frames at the same pace, if an interpreter with
+LeRobot is available: this one, or those in EVA_LEROBOT_PYTHONS. Then processes are killed at random moments, and the
+page of 10,000 episodes is requested.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ _LONG_BUSY_S = 300.0
 _KILLED_S = (
     200.0,
     60.0,
-)  # for killing what records, and the worker: the default run is to end within ten minutes
+)  # for kills of recording processes and of the worker: the default run must end within ten minutes
 _BESIDE_S = 15.0  # of the same frames, per writer
 _LISTED = 10_000
 _MODES = ("default", "streaming")
 
 
 def measure(seconds: float, long: bool = False) -> Report:
-    """`frames_lost`, `intake_age_p99_ms`, `memory_growth_mb`, `cpu_core_percent`, `kill9_worst_loss_s` and others.
+    """Measure `frames_lost`, `intake_age_p99_ms`, `memory_growth_mb`, `cpu_core_percent`, `kill9_worst_loss_s` and
+    others.
 
-    And what they were made of; `load_1min` is of the machine at the end, each part's own stands in its row.
+    `load_1min` is the machine's load at the end; that of each part is in its row.
     """
     seed = random.SystemRandom().randrange(1 << 32)
     with tempfile.TemporaryDirectory() as name:
@@ -72,7 +73,7 @@ def figures(
     kills: Mapping[str, Any],
     listing: Mapping[str, Any],
 ) -> list[Figure]:
-    """Figures of the five parts: those with a bound, and those that are only told."""
+    """Return the figures of the five parts, with and without requirements."""
     memory, disk = station["memory_mb"], station["to_disk_ms"]
     rows: Sequence[Mapping[str, Any]] = kills["rows"]
     return [
@@ -112,7 +113,7 @@ def figures(
 
 
 def _ratios(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """LeRobot's processor time per recorded frame as a multiple of ours, its dataset included in both."""
+    """Return LeRobot's processor time per recorded frame as a multiple of ours, including the dataset in both."""
     (ours,) = (row for row in rows if row["writer"] == "ours")
     per_frame = {row["writer"]: (row["capture_cpu_s"] + row["save_cpu_s"]) / row["frames"] for row in rows}
     found = [
@@ -133,9 +134,9 @@ def _made(folder: Path) -> Path:
 
 
 def _timed(part: Any, *arguments: Any) -> dict[str, Any]:
-    """Findings of a part, its duration, and the load of the machine when it ended."""
+    """Return the results of a part, with its duration and the machine's load at its end."""
     begun = time.monotonic()
-    print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # minutes pass: say where it is
+    print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # progress, because it takes minutes
     found = part(*arguments)
     return {**found, "took_s": time.monotonic() - begun, "load": os.getloadavg()}
 
@@ -153,7 +154,7 @@ def _beside(folder: Path, frames: Path) -> dict[str, Any]:
 
 
 def interpreters() -> list[str]:
-    """Those that have a LeRobot whose writer can encode while it records, which is 0.4.4 and later."""
+    """Return the interpreters with a LeRobot that can encode while recording (0.4.4 or later)."""
     named = [path for path in os.environ.get("EVA_LEROBOT_PYTHONS", "").split(":") if path]
     if find_spec("lerobot") is not None:
         named.append(sys.executable)
@@ -168,7 +169,7 @@ def interpreters() -> list[str]:
 
 
 def _child(python: str, module: str, *arguments: str, **environment: str) -> dict[str, Any]:
-    """Last output of a module of ours, as JSON; the whole of its output where it fails."""
+    """Return the last output line of a benchmark module as JSON; exit with its complete error output if it fails."""
     command = [python, "-m", f"benchmarks.{module}", *arguments]
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
@@ -180,7 +181,7 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
 
 
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
-    """Each process at 10 moments, 50 where it may be long; fewer on a slow machine, but 10 in all."""
+    """Kill each process at 10 moments, 50 if long; fewer on a slow machine, but at least 10 in all."""
     recording, working = (
         (KillCount(150, 150, 0.0), KillCount(50, 50, 0.0))
         if long
@@ -193,7 +194,7 @@ def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
         rows = kill_recording(lab, recording, seed)
     finally:
         lab.close()
-    data = folder / "published"  # apart: what was interrupted is not published before somebody has scored it
+    data = folder / "published"  # separate: interrupted episodes are not published before they are scored
     make_episodes(data, frames)
     return {"rows": [*rows, *kill_worker(data, working, seed)]}
 

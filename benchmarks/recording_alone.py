@@ -15,11 +15,11 @@ from runtime.recording.base import ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.settings import RecordingSettings
 
-_TICKS = 3  # of control per row: 90 Hz
+_TICKS = 3  # control ticks per row: 90 Hz
 
 
 def manifest() -> dict[str, Any]:
-    """Of an episode of the frames that every recorder is given."""
+    """Return the manifest of an episode with the common frames."""
     names = [f"joint_{number}" for number in range(JOINTS)]
     robot = {"name": "bench", "joint_names": names, "eef_names": [], "dim": JOINTS, "eef_dim": 0}
     return {
@@ -45,7 +45,7 @@ def manifest() -> dict[str, Any]:
 
 
 def append(journal: EpisodeJournal, index: int, pictures: dict[str, Any]) -> None:
-    """Row `index` with its pictures, and its ticks."""
+    """Append row `index` with its images and ticks."""
     now, here = time.monotonic(), joints(index)
     captured = dict.fromkeys(("joints", *CAMERAS), now)
     journal.append(Row(index, index * _TICKS, now, index, here, here, captured, pictures, "policy"))

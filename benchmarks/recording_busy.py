@@ -1,4 +1,4 @@
-"""Recordings of a whole station beside busy loops: how old joints come into the shared page, and what is lost."""
+"""Recordings of a complete station in parallel to busy loops: age of joints in shared state, and losses."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from runtime.clients.client import Refused
 from runtime.recording.reader import Episode, open_episode
 from tests.processes import PATIENCE_S
 
-_LOOK_S = 20.0  # less than what the ages are of
+_LOOK_S = 20.0  # less than the window of the ages
 _LOOP = "while True: pass"
 _NODE_PRIORITY = 30  # above ours
-# Patient with everything but old joints, which are what is measured.
+# Tolerant limits except for the age of joints, which is measured.
 _JUDGED = ("safety.joint_age_s", "safety.refusals_to_hold")
 _SETTINGS = [one for one in PATIENT if not one.startswith(_JUDGED)]
 CASES = {"quiet": (False, "auto"), "busy": (True, "auto"), "busy_ordinary": (True, "off")}
 
 
 def record(folder: Path, seconds: float) -> dict[str, Any]:
-    """Record `seconds` on a quiet machine, beside a busy loop per core, and there without a real-time class."""
+    """Record `seconds` on a quiet machine, with a busy loop per core, and with both but without real-time class."""
     rows = []
     for name, (busy, realtime) in CASES.items():
         lab = PatientLab(folder / name)
@@ -70,7 +70,7 @@ def _run(lab: PatientLab, seconds: float, busy: bool) -> dict[str, Any]:
 
 
 def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], list[str]]:
-    """The ages of joints as they came in, at times; why the robot was held, and goes on."""
+    """Return ages of joints at intervals, and the reasons for holds; held runs are resumed."""
     end, look_at = time.monotonic() + seconds, time.monotonic() + _LOOK_S
     ages: list[dict[str, float]] = []
     held: list[str] = []
@@ -80,7 +80,7 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
         if not status["state_is"]["going"]:
             held.append(status["reason"])
         if status["state_is"]["held"]:
-            with suppress(Refused):  # not yet: again with the next look
+            with suppress(Refused):  # not possible yet: retried at the next poll
                 lab.client.command("resume")
         if now >= min(look_at, end):
             look_at = now + _LOOK_S
@@ -90,7 +90,7 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
 
 
 def pictures(episode: Episode) -> dict[str, int]:
-    """Count of pictures that were given and are not in the videos: flagged, and not (`silent`)."""
+    """Return the number of images that were given but are not in the videos: `flagged` or `silent`."""
     flagged = silent = 0
     rows = episode.rows
     for camera in episode.layout.cameras:
@@ -103,7 +103,7 @@ def pictures(episode: Episode) -> dict[str, int]:
 
 
 def _put_first(process: int) -> None:
-    """The node stands for a machine of its own: it is not held up by ours, where that is permitted."""
+    """Give the node real-time priority if permitted: it represents another machine, which ours cannot delay."""
     with suppress(PermissionError):
         for thread in Path(f"/proc/{process}/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(_NODE_PRIORITY))
@@ -111,7 +111,7 @@ def _put_first(process: int) -> None:
 
 @contextmanager
 def _loops(count: int) -> Iterator[None]:
-    """So many processes that never wait."""
+    """Run that many busy processes during the block."""
     loops = [subprocess.Popen([sys.executable, "-c", _LOOP]) for _ in range(count)]
     try:
         yield

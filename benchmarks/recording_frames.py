@@ -1,4 +1,4 @@
-"""The pictures of benchmarks.recording_pace: three cameras of the simulated bench, while an arm waves."""
+"""Images for benchmarks.recording_pace: three cameras of the simulated bench with a moving arm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ask for the publication of all finished episodes: `python -m benchmarks.recording_jobs`; prints their uuids.
+"""Enqueue the publication of all finished episodes: `python -m benchmarks.recording_jobs`; prints their uuids.
 
 The data folder is EVA_DATA_DIR.
 """
@@ -11,7 +11,7 @@ import sys
 
 
 def main() -> None:
-    """Make the database where there is none, read the folders into it, and queue one job per episode."""
+    """Create the database if necessary, read the folders into it, and enqueue one job per episode."""
     import django
 
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")

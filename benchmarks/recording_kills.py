@@ -1,7 +1,7 @@
-"""kill -9 at random moments while a station records and a worker publishes: what is lost, and whether all still opens.
+"""kill -9 at random moments during recording and publishing: losses, and whether all files can be opened.
 
-Media, the coordinator, control and reception are killed in turn, each in a recorded run; the worker while it does the
-jobs of what was recorded. Nothing is timed by the victim: the moment of the kill is ours, on the clock of the rows.
+Media, coordinator, control and reception are killed in turn, each in a recorded run, and the worker during its jobs.
+The time of a kill is taken by the killer, on the clock of the rows.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from tests.processes import PATIENCE_S, eventually
 
 EPISODES = 6  # for the worker
 PROCESSES = ("media", "coordinator", "control", "reception")
-_SPREAD_S = (1.0, 3.5)  # of a recording, within which its kill falls
-_WORKING_S = (0.0, 1.5)  # of a worker, from when it has its first job
+_SPREAD_S = (1.0, 3.5)  # window of the kill within a recording
+_WORKING_S = (0.0, 1.5)  # window of the kill after a worker's first job
 _CLOSED_S = 120.0
 _PUBLISHED_S = 180.0
 RUNNING = "select key, owner from jobs_job where status = 'running'"
@@ -47,14 +47,14 @@ RUNNING = "select key, owner from jobs_job where status = 'running'"
 
 @dataclass(frozen=True, slots=True)
 class KillCount:
-    """Count of kills: `most`, or fewer but at least `least` where `seconds` are over before."""
+    """Number of kills: `most`, or fewer but at least `least` after `seconds`."""
 
     most: int
     least: int
     seconds: float
 
     def moments(self, seed: int, between: tuple[float, float]) -> Iterator[float]:
-        """When each kill is to fall, after what it interrupts has begun [s]."""
+        """Yield the moment of each kill, after the begin of the interrupted activity [s]."""
         drawn, begun = random.Random(seed), time.monotonic()
         for number in range(self.most):
             if number >= self.least and time.monotonic() - begun > self.seconds:
@@ -63,14 +63,14 @@ class KillCount:
 
 
 def kill_recording(lab: Lab, many: KillCount, seed: int) -> list[dict[str, Any]]:
-    """One row per kill: process, moment, what was lost [s], how the episode ended."""
+    """Return one row per kill: process, moment, loss [s], and how the episode ended."""
     kills: deque[float] = deque(maxlen=MOST_RESTARTS)
     moments = enumerate(many.moments(seed, _SPREAD_S))
     return [_one(lab, PROCESSES[number % len(PROCESSES)], moment, kills) for number, moment in moments]
 
 
 def _one(lab: Lab, process: str, moment: float, kills: deque[float]) -> dict[str, Any]:
-    if len(kills) == kills.maxlen:  # a family that dies more often is given up by its supervisor
+    if len(kills) == kills.maxlen:  # the supervisor gives up a station whose processes end more often
         time.sleep(max(0.0, kills[0] + RESTART_WINDOW_S + 1.0 - time.monotonic()))
     lab.reach("idle", "ready")
     lab.ready()
@@ -99,9 +99,9 @@ def _closed(folder: Path) -> Episode:
 
 
 def _loss(episode: Episode, killed: float) -> dict[str, Any]:
-    """From the last row that is left, with its pictures, until the kill [s]; a row stands for its own period.
+    """Return the time from the last complete row, including its period, until the kill [s].
 
-    Where none is left, from when the episode began.
+    Without any row, from the episode's begin.
     """
     times = episode.rows.column("tick_time").to_numpy()
     started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
@@ -119,7 +119,7 @@ def _loss(episode: Episode, killed: float) -> dict[str, Any]:
 
 
 def make_episodes(data: Path, frames: Path, episodes: int = EPISODES) -> None:
-    """Finished episodes of two seconds for the worker to publish."""
+    """Create finished episodes of two seconds for the worker to publish."""
     pictures = Frames(frames)
     for _ in range(episodes):
         journal = EpisodeJournal(data / "episodes", RecordingSettings(min_free_bytes=0), patient=True)
@@ -130,14 +130,14 @@ def make_episodes(data: Path, frames: Path, episodes: int = EPISODES) -> None:
 
 
 def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
-    """Kill the worker while it works off a queue, then let one finish: rows per kill, the last of what came of it.
+    """Kill the worker during its jobs, then let one finish; return a row per kill, and a last one with the result.
 
-    `problems` are the sentences of what did not open.
+    `problems` are sentences on files that cannot be opened.
     """
     environment = os.environ | {
         "EVA_DATA_DIR": str(data),
         "EVA_LOG_LEVEL": "ERROR",
-        "EVA_JOB_STALE_S": "12",  # sweeping a dead worker's job is what is waited for here
+        "EVA_JOB_STALE_S": "12",  # short, because the benchmark waits until a dead worker's job is reclaimed
     }
     asked = _ask(environment)
     rows = []
@@ -160,7 +160,7 @@ def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
 
 
 def _ask(environment: Mapping[str, str]) -> list[str]:
-    """Have every closed episode published, anew where it is already; their uuids."""
+    """Enqueue the publication of every closed episode, repeated if published already; return their uuids."""
     command = [sys.executable, "-m", "benchmarks.recording_jobs"]
     done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True, text=True)
     found: list[str] = json.loads(done.stdout.splitlines()[-1])
@@ -179,7 +179,7 @@ def _worker(environment: Mapping[str, str]) -> Iterator[subprocess.Popen[bytes]]
 
 
 def _working(data: Path, worker: subprocess.Popen[bytes], dead: Collection[str]) -> tuple[str, str]:
-    """The key and the owner of the first job that this worker has; jobs of the `dead` are their own still."""
+    """Return key and owner of this worker's first job; jobs of `dead` owners may still be listed."""
     begun = time.monotonic()
     while time.monotonic() - begun < 60.0 and worker.poll() is None:
         for key, owner in _query(data, RUNNING):
@@ -198,7 +198,7 @@ def _published(data: Path, worker: subprocess.Popen[bytes], asked: list[str]) ->
 
 
 def _missing_s(data: Path, asked: list[str]) -> float:
-    """Of what was recorded, the longest that an episode's dataset has not [s]; all of it where it is in none."""
+    """Return the longest part of a recording that is missing in its dataset [s]; all of it if it is not published."""
     worst = 0.0
     for uuid in asked:
         episode = open_episode(data / "episodes" / uuid)
@@ -216,7 +216,7 @@ def _query(data: Path, query: str) -> list[Any]:
 
 
 def _problems(data: Path) -> list[str]:
-    """Datasets and episodes that do not open as they are, before anything has been mended."""
+    """Return datasets and episodes that cannot be opened as they are, before any repair."""
     datasets = [info.parents[1] for info in data.glob(f"datasets/**/{INFO}")]
     found = [f"{dataset.name}: {said}" for dataset in datasets for said in check(dataset)]
     for folder in data.glob("episodes/*"):

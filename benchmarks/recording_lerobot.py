@@ -1,7 +1,7 @@
 """LeRobot's own writer: `PYTHON -m benchmarks.recording_lerobot FRAMES COUNT FOLDER MODE`; prints JSON.
 
-Runs in an interpreter that has LeRobot 0.4 and nothing of ours. MODE is `default`, its pictures as PNG files that
-save_episode encodes, or `streaming`, H.264 while it records.
+Runs in an interpreter with LeRobot 0.4 and without our packages. MODE is `default`, with images as PNG files that
+save_episode encodes, or `streaming`, H.264 during recording.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, feed_frames, finish, joints
 
 MODES: dict[str, dict[str, Any]] = {
-    "default": {"image_writer_threads": 4 * len(CAMERAS)},  # as its lerobot-record has it
+    "default": {"image_writer_threads": 4 * len(CAMERAS)},  # as in lerobot-record
     "streaming": {"streaming_encoding": True, "vcodec": "h264"},
 }
 
@@ -50,13 +50,13 @@ def main(path: str, count: str, folder: str, mode: str) -> None:
 
 
 def _operators() -> Any:
-    """Declares what torchvision asks for and a torch without GPU lacks; lives as long as what is returned."""
+    """Declare operators that torchvision requires and a torch without GPU lacks; keep the returned library alive."""
     import torch
 
     library = torch.library.Library("torchvision", "DEF")
     try:
         library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-    except RuntimeError:  # it is there already
+    except RuntimeError:  # it is declared already
         return None
     return library
 

@@ -1,6 +1,6 @@
-"""The page of all episodes with many of them: `python -m benchmarks.recording_listing COUNT`; prints JSON.
+"""Page of all episodes with many of them: `python -m benchmarks.recording_listing COUNT`; prints JSON.
 
-EVA_DATA_DIR is a folder of its own; the page is asked for as a browser does, through all of the web's layers.
+EVA_DATA_DIR is a separate folder; requests pass through all layers of the web.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FILTERS = {
 
 
 def main(count: int) -> None:
-    """By filter: the median of seven requests [ms]."""
+    """Print by filter the median of seven requests [ms]."""
     import django
 
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
@@ -45,7 +45,7 @@ def main(count: int) -> None:
     page.force_login(user)
     rows = []
     for name, query in FILTERS.items():
-        took = [_request(page, query) for _ in range(_AGAIN + 1)][1:]  # the first compiles templates
+        took = [_request(page, query) for _ in range(_AGAIN + 1)][1:]  # the first request compiles templates
         walls, used = zip(*took, strict=True)
         rows.append(
             {
@@ -59,7 +59,7 @@ def main(count: int) -> None:
 
 
 def _request(page: Any, query: str) -> tuple[float, float]:
-    """Time of a request, and processor time of it [ms]."""
+    """Return wall time and processor time of a request [ms]."""
     begun, used = time.perf_counter(), time.process_time()
     answer = page.get(f"/replay/?{query}")
     took = (time.perf_counter() - begun) * 1000.0, (time.process_time() - used) * 1000.0
@@ -69,7 +69,7 @@ def _request(page: Any, query: str) -> tuple[float, float]:
 
 
 def _fill(count: int) -> None:
-    """Episodes of three stations, of all modes and ends, half of them trials' rollouts; all can be played."""
+    """Create playable episodes of three stations, of all modes and results, half of them of trials."""
     from django.utils import timezone
 
     from evaweb.episodes.folders import preview_folder

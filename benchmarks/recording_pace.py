@@ -1,6 +1,6 @@
-"""Frames that any recorder can be given, and the pace of a camera to give them at.
+"""Frames for any recorder, and a camera's pace.
 
-Nothing but numpy is imported: the interpreter of another recorder runs this too.
+Imports only numpy, because the interpreters of other recorders run it too.
 """
 
 from __future__ import annotations
@@ -22,48 +22,48 @@ _LATE_S = 1.0 / FPS
 
 
 class Frames:
-    """Pictures on disk, RGB uint8 [N, cameras, H, W, 3], shown to and fro so that motion has no cut."""
+    """Images on disk, RGB uint8 [N, cameras, H, W, 3], played forwards and backwards for continuous motion."""
 
     def __init__(self, path: Path) -> None:
         self._pictures = np.load(path, mmap_mode="r")
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """By camera, picture `index` [H, W, 3], in memory of its own."""
+        """Return image `index` by camera [H, W, 3], as copies."""
         turn = 2 * len(self._pictures) - 2
         place = min(index % turn, turn - index % turn)
         return {camera: np.array(self._pictures[place, number]) for number, camera in enumerate(CAMERAS)}
 
 
 def joints(index: int) -> Any:
-    """Joints [14] of frame `index`, float32 rad."""
+    """Return the joints of frame `index`, float32 [14] rad."""
     return np.sin(index / FPS + np.arange(JOINTS)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderCost:
-    """Cost of an episode to one recorder; processor times with its children's [s]."""
+    """Cost of an episode to a recorder; processor times include children [s]."""
 
     frames: int
     capture_cpu_s: float
-    save_cpu_s: float  # until the dataset holds the episode
+    save_cpu_s: float  # until the dataset contains the episode
     save_s: float
-    add_mean_ms: float  # that the caller waits per frame
+    add_mean_ms: float  # delay of the caller per frame
     add_p99_ms: float
     add_max_ms: float
-    late: int  # frames that were given a whole period too late, as the one before them took so long
+    late: int  # frames given more than a period late, because the previous one took so long
     bytes: int
     peak_mb: float
 
     def fields(self) -> dict[str, Any]:
-        """As JSON has them."""
+        """Return the fields as JSON."""
         return asdict(self)
 
 
 def feed_frames(frames: Frames, count: int, add: Callable[[int, dict[str, Any]], None]) -> dict[str, Any]:
-    """Call `add` for `count` frames at 30 Hz; the first half of a Written."""
+    """Call `add` for `count` frames at 30 Hz; return the first fields of a RecorderCost."""
     took, late = [], 0
     before = processor_s()
-    own = 0.0  # of making the frames, which is no recorder's
+    own = 0.0  # for creating the frames, which is not the recorder's
     begun = time.monotonic()
     for index in range(count):
         drawn = time.thread_time()
@@ -86,7 +86,7 @@ def feed_frames(frames: Frames, count: int, add: Callable[[int, dict[str, Any]],
 
 
 def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> RecorderCost:
-    """Call `save` and put the whole together; `folder` holds what was saved."""
+    """Call `save` and return the complete cost; `folder` contains what was saved."""
     before, begun = processor_s(), time.monotonic()
     save()
     return RecorderCost(
@@ -99,6 +99,6 @@ def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> Rec
 
 
 def processor_s() -> float:
-    """Of this process with all its threads, and of its children that have ended [s]."""
+    """Return the processor time of this process and of its ended children [s]."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)

@@ -1,4 +1,4 @@
-"""One recording of a whole station: what it takes, how soon frames are on disk, how it ends and is published."""
+"""Recording of a complete station: cost, delay until frames are on disk, end, and publication."""
 
 from __future__ import annotations
 
@@ -21,16 +21,20 @@ from tests.crash.lab import Lab
 from tests.processes import PATIENCE_S
 
 SIZE = ("--width", "640", "--height", "480")
-_SETTLED_S = 3.0  # of a recording, until encoders, queues and pools have what they need
+_SETTLED_S = 3.0  # start of a recording, until encoders, queues and pools are allocated
 _SIZES_PERIOD_S = 0.01
 _MEMORY_PERIOD_S = 0.5
 
 
 class PatientLab(Lab):
-    """Its processes may start on a machine that is full."""
+    """Lab that tolerates slow starts of its processes on a busy machine."""
 
     def ready(self, **asked: Any) -> PatientLab:
-        """Set up, again where a process that was killed is not back yet; AssertionError says what is in the way."""
+        """Set up, repeatedly while a killed process is restarting.
+
+        Raises:
+            AssertionError: If it remains impossible.
+        """
         begun = time.monotonic()
         while True:
             try:
@@ -44,21 +48,23 @@ class PatientLab(Lab):
 
 
 class Watch:
-    """Looks at both processes and at the videos of an episode from outside, on a thread, until `end`."""
+    """Observer of both processes and of an episode's videos, in a thread until `end`."""
 
     def __init__(self, media: psutil.Process, reception: psutil.Process, folder: Path) -> None:
         self._media, self._reception = media, reception
         self._folder = folder
         self._ending = threading.Event()
-        self.memory: list[float] = []  # of media, resident [MB], every half second from when it has settled
-        self.processor = self.receiving = 0.0  # of media, and of reception [s], from then on
+        self.memory: list[float] = []  # resident memory of media [MB], every half second after settling
+        self.processor = self.receiving = 0.0  # processor time of media, and of reception [s], after settling
         self.seconds = 0.0
-        self.sizes: dict[str, list[tuple[float, int]]] = {}  # (monotonic, bytes) whenever a video has grown
+        self.sizes: dict[
+            str, list[tuple[float, int]]
+        ] = {}  # (monotonic time, bytes) whenever a video has grown
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def end(self) -> None:
-        """Look no more."""
+        """Stop observing."""
         self._ending.set()
         self._thread.join()
 
@@ -86,7 +92,7 @@ class Watch:
 
 
 def resident_mb(process: psutil.Process) -> float:
-    """Resident memory of a process [MB]."""
+    """Return the resident memory of a process [MB]."""
     return float(process.memory_info().rss) / 1e6
 
 
@@ -96,7 +102,7 @@ def _used(process: psutil.Process) -> float:
 
 
 def record(folder: Path, seconds: float) -> dict[str, Any]:
-    """Bring up a station with three cameras of 640x480 at 30 Hz, record `seconds` of a run, end it, publish it."""
+    """Start a station with three cameras of 640x480 at 30 Hz, record a run of `seconds`, end and publish it."""
     lab = PatientLab(folder)
     try:
         lab.node(*SIZE).server()
@@ -147,15 +153,15 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
 
 
 def _missed(lab: Lab) -> int:
-    """Observations that the node has sent and the station has not received."""
+    """Return the number of observations that the node sent and the station did not receive."""
     return int(lab.client.status()["link"]["faults"].get("frames_lost", 0))
 
 
 def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
-    """Rows that the grid has and the table has not, pictures that a row was given and its video has not.
+    """Return missing rows of the grid, and images that were given but are not in the video.
 
-    And the pictures of `missed` observations. `grid_repeats` and `grid_skips` are no loss: a source at 30 Hz of its
-    own beside a grid of 30 Hz of ours.
+    Images of `missed` observations are included. `grid_repeats` and `grid_skips` are not losses: source and grid have
+    independent clocks of 30 Hz.
     """
     rows, outcome = episode.rows, episode.outcome or {}
     times = rows.column("tick_time").to_numpy()
@@ -185,7 +191,9 @@ def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
 
 
 def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> dict[str, float]:
-    """From the capture of a picture until the file holds all of its packet, as seen from outside [ms]."""
+    """Return the time from an image's capture until its packet is completely in the file, observed from
+    outside [ms].
+    """
     started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
     taken: list[float] = []
     for camera, video in episode.videos.items():
@@ -195,7 +203,7 @@ def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> d
         captured = episode.rows.column(f"capture_time.{camera}").to_numpy() + started
         repeated = episode.rows.column(f"repeated.{camera}").to_numpy()
         count = min(len(ends), len(captured))
-        seen = np.searchsorted(grown, ends[:count])  # the first look that found at least so many bytes
+        seen = np.searchsorted(grown, ends[:count])  # first observation of at least that many bytes
         known = (seen < len(times)) & np.isfinite(captured[:count]) & ~repeated[:count]
         taken.extend((times[seen[known]] - captured[:count][known]) * 1000.0)
     if not taken:
@@ -205,9 +213,11 @@ def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> d
 
 
 def published(episode: Path, dataset: Path, frames: int) -> dict[str, Any]:
-    """Publish by the command line; how long it takes, and how many coded frames differ from those recorded."""
+    """Publish by the command line; return its duration, and the number of encoded frames that differ from the
+    recording.
+    """
     command = [sys.executable, "-m", "runtime.datasets", "publish", str(episode), "--to", str(dataset)]
-    command.append("--include-interrupted")  # one that failed on a full machine is measured all the same
+    command.append("--include-interrupted")  # measure it even if the run failed on a busy machine
     begun = time.monotonic()
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     took = time.monotonic() - begun

@@ -1,6 +1,6 @@
-"""Time until an episode plays: from its address to the first picture of every camera.
+"""Time until an episode plays: from its address to the first image of every camera.
 
-The demo records a run; then the web alone serves it to Debian's Chromium, which has seen nothing of it before.
+The demo records a run; then the web alone serves it to Debian's Chromium with an empty cache.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SECONDS = 30.0  # of the recording
 _AGAIN = 9
 _KNOWN_S = 60.0
 _SHOWN_MS = 30_000
-# Runs before the page's own scripts: notes when every camera has a picture, in ms since the address was asked for.
+# Runs before the page's own scripts: records when every camera has an image, in ms since the navigation.
 _WATCH = """
 (() => {
   const cameras = () => [...document.querySelectorAll("video[data-camera]")];
@@ -44,7 +44,7 @@ _WATCH = """
 
 
 def measure(seconds: float) -> Report:
-    """`replay_start_ms` and `replay_fetched_share` (of the videos): medians of nine visits, each of a new browser."""
+    """Measure `replay_start_ms` and `replay_fetched_share` (of the videos): medians of nine visits by new browsers."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         ready = folder / "ready.json"
@@ -64,7 +64,7 @@ def measure(seconds: float) -> Report:
 
 
 def _recorded(visitor: RestClient, seconds: float) -> str:
-    """The episode of a run of so long, once its videos can be played."""
+    """Return the episode of a run of that length, when its videos can be played."""
     with closing(LivePage(visitor, STATION)) as page:
         scene = visitor.get("scenes")["items"][0]
         checkpoint = visitor.get("checkpoints")["items"][0]["name"]
@@ -84,7 +84,7 @@ def _recorded(visitor: RestClient, seconds: float) -> str:
 
 @contextmanager
 def _web(data: Path) -> Iterator[str]:
-    """The web alone, on a free port; its address."""
+    """Yield the address of a web process alone, on a free port."""
     child = subprocess.Popen(
         [sys.executable, "manage.py", "serve", "--port", "0", "--lifeline"],
         cwd=ROOT,
@@ -103,7 +103,7 @@ def _web(data: Path) -> Iterator[str]:
 
 
 def _visits(url: str, password: str, episode: str, size: int) -> Iterator[dict[str, Any]]:
-    """One browser after the other, none of which has anything kept; the first warms up the web and is not counted."""
+    """Yield visits of new browsers; the first visit, which warms up the web, is not counted."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

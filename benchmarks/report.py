@@ -15,7 +15,7 @@ _COMPARE = {"<=": operator.le, "<": operator.lt, ">=": operator.ge, "==": operat
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One number and what it should be, as "<= 0.5"; "" where it is only reported."""
+    """Number with its requirement, such as "<= 0.5"; "" if it is only reported."""
 
     name: str
     value: float
@@ -24,7 +24,7 @@ class Figure:
 
     @property
     def holds(self) -> bool | None:
-        """True if the value is as wanted; None where nothing is wanted."""
+        """Whether the value meets the requirement; None without one."""
         if not self.wanted:
             return None
         sign, bound = self.wanted.split()
@@ -33,14 +33,14 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The figures of one run, and the rows they were made from."""
+    """Figures of one run, and the rows from which they were computed."""
 
     name: str
     figures: Sequence[Figure]
     rows: Sequence[Mapping[str, object]] = field(default_factory=list)
 
     def table(self) -> str:
-        """The figures in columns."""
+        """Return the figures as a table."""
         width = max(len(figure.name) for figure in self.figures)
         marks = {True: "ok", False: "MISSED", None: ""}
         return "\n".join(
@@ -49,18 +49,18 @@ class Report:
         )
 
     def write(self, path: Path) -> None:
-        """The report as JSON, in a file."""
+        """Write the report as JSON to a file."""
         path.write_text(self.json(), "utf-8")
 
     def json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         figures = [asdict(figure) | {"holds": figure.holds} for figure in self.figures]
         content = {"name": self.name, "machine": machine(), "figures": figures, "rows": list(self.rows)}
         return json.dumps(content, indent=1, default=str)
 
 
 def machine() -> dict[str, object]:
-    """Machine on which the figures were measured."""
+    """Return the properties of the machine on which the figures were measured."""
     return {
         "cpus": os.cpu_count(),
         "load": os.getloadavg(),

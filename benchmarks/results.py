@@ -1,6 +1,6 @@
-"""Pages of results over 100,000 trials of 200 evaluations, exports, handing out at once, and the stopping rule.
+"""Result pages with 100,000 trials of 200 evaluations, exports, concurrent allocation, and the stopping rule.
 
-On SQLite, and on PostgreSQL where its programs and a driver are installed: a server of its own in a scratch folder.
+On SQLite, and on PostgreSQL if its programs and a driver are installed: a separate server in a scratch folder.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from evaweb.statistics.sequential import success_evidence
 
 PLANS, TRIALS = 200, 100_000
 RATES = (0.5, 0.8, 0.3)
-RUNS = 2000  # of the stopping rule at each rate
+RUNS = 2000  # runs of the stopping rule at each rate
 PAIRS = 100
-FIRST_LOOK = 10  # pairs, of who peeks at a test for a fixed number after every pair
+FIRST_LOOK = 10  # first pair after which the peeking reader tests
 ALPHA = 0.05
 PAGES = (
     "dashboard",
@@ -38,17 +38,17 @@ PAGES = (
     "export_statistics",
 )
 WANTED_MS, MOST_QUERIES = 200, 53
-MANY_PLANS, MANY_TRIALS, COPIES = 42, 21_000, 50  # together a million
-MANY_WANTED_MS = {"all_trials": 500, "dashboard": 500}  # pages over all of a million
+MANY_PLANS, MANY_TRIALS, COPIES = 42, 21_000, 50  # together a million trials
+MANY_WANTED_MS = {"all_trials": 500, "dashboard": 500}  # pages over all trials
 _ROOT = Path(__file__).parents[1]
 
 
 def measure(
     seconds: float, plans: int = PLANS, trials: int = TRIALS, runs: int = RUNS, long: bool = False
 ) -> Report:
-    """All figures; `long`: also of a million trials, on PostgreSQL.
+    """Return all figures; with `long` also those of a million trials, on PostgreSQL.
 
-    `seconds` bounds nothing here, because what is measured is counted.
+    `seconds` is ignored, because the amount of work is fixed.
     """
     figures = list(rule_figures(runs))
     rows: list[dict[str, Any]] = []
@@ -74,7 +74,7 @@ def measure(
 def _measured(
     data: Path, environment: dict[str, str], plans: int, trials: int, copies: int = 1
 ) -> dict[str, Any]:
-    """Findings on one database, by a program of its own."""
+    """Return the results on one database, from a separate program."""
     data.mkdir()
     out = data / "out.json"
     counts = {"--plans": plans, "--trials": trials, "--copies": copies}
@@ -93,7 +93,7 @@ def _measured(
 
 
 def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
-    """Of one database."""
+    """Yield the figures of one database."""
     name = row["database"]
     for page in PAGES:
         found = row["pages"][page]
@@ -114,7 +114,7 @@ def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
 
 
 def rule_figures(runs: int) -> Iterator[Figure]:
-    """Rates at which the stopping rule, and a peeking reader, find a difference between equal checkpoints."""
+    """Yield the rates at which the stopping rule, and a peeking reader, separate equal checkpoints."""
     for rate in RATES:
         chance = random.Random(f"{rate}")
         found = naive = 0
@@ -127,7 +127,7 @@ def rule_figures(runs: int) -> Iterator[Figure]:
 
 
 def _peeked(pairs: list[tuple[bool, bool]]) -> bool:
-    """True if a fixed-size test of pairs (two proportions, pooled) is significant at any of the looks."""
+    """Return True if a fixed-size test of two pooled proportions is significant at any of the looks."""
     x1 = x2 = 0
     for n, (one, other) in enumerate(pairs, start=1):
         x1, x2 = x1 + one, x2 + other

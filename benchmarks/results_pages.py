@@ -1,7 +1,7 @@
-"""The pages of results on one database: `python -m benchmarks.results_pages OUT.json [--plans N] [--trials N]`.
+"""Result pages on one database: `python -m benchmarks.results_pages OUT.json [--plans N] [--trials N]`.
 
-EVA_DATA_DIR and DATABASE_URL say which database; it has to be empty, and is filled first. Requests go through the
-whole of the web's middleware within this process, without a socket.
+The database of EVA_DATA_DIR and DATABASE_URL must be empty, and is filled first. Requests pass through the web's
+complete middleware in this process, without a socket.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from typing import Any
 from benchmarks.results_seed import Seeded, closed_episode, multiplied, seed
 
 ROUNDS = 120
-_QUESTIONS = 40  # to the planner, at once
+_QUESTIONS = 40  # simultaneous requests to the calculator
 _MS = 1000.0
 
 
 def main() -> None:
-    """Fill, ask, write what was measured."""
+    """Fill the database, send the requests, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--plans", type=int, default=200)
@@ -63,7 +63,9 @@ def main() -> None:
 
 
 def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
-    """Of each page: p50 and p95 [ms] of many requests, of the first to each evaluation, and most queries of one."""
+    """Return by page p50 and p95 [ms] of many requests, of the first per evaluation, and the most queries of
+    a request.
+    """
     from django.db import connection
     from django.test import Client
     from django.test.utils import CaptureQueriesContext
@@ -75,7 +77,7 @@ def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
     chance = random.Random(1)
     found = {}
     for page, address in _addresses(seeded).items():
-        _ask(client, address(seeded.plans[0]))  # templates are read, scipy is imported
+        _ask(client, address(seeded.plans[0]))  # loads templates and scipy
         caching.clear_caches()
         cold: list[float] = []
         warm: list[float] = []
@@ -126,8 +128,9 @@ def _addresses(seeded: Seeded) -> dict[str, Callable[[Any], str]]:
 
 
 def planner(seeded: Seeded) -> dict[str, float]:
-    """A page of others while one viewer asks the planner so many different questions at once: p95 [ms] of the page, and
-    how many questions were answered, and refused with when to ask again.
+    """Return the delay of other pages while one viewer sends many different requests to the calculator.
+
+    p95 of the page [ms], and the numbers of answered requests and of those refused with a retry time.
     """
     from django.test import Client
 
@@ -158,7 +161,7 @@ def planner(seeded: Seeded) -> dict[str, float]:
 
 
 def exports(seeded: Seeded) -> dict[str, float]:
-    """Rows per second of exports of all trials, and of evaluations one after the other."""
+    """Return the rows per second of exports of all trials, and of single evaluations."""
     from django.test import Client
 
     client = Client()
@@ -187,7 +190,7 @@ def _parquet_rows(content: bytes) -> int:
 
 
 def measure_allocation(seeded: Seeded) -> dict[str, float]:
-    """All operators ask for trials of one plan at all stations at once until none is left."""
+    """Let all operators request trials of one plan at all stations simultaneously, until none is left."""
     from evaweb.plans.models import Plan
     from evaweb.plans.services import freeze_plan
 
@@ -241,9 +244,9 @@ def measure_allocation(seeded: Seeded) -> dict[str, float]:
 def _operator(
     plan: Any, operator: Any, station: Any, times: list[float], locked: list[str], faults: list[str]
 ) -> None:
-    """Ask, run, score, ask again; somebody else's trial on the station is waited for.
+    """Request, run and score trials in a loop; another operator's trial on the station is waited for.
 
-    Where the database stays locked longer than it waits, the web refuses and the operator asks again: `locked`.
+    If the database is locked for too long, the web refuses and the operator retries: `locked`.
     """
     from django.db import OperationalError, connection
 
@@ -283,7 +286,7 @@ def _asked(plan: Any, operator: Any, station: Any, times: list[float]) -> Any:
 
 
 def _made(trial: Any, operator: Any) -> None:
-    """Its run is over, and it is scored."""
+    """End the run of a trial, and score it."""
     from django.utils import timezone
 
     from evaweb.trials.models import Milestone, Trial, TrialStatus
@@ -300,7 +303,7 @@ def _made(trial: Any, operator: Any) -> None:
 
 
 def _out_of_order(handed: Sequence[tuple[int, int, int]]) -> int:
-    """Blocks that did not begin in the order of the schedule, or that a station left, or that two stations had."""
+    """Return the number of blocks that began out of order, changed station, or had two stations."""
     begun = list(dict.fromkeys(block for _, block, _ in handed))
     wrong = sum(one > other for one, other in pairwise(begun))
     for station in {station for *_, station in handed}:

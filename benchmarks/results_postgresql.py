@@ -1,4 +1,4 @@
-"""A PostgreSQL server of one's own, in a scratch folder, reached by a socket there."""
+"""Separate PostgreSQL server in a scratch folder, reached by a socket there."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 _PLACES = sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
-_USER = "postgres"  # the server refuses to be root
+_USER = "postgres"  # the server refuses to run as root
 
 
 def why_not() -> str:
-    """Why it cannot be measured here, "" where it can."""
+    """Return why a server cannot run here, "" if it can."""
     if find_spec("psycopg") is None:
         return "the driver psycopg is not installed"
     if _program("initdb") is None:
@@ -28,13 +28,13 @@ def why_not() -> str:
 
 @contextmanager
 def server(folder: Path) -> Iterator[str]:
-    """Its address for DATABASE_URL, while it runs; durable as it is by default."""
+    """Yield the server's address for DATABASE_URL; its durability settings are the defaults."""
     folder.mkdir()
     if os.geteuid() == 0:
         shutil.chown(folder, _USER)
         for parent in folder.parents:
             if parent.stat().st_uid == 0 and parent.stat().st_mode & 0o777 == 0o700:
-                parent.chmod(0o711)  # the scratch folder of this program only
+                parent.chmod(0o711)  # only the scratch folder of this program
     data = folder / "data"
     _run("initdb", "-D", str(data), "-U", "eva", "-A", "trust", "-E", "UTF8")
     options = f"-k {folder} -c listen_addresses='' -c fsync=on"

@@ -1,4 +1,4 @@
-"""A lab with many evaluations in the database, as they would be after years: for measurements of pages."""
+"""Database of a lab with many evaluations, as after years, for measurements of pages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _COPIED = (
 
 @dataclass(frozen=True, slots=True)
 class Seeded:
-    """Seeded data: plans whose results every user may see, their viewer, operators, stations."""
+    """Seeded data: plans with visible results, their viewer, operators, stations."""
 
     plans: Sequence[Any]
     viewer: Any
@@ -40,7 +40,9 @@ class Seeded:
 
 
 def seed(plans: int, trials: int) -> Seeded:
-    """`plans` evaluations of together about `trials` trials, the last twentieth of the plans still running."""
+    """Create `plans` evaluations with about `trials` trials in all; the last twentieth of the plans is still
+    running.
+    """
     from django.contrib.auth.models import Group, User
 
     from evaweb.stations.models import Station
@@ -63,7 +65,7 @@ def seed(plans: int, trials: int) -> Seeded:
             for n, text in enumerate(_MILESTONES, start=1)
         )
     checkpoints = [Checkpoint.objects.create(name=f"policy-{i:02}") for i in range(12)]
-    late = round(plans * 0.95)  # from this one on they still run
+    late = round(plans * 0.95)  # plans from here on are still running
     share = trials // plans
     made = [
         _plan(i, share, chance, operators, stations, scenes, checkpoints, i >= late) for i in range(plans)
@@ -72,9 +74,9 @@ def seed(plans: int, trials: int) -> Seeded:
 
 
 def multiplied(seeded: Seeded, times: int) -> Seeded:
-    """Each evaluation with all that belongs to it so many times, each copy before the last one; on PostgreSQL.
+    """Multiply each evaluation with all its rows, older copies first; PostgreSQL only.
 
-    The server copies rows, and checks none of them: its user has to be its superuser.
+    The server copies rows without checks: its user must be a superuser.
     """
     from django.apps import apps
     from django.db import connection, transaction
@@ -83,7 +85,7 @@ def multiplied(seeded: Seeded, times: int) -> Seeded:
 
     models = [apps.get_model(name) for name in _COPIED]
     with transaction.atomic(), connection.cursor() as cursor:
-        cursor.execute("SET LOCAL session_replication_role = replica")  # neither triggers nor foreign keys
+        cursor.execute("SET LOCAL session_replication_role = replica")  # without triggers and foreign keys
         steps = {model: _newest(cursor, model) for model in models}
         for model in models:
             table, fields = model._meta.db_table, model._meta.concrete_fields
@@ -104,7 +106,7 @@ def multiplied(seeded: Seeded, times: int) -> Seeded:
 
 
 def _newest(cursor: Any, model: Any) -> int:
-    """The highest number of a row; 0 where rows have no numbers."""
+    """Return the highest primary key; 0 if keys are not integers."""
     from django.db.models import AutoField
 
     if not isinstance(model._meta.pk, AutoField):
@@ -114,7 +116,7 @@ def _newest(cursor: Any, model: Any) -> int:
 
 
 def _copied(field: Any, steps: Mapping[Any, int]) -> str:
-    """A column of a copy, in SQL."""
+    """Return the SQL expression of a column in a copy."""
     column = f'"{field.column}"'
     of = field.related_model if field.is_relation else field.model if field.primary_key else None
     if steps.get(of):
@@ -174,7 +176,7 @@ def _trials(
     begin: datetime,
     share: float,
 ) -> None:
-    """The first `share` of a plan's slots handed out, run, scored and counted."""
+    """Create the first `share` of a plan's trials: allocated, run, scored and counted."""
     slots = list(plan.slots.order_by("index"))
     slots = slots[: int(len(slots) * share)]
     trials = _run(plan, slots, chance, operators, stations, begin)
@@ -192,7 +194,7 @@ def _run(
     stations: Sequence[Any],
     begin: datetime,
 ) -> list[Any]:
-    """A trial of each slot with its recording; each block at one station, by one operator."""
+    """Return a trial with recording for each slot; each block has one station and one operator."""
     block_of = {slot.block: (chance.choice(stations), chance.choice(operators)) for slot in slots}
     trials = []
     for number, slot in enumerate(slots):
@@ -206,7 +208,7 @@ def _run(
 
 
 def closed_episode(station: Any, started: datetime, seconds: float) -> Any:
-    """A recording of 30 rows a second that is closed; not saved."""
+    """Return an unsaved closed recording with 30 rows per second."""
     from evaweb.episodes.models import Episode
 
     return Episode(
@@ -244,7 +246,7 @@ def _trial(plan: Any, slot: Any, episode: Any, operator: Any) -> Any:
 
 
 def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Random) -> None:
-    """A score of each trial; `skill` is how often a checkpoint succeeds. Milestones are reached in their order."""
+    """Score each trial; `skill` is the success rate by checkpoint. Milestones are reached in order."""
     from evaweb.trials.models import Milestone, MilestoneOutcome, Score
 
     stones: dict[int, list[Any]] = {}
@@ -283,7 +285,7 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
 
 
 def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
-    """Write how each trial was handed out, in the order of the schedule."""
+    """Create the handouts in the order of the schedule."""
     from evaweb.plans.commitment import draw_codes
     from evaweb.plans.models import Handout
 
@@ -297,7 +299,7 @@ def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
 
 
 def _written(rows: Sequence[Any]) -> list[Any]:
-    """The rows of one model in the database: on PostgreSQL by COPY, with their numbers fetched first."""
+    """Insert the rows of one model; on PostgreSQL by COPY, with primary keys reserved first."""
     from django.db import connection
     from django.db.models import AutoField
     from django.db.models.expressions import DatabaseDefault
@@ -333,7 +335,7 @@ def _written(rows: Sequence[Any]) -> list[Any]:
 
 
 def _counted(plan: Any) -> None:
-    """Each trial's one score is its verdict: in one statement, because one by one takes minutes."""
+    """Set each trial's only score as its verdict, in one statement for speed."""
     from django.db import connection
 
     with connection.cursor() as cursor:

@@ -1,7 +1,7 @@
-"""Loops that do nothing but sleep, measured beside ours: `python -m benchmarks.sleeper HOW HZ SECONDS [PRIORITY]`.
+"""Loops that only sleep, for comparison: `python -m benchmarks.sleeper HOW HZ SECONDS [PRIORITY]`.
 
-"rest" is the common way: work, then sleep what is left of the period. "deadlines" sleeps to absolute deadlines as
-our control does, in its scheduling class where a PRIORITY is given: what is late here is the machine's.
+"rest" is the common method: work, then sleep for the remaining period. "deadlines" sleeps to absolute deadlines like
+our control, in its scheduling class if PRIORITY is given: its lateness is the machine's.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from runtime.core.clock import MonotonicClock
 
 
 def main() -> None:
-    """Print one line of JSON: the class it got, and of each wake-up its time, step and lateness [s]."""
+    """Print a line of JSON: scheduling class, and time, step and lateness of each wake-up [s]."""
     how, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
     scheduling = realtime.enter_realtime(int(sys.argv[4])) if len(sys.argv) > 4 else "ordinary"
     loop = {"rest": _rest, "deadlines": _deadlines}[how]
@@ -24,7 +24,7 @@ def main() -> None:
 
 
 def _rest(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep what is left of the period since the last wake-up."""
+    """Sleep for the remaining period since the last wake-up."""
     woke = [time.monotonic()]
     end = woke[0] + seconds
     while woke[-1] < end:
@@ -35,7 +35,7 @@ def _rest(period: float, seconds: float) -> tuple[list[float], list[int], list[f
 
 
 def _deadlines(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep to start + n * period; a deadline that was missed is skipped."""
+    """Sleep until start + n * period; missed deadlines are skipped."""
     clock = MonotonicClock()
     woke: list[float] = []
     steps: list[int] = []

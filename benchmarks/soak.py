@@ -1,4 +1,4 @@
-"""Every fuzzer of benchmarks/fuzzing in turn, scenario after scenario: what was violated, what leaked, what grew."""
+"""All fuzzers of benchmarks/fuzzing in turn, scenario after scenario: violations, leaks, memory growth."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from benchmarks import fuzzing
 from benchmarks.report import Figure, Report
 
 SECONDS = 120.0
-_SETTLED = 0.25  # of the time, after which nothing should grow any more
-_GROWTH_MB = 0.05  # per round: less than any scenario that is kept as a whole
-_ROUNDS = 200  # from which on that is more than noise, and everything has been loaded before them
+_SETTLED = 0.25  # share of the time after which nothing should grow
+_GROWTH_MB = 0.05  # per round: less than any complete scenario
+_ROUNDS = 200  # rounds from which growth exceeds noise, with everything loaded before
 
 Fuzzer = Callable[[int], list[str]]
 
@@ -39,20 +39,20 @@ class HeldResources(NamedTuple):
 
 
 def fuzzers() -> Mapping[str, Fuzzer]:
-    """`once` of each module in benchmarks/fuzzing, by its name."""
+    """Return `once` of each module in benchmarks/fuzzing, by name."""
     names = sorted(module.name for module in pkgutil.iter_modules(fuzzing.__path__))
     modules = {name: importlib.import_module(f"benchmarks.fuzzing.{name}") for name in names}
     return {name: module.once for name, module in modules.items() if hasattr(module, "once")}
 
 
 def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: int | None = None) -> Report:
-    """Scenarios for `seconds`, from the seed `first` on, or from one drawn anew; the report names every violation."""
+    """Run scenarios for `seconds`, from the seed `first` on or a random one; the report lists every violation."""
     chosen = chosen or fuzzers()
     first = secrets.randbelow(2**31) if first is None else first
     begun, seed = time.monotonic(), first
     found = dict.fromkeys(chosen, 0)
     rows: list[dict[str, object]] = [{"first_seed": first}]
-    settled: list[HeldResources] = []  # after each round since then
+    settled: list[HeldResources] = []  # after each round after settling
     while not settled or time.monotonic() - begun < seconds:
         for name, once in chosen.items():
             with _quiet():
@@ -69,7 +69,7 @@ def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: i
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Show errors only: the scenarios themselves provoke the log's warnings."""
+    """Log only errors during the block: the scenarios provoke warnings."""
     log = logging.getLogger("runtime")
     before = log.level
     log.setLevel(logging.ERROR)
@@ -80,9 +80,9 @@ def _quiet() -> Iterator[None]:
 
 
 def held_resources() -> HeldResources:
-    """Resources that this process holds now, without what the C library only has not given back yet."""
+    """Return the resources that this process holds, without memory that the C library has not returned yet."""
     gc.collect()
-    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # musl has none
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # not available in musl
         trim(0)
     process = psutil.Process(os.getpid())
     memory = process.memory_info().rss / 1e6
@@ -90,7 +90,7 @@ def held_resources() -> HeldResources:
 
 
 def _grown(settled: Sequence[HeldResources]) -> list[Figure]:
-    """Growth from round to round; memory is reported on only where the rounds are too few to tell."""
+    """Return the growth per round; memory has no requirement if there are too few rounds."""
     before, after = settled[0], settled[-1]
     memory = [held.memory_mb for held in settled]
     slope = float(theilslopes(memory).slope) if len(memory) > 1 else 0.0

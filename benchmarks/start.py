@@ -1,7 +1,7 @@
-"""From `python -m runtime` of the tabletop deployment to its first snapshot in the state idle, and what that takes.
+"""Time from `python -m runtime` of the tabletop deployment to its first idle snapshot, and its cost.
 
-The bench runs already, and every file has been read before. Processor time and memory are those of each process when
-the snapshot came; modules are those that it had loaded when it ended.
+The bench is running, and every file has been read before. Processor time and memory are those of each process at the
+snapshot; modules are those loaded at its end.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _POLL_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class StartedStation:
-    """A station that is idle: its client, its processes, and how long it took to come there [s]."""
+    """Idle station: its client, its processes, and the time until it was idle [s]."""
 
     client: StationClient
     processes: Mapping[str, psutil.Process]
@@ -54,9 +54,9 @@ class StartedStation:
 def started(
     node: Mapping[str, str], folder: Path, *assignments: str, broken: str = ""
 ) -> Iterator[StartedStation]:
-    """The tabletop's station at `node`; afterwards `folder`/loaded has a file of modules for each program.
+    """Yield the tabletop's station at `node`; afterwards `folder`/loaded has a list of modules for each program.
 
-    `broken` are modules, with commas, that none of its processes can import.
+    `broken` is a comma-separated list of modules that its processes cannot import.
     """
     (folder / "loaded").mkdir(parents=True)
     settings = (
@@ -94,7 +94,7 @@ def started(
 
 
 def _station_dir(folder: Path, assignments: tuple[str, ...]) -> Path:
-    """That of the deployment's station, or of the one that is named in its place."""
+    """Return the folder of the deployment's station, or of the station named in the overrides."""
     named = [one.partition("=")[2].strip('"') for one in assignments if one.startswith("station=")]
     return folder / "stations" / (named[-1] if named else "bench-1")
 
@@ -111,7 +111,7 @@ def _await_idle(client: StationClient, family: subprocess.Popen[bytes], folder: 
 
 
 def loaded(folder: Path, process: str) -> list[str]:
-    """Names of the modules that a process of a station in `folder` had loaded when it ended."""
+    """Return the modules that a process of a station in `folder` had loaded at its end."""
     return (folder / "loaded" / PROGRAMS[process]).read_text().split()
 
 
@@ -126,9 +126,9 @@ def _once(node: Mapping[str, str], folder: Path) -> dict[str, Any]:
 
 
 def measure(seconds: float) -> Report:
-    """`station_ready_s`, and for each process `cpu_s.PROCESS`, `modules.PROCESS` and `memory_mb.PROCESS`; medians of 5.
+    """Measure `station_ready_s`, and `cpu_s.PROCESS`, `modules.PROCESS` and `memory_mb.PROCESS`; medians of 5.
 
-    `seconds` means nothing here.
+    `seconds` is ignored.
     """
     with tempfile.TemporaryDirectory() as name:
         lab = Lab(Path(name))

@@ -1,7 +1,7 @@
-"""The two halves of a strategy in integer steps: a query, a delay, a merge, one action per step.
+"""The two halves of a strategy in integer steps: request, delay, merge, one action per step.
 
-What the coordinator and control do with them, in the same order, and no more: no process, no wire, no safety, a robot
-that is at once where it is told to be. A tick is: collect the answer or ask, merge what was posted, execute.
+As in coordinator and control, in the same order, but without processes, wire and safety, and with a robot that reaches
+each command at once. A tick is: take an answer or send a request, merge, execute.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
 from runtime.strategies.base import ArrivedChunk, MergeResult, Progress, StrategyParameters, join
 
 Policy = Callable[[int, Conditioning | None], Float64]  # observation step, conditioning -> rows [H, D]
-FAR = 0.05  # [rad] that a run's first action may be off without being blended in, as in control
+FAR = 0.05  # [rad] deviation of a run's first action that is not blended in, as in control
 
 
 @dataclass(frozen=True, slots=True)
 class Executed:
-    """One step: what was sent, whose it was, and whether nothing was planned though something should have been."""
+    """Executed step: the action, its contributions, and whether the plan was unexpectedly empty."""
 
     step: int
     action: Float64
-    makers: Contributions  # () where the last target was held
+    makers: Contributions  # () while the last target is held
     starved: bool
 
 
@@ -50,11 +50,11 @@ class Log:
 
     executed: list[Executed] = field(default_factory=list)
     merged: list[MergeResult] = field(default_factory=list)
-    observed: dict[int, int] = field(default_factory=dict)  # by chunk: the step it was asked about
+    observed: dict[int, int] = field(default_factory=dict)  # by chunk: step of its observation
 
 
 class StepLoop:
-    """One run. `delay` gives the ticks that request number n (from 1) takes; `rate` is the control rate [Hz]."""
+    """Run of a strategy; `delay` returns the ticks of request number n (from 1), `rate` is the control rate [Hz]."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class StepLoop:
         self._flight: _Request | None = None
         self._number = 0
         self._asked = -1
-        self._waiting = True  # for the first chunk: no starvation yet
+        self._waiting = True  # for the first chunk: not starvation
         self._starved = False
         self._delays: deque[int] = deque(maxlen=50)
         self._commitment = RtcPrefix(rate, Mixture(self._dims))
@@ -87,7 +87,7 @@ class StepLoop:
         self.tune(strategy, config)
 
     def tune(self, strategy: ModuleType, config: StrategyParameters) -> None:
-        """Go on with this strategy from the next tick on."""
+        """Use this strategy from the next tick on."""
         self._joining = self._joining or self._kind not in ("", strategy.__name__)
         self._kind = strategy.__name__
         waited = self.step > 0 and self._merge.requests_while_stopped
@@ -95,16 +95,16 @@ class StepLoop:
         self._query = strategy.query(config)
         self._merge = strategy.merge(config, self._dims)
         if waited and not self.timeline.remaining(self.step):
-            self._waiting = True  # the robot stands by intention: the next chunk is a first one
+            self._waiting = True  # the robot waits intentionally: the next chunk counts as a first one
 
     def run(self, ticks: int) -> Log:
-        """Do so many ticks."""
+        """Execute that many ticks."""
         for _ in range(ticks):
             self.tick()
         return self.log
 
     def tick(self) -> None:
-        """One control period."""
+        """Execute one control period."""
         if self._flight is None and self._query.should_request(self._progress()):
             self._flight = self._ask()
         if self._flight is not None and self.step >= self._flight.due:
@@ -127,7 +127,7 @@ class StepLoop:
         return _Request(self._number, self.step, due, self._query.requests_while_stopped, rows)
 
     def _conditioning(self) -> Conditioning | None:
-        """The robot's commitment, as the coordinator would tell a policy that continues its chunks."""
+        """Return the conditioning that the coordinator would send to a policy with RTC."""
         quantile, horizon = self._config.delay_quantile, self._config.execution_horizon
         return self._commitment.conditioning(self.step, self._delays, quantile, horizon)
 
@@ -164,7 +164,7 @@ class StepLoop:
 
 
 def _to_message(merged: MergeResult) -> ChunkMerged:
-    """Control's message to the coordinator about it."""
+    """Return control's message to the coordinator about a merge."""
     return ChunkMerged(
         merged.chunk_id,
         1,

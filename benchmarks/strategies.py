@@ -1,25 +1,23 @@
-"""Quality of strategies, each action of the policy being known: offset, error, jerk, reaction, starvation.
+"""Quality of strategies with known policy actions: offset, error, jerk, reaction, starvation.
 
-The halves of the strategies themselves (query, merge, timeline, commitment) are driven in integer steps by
-benchmarks/step_loop.py: no process, no wire, no safety, no robot that lags. So it is deterministic and fast enough
-for every cell. `checked_in_lockstep` counts the actions that the real station, whole and in lockstep
-(benchmarks/strategy_station.py), planned for the same policy; `different_in_lockstep` those that the step loop has
-otherwise, to the bit.
+The halves of the strategies (query, merge, timeline, conditioning) run in integer steps in benchmarks/step_loop.py,
+without processes, wire, safety or robot lag: deterministic, and fast enough for every cell. `checked_in_lockstep` is
+the number of actions that the complete station in lockstep (benchmarks/strategy_station.py) planned for the same
+policy; `different_in_lockstep` is how many of them the step loop does not reproduce bit by bit.
 
-A cell is infeasible where a chunk ends before the next one can have arrived: H < delay + query interval, the
-interval being the longer of 1 / rate and delay + 1 ticks (an answer is asked for on the tick after the last one
-arrived). Its figures are in the rows and count in none of the summary but `unrecovered_starvations`. `sync` waits,
-and is feasible everywhere.
+A cell is infeasible if a chunk ends before the next one can arrive: H < delay + query interval, with the interval the
+longer of 1 / rate and delay + 1 ticks (a chunk is requested on the tick after the last one arrived). Its figures are
+in the rows, but in no summary except `unrecovered_starvations`. `sync` waits, and is always feasible.
 
-* `offset_steps`: by how many steps the published actions are late, found in the numbers alone and not in what the
-  merge says of itself: the shift of the reference, by fractions of a step, that fits them best (least squares).
-  For `sync` the reference of a chunk is the one it was asked for, from the step its first row is executed on.
-* `rms_error` [rad]: published action against the reference at the same moment, also for `sync`.
-* `jerk_ratio`: 95th percentile of the third difference of what is published, relative to that of the reference.
-* `..._disagreeing`: the same where each chunk is off by a constant of its own, up to 0.02 rad: seams show.
-* `reaction50/90/99`: steps from a change of mind by 1 rad until so much of it is published. The worst of four
-  changes, the first one right after a request has gone out, the others spread over the interval.
-* `starved`: steps without a plan. `spike`: the same where one answer takes longer than the chunk lasts.
+* `offset_steps`: delay of the published actions in steps, from the numbers alone and not from what merging reports:
+  the fractional shift of the reference that fits them best (least squares). For `sync` the reference of a chunk is
+  that of its request, from the step on which its first row is executed.
+* `rms_error` [rad]: published action compared with the reference at the same moment, also for `sync`.
+* `jerk_ratio`: 95th percentile of the third difference of the published actions, relative to that of the reference.
+* `..._disagreeing`: the same with a constant offset per chunk of up to 0.02 rad, which makes seams visible.
+* `reaction50/90/99`: steps from a change of intention by 1 rad until that percentage of it is published. The worst of
+  four changes, the first right after a request was sent, the others distributed over the interval.
+* `starved`: steps without a plan. `spike`: the same if one answer takes longer than the chunk lasts.
 """
 
 from __future__ import annotations
@@ -44,17 +42,17 @@ from runtime.strategies.base import JOIN_WINDOW, StrategyParameters
 
 KINDS = ("sync", "async", "ensemble", "naive", "rtc")
 DELAYS = (0, 1, 3, 8, 15)  # [ticks]
-RATES = (1.0, 3.0, 10.0, None)  # [Hz], None back to back
+RATES = (1.0, 3.0, 10.0, None)  # [Hz], None: back to back
 HORIZONS = (16, 50)
 CONTROLS = (30.0, 50.0, 100.0)  # [Hz]
 _SECONDS = 6.0  # of virtual time per run
 _CHANGES = 4
-_SLOW = 4  # number of the request that takes too long, in the run with a spike
+_SLOW = 4  # number of the delayed request in the run with a spike
 
 
 @dataclass(frozen=True, slots=True)
 class Cell(Case):
-    """A case with what is known of it beforehand."""
+    """Case with its derived properties."""
 
     @property
     def interval(self) -> int:
@@ -69,19 +67,19 @@ class Cell(Case):
 
     @property
     def cycle(self) -> int:
-        """Ticks within which everything happens once."""
+        """Ticks within which everything happens at least once."""
         return self.horizon + self.delay + self.interval + JOIN_WINDOW
 
     @property
     def config(self) -> StrategyParameters:
-        """Its parameters: the defaults, at its rate."""
+        """Parameters: the defaults, at the cell's rate."""
         made: StrategyParameters = variants("runtime.strategies")[self.strategy].Config(
             inference_rate=self.inference_hz
         )
         return made
 
     def loop(self, meant: IntendedRows, start: Float64, spike: int = 0) -> StepLoop:
-        """A run of it; request number _SLOW takes `spike` ticks instead."""
+        """Return a run of the cell; request number _SLOW takes `spike` ticks instead."""
         module = variants("runtime.strategies")[self.strategy]
 
         def delay(number: int) -> int:
@@ -110,7 +108,7 @@ class Tracked:
 
 
 def measure(seconds: float) -> Report:
-    """Everything; `seconds` is the budget of the moving target alone, a cell takes as long as it takes."""
+    """Measure everything; `seconds` is the budget of the moving target alone, cells have no limit."""
     cells = [Cell(*values) for values in product(KINDS, CONTROLS, RATES, HORIZONS, DELAYS)]
     with ProcessPoolExecutor(2) as pool:
         rows = list(pool.map(_row, cells, chunksize=20))
@@ -129,7 +127,7 @@ def measure(seconds: float) -> Report:
 
 
 def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
-    """One strategy's: the worst over its feasible cells, and what it does in the cell of the reaction."""
+    """Yield the figures of one strategy: the worst over its feasible cells, and the reaction in one cell."""
     kind, feasible = rows[0]["strategy"], [row for row in rows if row["feasible"]]
     there = next(row for row in rows if all(row[key] == value for key, value in THE_CELL.items()))
     window = StrategyParameters().blend_window
@@ -148,7 +146,7 @@ def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
 
 
 def _row(cell: Cell) -> dict[str, Any]:
-    """Everything of one cell."""
+    """Return the row of a cell."""
     exact, other = measure_tracking(cell, False), measure_tracking(cell, True)
     spike = measure_tracking(cell, False, spike=cell.horizon + 5)
     reaction = measure_reaction(cell) if cell.feasible else (None, None, None)
@@ -171,7 +169,7 @@ def _row(cell: Cell) -> dict[str, Any]:
 
 
 def measure_tracking(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
-    """Follow the reference for _SECONDS after everything has begun."""
+    """Follow the reference for _SECONDS after the initial phase."""
     reference = Reference(cell.control_hz)
     begin = 2 * cell.cycle
     ticks = begin + 4 * spike + int(_SECONDS * cell.control_hz)
@@ -179,7 +177,7 @@ def measure_tracking(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
     meant = chunks_of(table, cell.horizon)
     loop = cell.loop(with_disagreement(meant) if disagree else meant, table[0], spike)
     log = loop.run(ticks)
-    for _ in range(4 * cell.cycle):  # a gap at the end is given the time to end
+    for _ in range(4 * cell.cycle):  # so that a gap at the end can end
         if not log.executed[-1].starved:
             break
         loop.tick()
@@ -202,7 +200,7 @@ def _jerk(actions: Float64) -> float:
 
 
 def _offset(reference: Reference, cell: Cell, log: Log, begin: int) -> float:
-    """By how many steps what is published is late against the reference, to a millionth."""
+    """Return the delay of the published actions relative to the reference [steps], to 1e-6."""
     ticks = [tick for tick in log.executed[begin:] if tick.makers]
     if not ticks:
         return 0.0
@@ -218,7 +216,7 @@ def _offset(reference: Reference, cell: Cell, log: Log, begin: int) -> float:
 
 
 class _Mind:
-    """Means 0 or 1 for every step to come, whatever it meant before."""
+    """Intention of 0 or 1 for all coming steps, whatever it was before."""
 
     def __init__(self, horizon: int) -> None:
         self.value = 0.0
@@ -229,7 +227,9 @@ class _Mind:
 
 
 def measure_reaction(cell: Cell) -> tuple[int, int, int]:
-    """Steps until 50, 90 and 99 % of a change of mind are published, each the worst of _CHANGES changes."""
+    """Return the steps until 50, 90 and 99 % of a change of intention are published, each the worst of
+    _CHANGES changes.
+    """
     mind = _Mind(cell.horizon)
     loop = cell.loop(mind, np.zeros(DIM))
     period = cell.interval if cell.strategy != "sync" else cell.horizon + cell.delay
@@ -249,6 +249,6 @@ def measure_reaction(cell: Cell) -> tuple[int, int, int]:
 
 
 def _last_below(done: Float64, share: float) -> int:
-    """The last step that has not come so far, to a billionth."""
+    """Return the last step below `share`, with a tolerance of 1e-9."""
     below = np.flatnonzero(done < share - 1e-9)
     return int(below[-1]) if len(below) else -1

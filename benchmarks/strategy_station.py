@@ -1,4 +1,4 @@
-"""The whole station in lockstep beside the step loop: the same policy, the same delay, action for action."""
+"""Complete station in lockstep compared with the step loop: same policy, same delay, action by action."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Capabilities, Sink, Source
 
-_SCALE = 0.3  # of the reference: so slow that safety has nothing to change
+_SCALE = 0.3  # of the reference: slow enough for safety to change nothing
 _TICKS = 300
 
 
 class InstantRobot(Source, Sink):
-    """A robot that is at once where it is told to be."""
+    """Robot that reaches each command at once."""
 
     def __init__(self, robot: Robot, clock: Clock) -> None:
         self._clock = clock
@@ -40,10 +40,10 @@ class InstantRobot(Source, Sink):
         self.position = robot.poses["ready"].astype(np.float64)
 
     def connect(self) -> None:
-        """Nothing to open."""
+        """Do nothing: there is no connection."""
 
     def receive(self, timeout: float) -> Observation | None:
-        """Present observation, with black pictures."""
+        """Return the current observation, with black images."""
         self._sequence += 1
         now = self._clock.now()
         return Observation(
@@ -55,15 +55,15 @@ class InstantRobot(Source, Sink):
         )
 
     def send(self, command: RobotCommand) -> None:
-        """Go there."""
+        """Move to the command at once."""
         self.position = command.action.astype(np.float64)
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there are no resources."""
 
 
 class TablePolicy(Policy):
-    """Answers by the number of control steps since the first observation after a reset."""
+    """Policy that answers by the number of control steps since the first observation after a reset."""
 
     def __init__(self, answer: Answering, horizon: int) -> None:
         self._answer = answer
@@ -71,21 +71,21 @@ class TablePolicy(Policy):
         self.first = -1
 
     def connect(self) -> PolicyInfo:
-        """Nothing to reach."""
+        """Return the policy's properties; there is no server."""
         return PolicyInfo("known", action_space="joint", horizon=self._horizon, supports_rtc=True)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """The rows for that step."""
+        """Return the rows for the observation's step."""
         if self.first < 0:
             self.first = observation.step
         return ActionChunk(self._answer(observation.step - self.first, conditioning).astype(np.float32))
 
     def reset(self) -> None:
-        """The next observation is the first."""
+        """Regard the next observation as the first."""
         self.first = -1
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there are no resources."""
 
 
 def station_of(
@@ -95,7 +95,7 @@ def station_of(
     clock: VirtualClock,
     around: LockstepEnvironment | None = None,
 ) -> Lockstep:
-    """A station in lockstep with that robot and that policy in the place of its own."""
+    """Return a station in lockstep with this robot and this policy instead of its own."""
     spec = replace(spec, capabilities=Capabilities(moves_robot=True))
     peers = Peers(lambda spec, clock: robot, lambda spec, clock: robot, lambda spec, clock: policy)
     return Lockstep(spec, clock, around, peers)
@@ -103,7 +103,7 @@ def station_of(
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Task of both the station and the step loop; `inference_hz` None is back to back."""
+    """Task for both station and step loop; `inference_hz` None is back to back."""
 
     strategy: str
     control_hz: float
@@ -113,13 +113,13 @@ class Case:
 
     @property
     def section(self) -> dict[str, Any]:
-        """The strategy, as in a deployment file."""
+        """Section of the strategy in a deployment file."""
         paced = {} if self.inference_hz is None else {"inference_rate": self.inference_hz}
         return {"kind": self.strategy, **paced}
 
 
 def compare(case: Case) -> tuple[int, int]:
-    """Count of the policy's actions planned by the station, and of those that the step loop has otherwise."""
+    """Return the number of the policy's actions that the station planned, and of those that differ in the step loop."""
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), case)
         start = spec.robot.poses["ready"].astype(np.float64)
@@ -138,7 +138,7 @@ def compare(case: Case) -> tuple[int, int]:
 
 
 def _run(spec: StationSpec, policy: TablePolicy) -> tuple[int, Mapping[int, Float32]]:
-    """The step of the run's first observation, and by control step what was planned, before safety."""
+    """Return the step of the run's first observation, and the planned actions by control step, before safety."""
     planned: dict[int, Float32] = {}
     clock = VirtualClock()
     with closing(station_of(spec, InstantRobot(spec.robot, clock), policy, clock)) as station:
@@ -160,7 +160,7 @@ def _run(spec: StationSpec, policy: TablePolicy) -> tuple[int, Mapping[int, Floa
 
 
 def _answer(start: Float64, case: Case) -> Answering:
-    """Policy of both: chunks that disagree, around `start`, in the float32 of the wire."""
+    """Return the policy of both: disagreeing chunks around `start`, in the float32 of the wire."""
     steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
     reference = Reference(case.control_hz)
     meant = with_disagreement(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
@@ -175,7 +175,9 @@ def _answer(start: Float64, case: Case) -> Answering:
 
 
 def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: float) -> dict[str, Any]:
-    """The tables of a station on the virtual clock whose robot and policy are given to it; nothing is recorded."""
+    """Return the deployment of a station on the virtual clock without recording; robot and policy are
+    replaced later.
+    """
     return {
         "station": "strategies",
         "robot": robot,

@@ -1,6 +1,6 @@
-"""Pages that are open on a station, all in this process: `python -m benchmarks.viewers URL STATION COOKIE ...`.
+"""Open pages at a station, all in this process: `python -m benchmarks.viewers URL STATION COOKIE ...`.
 
-Prints one line of JSON: the age of every snapshot when a viewer had it [ms], and the frames each got.
+Prints a line of JSON: the age of every snapshot when a viewer received it [ms], and the frames per viewer.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ async def _read(given: argparse.Namespace, number: int, ages: list[float]) -> in
                 continue
             frames += 1
             streams = decode(message).header["streams"]
-            if "state" in streams:  # its clock is the machine's monotonic one, as ours is
+            if "state" in streams:  # its clock is the machine's monotonic clock too
                 ages.append((time.monotonic() - streams["state"]["json"]["clock"]) * 1000)
             await socket.send(json.dumps({"type": "credit"}))
     return frames
 
 
 async def _stall(given: argparse.Namespace, number: int) -> int:
-    """Ask for everything, then take nothing from the connection until the time is over."""
+    """Request everything, then read nothing from the connection until the time is over."""
     async with _page(given, f"stalled{number}", ping_interval=None, max_queue=1, close_timeout=1) as socket:
         await _ask(socket, given)
         socket.transport.pause_reading()

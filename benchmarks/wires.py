@@ -1,7 +1,7 @@
-"""Every wire: round trips of the policy protocols, and the way of observations through each transport.
+"""All wires: round trips of the policy protocols, and delays of observations through each transport.
 
-`benchmarks.wires_policies` and `benchmarks.wires_transports` say how each is measured. What is not installed is not
-measured, and the row says why.
+See `benchmarks.wires_policies` and `benchmarks.wires_transports` for the methods. Missing software is not measured,
+and its row gives the reason.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from benchmarks import wires_policies, wires_transports
 from benchmarks.report import Figure, Report
 
 SECONDS = 5.0
-_RATIO = "<= 1.1"  # as fast; from run to run it differs by as much as a tenth
-_GROWTH = "<= 10"  # MB in ten minutes; one picture in two hundred that was kept would be more
+_RATIO = "<= 1.1"  # equally fast; runs differ by up to a tenth
+_GROWTH = "<= 10"  # [MB] in ten minutes; retaining one image in two hundred would exceed it
 
 
 def measure(seconds: float) -> Report:
-    """`roundtrip_*_ms.PROTOCOL` and so on, `ratio_to_openpi_client`, `age_*_ms.TRANSPORT` and so on."""
+    """Measure `roundtrip_*_ms.PROTOCOL`, `ratio_to_openpi_client`, `age_*_ms.TRANSPORT` and others."""
     rows = [*wires_policies.measure(seconds), *wires_transports.measure(seconds)]
     for row in rows:
         for key in ("absent", "peer_absent"):
@@ -32,7 +32,7 @@ def measure(seconds: float) -> Report:
 
 
 def report(rows: Sequence[Mapping[str, Any]]) -> Report:
-    """The figures of rows."""
+    """Return the report of these rows."""
     figures: list[Figure] = []
     for row in rows:
         if "absent" not in row:

@@ -1,4 +1,4 @@
-"""Two ends of each transport that `benchmarks.wires_transports` measures: one function per case."""
+"""Both ends of each transport that `benchmarks.wires_transports` measures: one function per case."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ _MOST_DECODED_HZ = 200.0
 
 @dataclass(slots=True)
 class CaseSetup:
-    """Setting of a case: its processes, its folder, and its way of sending."""
+    """Context of a case: its processes, its folder, and its sender."""
 
     stack: contextlib.ExitStack
     folder: Path
     rate: float
     size: tuple[int, int]
     robot: str
-    page: int  # descriptor
-    hurried: bool  # as fast as goes without loss
+    page: int  # file descriptor of the shared state
+    hurried: bool  # as fast as possible without loss
     times: Path = field(init=False)
     sender: subprocess.Popen[str] | None = None
 
@@ -47,7 +47,7 @@ class CaseSetup:
         self.times = self.folder / "times.json"
 
     def send(self, module: str, *arguments: str) -> Mapping[str, Any]:
-        """Start what is at the other end; what it announces."""
+        """Start the sender, and return what it announces."""
         page = str(self.page) if self.hurried else ""
         command = [sys.executable, "-m", "benchmarks.wires_sender", str(self.times), page, module, *arguments]
         self.sender = self.stack.enter_context(process(command, self.page))
@@ -59,11 +59,11 @@ class CaseSetup:
         return announced
 
     def sized(self) -> tuple[str, ...]:
-        """Rate and size for the command line of a simulated robot."""
+        """Return rate and image size as options of a simulated robot."""
         return ("--rate", str(self.rate), "--height", str(self.size[0]), "--width", str(self.size[1]))
 
     def sent(self) -> Any:
-        """End the sender; when it began what it sent."""
+        """End the sender; return the times at which it began its messages."""
         if self.sender is None:
             return []
         end(self.sender)
@@ -72,7 +72,7 @@ class CaseSetup:
 
 @dataclass(frozen=True, slots=True)
 class CaseEndpoints:
-    """Transport and cameras to receive; a picture is dated by its number in a "strip" or "bar", or "due"."""
+    """Transport and cameras to receive; an image is dated by its number in a "strip" or "bar", or by its "due" time."""
 
     transport: Mapping[str, Any]
     cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -81,22 +81,22 @@ class CaseEndpoints:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A transport by the name of its figures; `needs` is the kind that has to be usable here, with `program`.
+    """Transport by the name of its figures; `needs` is the kind that must be available, with `program`.
 
-    `idle` is false where another case's memory tells of this one's.
+    `idle` is False if another case covers its memory.
     """
 
     name: str
     needs: str
     open: Callable[[CaseSetup], CaseEndpoints]
     robot: str = ROBOT
-    played: bool = False  # of a recording, as fast as its reader goes
+    played: bool = False  # of a recording, as fast as it is read
     program: str = ""
     idle: bool = True
 
 
 def cases() -> list[Case]:
-    """All that are measured where what they need is installed."""
+    """Return all cases."""
     return [
         Case("zmq", "zmq", _zmq),
         Case("ros1", "ros1", _ros1, program="rosmaster"),
@@ -109,7 +109,7 @@ def cases() -> list[Case]:
 
 
 def absent(case: Case) -> str:
-    """Why it cannot be measured here; "" where it can."""
+    """Return why a case cannot be measured here, "" if it can."""
     module = variants("runtime.transports").get(case.needs)
     if module is None:
         return f"there is no transport {case.needs!r}"
@@ -125,7 +125,7 @@ def absent(case: Case) -> str:
 
 @contextlib.contextmanager
 def process(command: Sequence[str], *descriptors: int) -> Iterator[subprocess.Popen[str]]:
-    """A process with a lifeline."""
+    """Yield a process with a lifeline."""
     child = subprocess.Popen(
         command,
         cwd=ROOT,
@@ -153,7 +153,7 @@ def end(child: subprocess.Popen[str]) -> None:
 
 
 def _node(stage: CaseSetup, *more: str) -> dict[str, Any]:
-    """The transport of a simulated node."""
+    """Start a simulated node, and return its transport."""
     free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
     said = stage.send("node", "--robot", stage.robot, *free, *more)
     return {"kind": "zmq", "sub_endpoint": said["obs_endpoint"], "pub_endpoint": said["action_endpoint"]}
@@ -164,14 +164,14 @@ def _zmq(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _ros2(stage: CaseSetup) -> CaseEndpoints:
-    """As the robot publishes: JPEG."""
+    """Open the case with JPEG, as the robot publishes."""
     domain = stage.stack.enter_context(free_domain())
     stage.send("ros2_node", "--robot", stage.robot, "--domain", str(domain), *stage.sized())
     return CaseEndpoints({"kind": "ros2", "domain": domain})
 
 
 def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
-    """The same robot, whose cameras publish pixels."""
+    """Open the case with raw pixels of the same robot."""
     folder = stage.folder / stage.robot
     shutil.copytree(ROOT / "robots" / stage.robot, folder)
     described = (folder / "robot.toml").read_text("utf-8")
@@ -181,7 +181,7 @@ def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _ros1(stage: CaseSetup) -> CaseEndpoints:
-    """rospy at both ends, and a master of its own."""
+    """Open the case with rospy at both ends, and a separate master."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -194,7 +194,7 @@ def _ros1(stage: CaseSetup) -> CaseEndpoints:
 
 @contextlib.contextmanager
 def _master(port: int, environment: Mapping[str, str]) -> Iterator[None]:
-    """A ROS 1 master that answers."""
+    """Run a ROS 1 master during the block."""
     child = subprocess.Popen(
         ["rosmaster", "--core", "-p", str(port)], env=environment, stdout=subprocess.DEVNULL
     )
@@ -216,7 +216,7 @@ def _dataset(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _file_cameras(stage: CaseSetup) -> CaseEndpoints:
-    """Videos in place of the recording's own, of which its joints remain."""
+    """Open the case with video files in place of the recording's own cameras."""
     transport, videos = _recorded(stage)
     cameras = {key: {"kind": "file", "path": str(path)} for key, path in videos.items()}
     return CaseEndpoints(transport, cameras, born="due")
@@ -229,9 +229,9 @@ def _recorded(stage: CaseSetup) -> tuple[dict[str, Any], dict[str, Path]]:
 
 
 def _mjpeg_cameras(stage: CaseSetup) -> CaseEndpoints:
-    """Cameras of the network beside a node, whose own pictures are as small as can be.
+    """Open the case with network cameras in addition to a node with minimal images.
 
-    What comes faster than it is decoded is passed over, so that no pictures may come as fast as they go.
+    Images that arrive faster than they are decoded are skipped, so the rate is limited.
     """
     keys = [camera.key for camera in robots.load_robot(stage.robot).cameras]
     rate, stage.hurried = str(min(stage.rate, _MOST_DECODED_HZ)), False

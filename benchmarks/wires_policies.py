@@ -1,8 +1,8 @@
-"""The round trip of each policy protocol against its stand-in server, which is a process of its own.
+"""Round trip of each policy protocol with its stand-in server, which is a separate process.
 
-Every request is a whole `infer`: three pictures 224x224 and 14 joints go out, 50 rows of 14 numbers come back and are
-checked. The published `openpi-client` asks the same server, in turn with ours, for the same observation; what it is
-given are views of the same pictures, as its own examples hand them over.
+Every request is a complete `infer`: three 224x224 images and 14 joints are sent, 50 rows of 14 numbers are received
+and checked. The published `openpi-client` sends the same observation to the same server, alternating with ours; it
+gets views of the same images, as in its own examples.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ROBOT = "agilex_piper"  # two arms of seven numbers, three cameras
 PICTURE = (224, 224, 3)
 HORIZON = 50
 RATE = 30.0
-WARM = 20  # requests that are not counted
+WARM = 20  # requests before the measurement
 _WEIGHED = 20  # requests whose bytes are counted
 _ROUNDS = 8
 _PATIENCE_S = 30.0
@@ -49,7 +49,7 @@ _PEER = "openpi-client"
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """A protocol by the name that `runtime.sim.serve` has for it: our settings, and options of the server."""
+    """Protocol by its name in `runtime.sim.serve`: our settings, and options of the server."""
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -57,7 +57,7 @@ class Protocol:
 
 
 def protocols(robot: Robot) -> list[Protocol]:
-    """All that are measured, each with three pictures and the joints of `robot`."""
+    """Return all measured protocols, each with three images and the joints of `robot`."""
     keys = [camera.key for camera in robot.cameras]
     places = {group.name: list(range(group.slice.start, group.slice.stop)) for group in robot.groups}
     pictures = {key: key for key in keys}
@@ -82,8 +82,10 @@ def protocols(robot: Robot) -> list[Protocol]:
 
 
 def measure(seconds: float) -> list[Row]:
-    """A row per protocol, each asked for `seconds`, openpi for twice as long as it shares them with its peer."""
-    heap.keep_freed_memory()  # as the coordinator does
+    """Return a row per protocol, each measured for `seconds`; openpi for twice as long, as it alternates with
+    its peer.
+    """
+    heap.keep_freed_memory()  # as in the coordinator
     robot = robots.load_robot(ROBOT)
     return [_case(protocol, robot, seconds) for protocol in protocols(robot)]
 
@@ -111,7 +113,7 @@ def _case(protocol: Protocol, robot: Robot, seconds: float) -> Row:
 
 
 def _round(opened: Sequence[Opening], seconds: float) -> list[Timed]:
-    """Each client over a new connection: on which processor a connection's threads come to lie is luck."""
+    """Measure each client with a new connection, because the placement of its threads on processors is random."""
     with contextlib.ExitStack() as stack:
         return in_turn([stack.enter_context(opening()) for opening in opened], seconds)
 
@@ -125,7 +127,7 @@ def _ours(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Ite
 
 @dataclass(slots=True)
 class Timed:
-    """Measurements of one client: round trips [s], and processor time until the next one's turn [s]."""
+    """Measurements of one client: round trips [s], and processor time per turn [s]."""
 
     round_trips: list[float] = field(default_factory=list)
     processor: list[float] = field(default_factory=list)
@@ -142,7 +144,7 @@ class Timed:
         return float(np.median(self.round_trips))
 
     def row(self) -> Row:
-        """`cpu_ms` is of this process per request, all of its threads."""
+        """Return the row; `cpu_ms` is the processor time of this process per request, with all threads."""
         percentiles = {f"p{q}": 1e3 * float(np.percentile(self.round_trips, q)) for q in (50, 99)}
         return {"round_trip_ms": percentiles, "cpu_ms": 1e3 * float(np.mean(self.processor))}
 
@@ -150,7 +152,7 @@ class Timed:
 def in_turn(
     asks: Sequence[Ask], seconds: float, clock: Callable[[], float] = time.perf_counter
 ) -> list[Timed]:
-    """Ask each again and again, who was first is last the next time; what came before is for warming up."""
+    """Call each in turn, in reversed order every second time, after a warm-up."""
     for _ in range(WARM):
         for ask in asks:
             ask()
@@ -168,7 +170,7 @@ def in_turn(
 
 
 def observation(robot: Robot) -> Observation:
-    """Joints at 0.1 and three pictures of noise."""
+    """Return an observation with joints at 0.1 and three noise images."""
     random = np.random.default_rng(0)
     pictures = {camera.key: random.integers(0, 256, PICTURE, np.uint8) for camera in robot.cameras}
     for picture in pictures.values():
@@ -177,7 +179,7 @@ def observation(robot: Robot) -> Observation:
 
 
 def absent(protocol: Protocol, robot: Robot) -> str:
-    """Software to be installed before it can be measured; "" where nothing is missing."""
+    """Return the software that is missing for a protocol, "" if none."""
     try:
         _policy(protocol, robot)
     except ConfigurationError as error:
@@ -193,7 +195,7 @@ def _policy(protocol: Protocol, robot: Robot, url: str | None = None) -> Policy:
 
 
 def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
-    """The published client asking for the same, or why it does not."""
+    """Return the published client for the same requests, or why it is not available."""
     try:
         from openpi_client.websocket_client_policy import WebsocketClientPolicy
     except ImportError as error:
@@ -208,13 +210,13 @@ def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
             return client.infer({"state": shown.qpos, "images": views, "prompt": shown.prompt})
 
         yield ask
-        client._ws.close()  # it has no way of its own
+        client._ws.close()  # it has no public method
 
     return opened, ""
 
 
 def _weighed(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Row:
-    """Bytes per request and answer with all that the protocol wraps around them, through a relay that counts."""
+    """Return the bytes per request and answer, with all protocol overhead, counted by a relay."""
     place = urlsplit(url)
     assert place.port is not None
     with Relay(place.port) as relay:
@@ -231,7 +233,7 @@ def _weighed(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> 
 
 @contextlib.contextmanager
 def _server(protocol: Protocol) -> Iterator[str]:
-    """The stand-in in a process of its own; its address."""
+    """Yield the address of a stand-in server in a separate process."""
     command = [sys.executable, "-m", "runtime.sim.serve", protocol.name, "--robot", ROBOT, "--port", "0"]
     command += ["--horizon", str(HORIZON), "--rate", str(RATE), "--lifeline", *protocol.options]
     child = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

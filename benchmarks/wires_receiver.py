@@ -1,8 +1,8 @@
-"""The receiving side of a transport in a process, as reception is: `python -m benchmarks.wires_receiver JSON`.
+"""Receiving side of a transport in a process, like reception: `python -m benchmarks.wires_receiver JSON`.
 
-The JSON is a `Receiving`. Observations go into the page whose descriptor it inherits, until standard input ends.
-With `fast`, which is for recordings, a virtual clock goes on by a frame as soon as the one before is in the page, and
-what has played out is played again; and then it has a clock that nobody else has.
+The JSON is a `Receiving`. Observations are written to the shared state of the inherited descriptor, until standard
+input ends. With `fast`, for recordings, a virtual clock advances by a frame as soon as the previous one is written,
+and a finished recording is played again.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ from runtime.processes.reception.receiver import ObservationReceiver
 from runtime.transports.base import Source
 
 FPS = 30.0
-_PUMP_S = 0.005  # as reception does
+_PUMP_S = 0.005  # as in reception
 
 
 @dataclass(frozen=True, slots=True)
 class Receiving:
-    """A robot by name or path, its transport and cameras as a deployment has them, the page, and whether `fast`."""
+    """Robot by name or path, transport and cameras as in a deployment, descriptor of the shared state, and
+    whether `fast`.
+    """
 
     robot: str
     transport: Mapping[str, Any]
@@ -47,12 +49,12 @@ class Receiving:
 
 
 def layout(robot: Robot) -> SharedStateLayout:
-    """The page of a station with this robot and all of its cameras."""
+    """Return the shared state layout of a station with this robot and all of its cameras."""
     return SharedStateLayout(robot.dim, robot.eef_dim, tuple(camera.key for camera in robot.cameras))
 
 
 def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
-    """The transport's observations with the cameras of the deployment's own, of which it is not told."""
+    """Return the transport's observations with the deployment's own cameras, which the transport does not provide."""
     module = variants("runtime.transports")[given.transport["kind"]]
     kinds = variants("runtime.cameras")
     cameras = {key: kinds[table["kind"]].Config(**table) for key, table in given.cameras.items()}
@@ -61,7 +63,7 @@ def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
 
 
 def main(text: str) -> None:
-    """Receive until the lifeline is cut."""
+    """Receive until the lifeline ends."""
     heap.keep_freed_memory()
     given = Receiving(**json.loads(text))
     robot = robots.load_robot(given.robot)
@@ -85,7 +87,7 @@ def main(text: str) -> None:
 
 
 class _Player:
-    """Notices that a recording has played out."""
+    """Detector of the end of a recording."""
 
     def __init__(self) -> None:
         self.over = False
@@ -101,4 +103,4 @@ def _say(event: Event) -> None:
 if __name__ == "__main__":
     main(sys.argv[1])
     sys.stdout.flush()
-    os._exit(0)  # nothing is left to be put away, and threads of a middleware keep nobody waiting
+    os._exit(0)  # nothing is left to close, and threads of a middleware must not delay the exit

@@ -1,4 +1,4 @@
-"""A recording to play: a LeRobot v2.1 dataset of one episode, whose videos are those that file cameras play."""
+"""Recording to play: a LeRobot v2.1 dataset of one episode, whose videos file cameras play too."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06
 
 
 def record(root: Path, robot: Robot, frames: int, fps: int, height: int, width: int) -> dict[str, Path]:
-    """Write the dataset; the videos by camera key."""
+    """Write the dataset; return the videos by camera key."""
     joints = np.repeat(robot.poses["home"][None], frames, axis=0).astype(np.float32)
     names = {"observation.state": joints, "action": joints}
     table = {name: pa.array(list(rows), pa.list_(pa.float32())) for name, rows in names.items()}
@@ -49,7 +49,7 @@ def _write_videos(
     with av.open(str(videos[first]), "w") as container:
         stream = container.add_stream("libx264", rate=fps)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "23", "g": "2", "preset": "veryfast"}  # key frames as LeRobot has them
+        stream.options = {"crf": "23", "g": "2", "preset": "veryfast"}  # key frames as in LeRobot
         for number in range(frames):
             drawn = scene.draw(number, number / fps, joints)[first]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(drawn, format="bgr24")))

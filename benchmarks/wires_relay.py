@@ -1,4 +1,4 @@
-"""A TCP relay on loopback that counts the bytes that pass, each way; nothing is timed through it."""
+"""TCP relay on loopback that counts the bytes in both directions; not used for timing."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import threading
 import time
 from types import TracebackType
 
-_PIECE = 1 << 20  # bytes
+_PIECE = 1 << 20  # [bytes]
 _QUIET_S = 0.1
 
 
 class Relay:
-    """Between whoever connects to `port` and the server at `target`, for any number of connections."""
+    """Relay from `port` to the server at `target`, for any number of connections."""
 
     def __init__(self, target: int) -> None:
         self._target = target
@@ -22,7 +22,7 @@ class Relay:
         self._counted = [
             0,
             0,
-        ]  # to the server, from it; each written by the threads of that way under the lock
+        ]  # to the server, from it; guarded by the lock
         self._lock = threading.Lock()
         self._ends: list[socket.socket] = []
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
@@ -34,7 +34,7 @@ class Relay:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Hang up, and wait for its threads."""
+        """Close all connections, and wait for the threads."""
         with self._lock:
             ends = [self._listening, *self._ends]
         for end in ends:
@@ -46,7 +46,7 @@ class Relay:
             end.close()
 
     def settled(self) -> tuple[int, int]:
-        """Bytes to the server and from it so far, once nothing has passed for a tenth of a second."""
+        """Return the bytes to and from the server so far, after a tenth of a second without traffic."""
         before, now = None, self._now()
         while before != now:
             time.sleep(_QUIET_S)
@@ -61,7 +61,7 @@ class Relay:
         while True:
             try:
                 client, _ = self._listening.accept()
-            except OSError:  # hung up
+            except OSError:  # closed
                 return
             server = socket.create_connection(("127.0.0.1", self._target))
             with self._lock:

@@ -1,9 +1,9 @@
-"""Sender at the other end of a transport, and the starting times of its messages.
+"""Sender at the other end of a transport, and the start times of its messages.
 
 `python -m benchmarks.wires_sender TIMES PAGE MODULE ARGUMENT...` runs the simulated robot `runtime.sim.MODULE`, or
-with MODULE "cameras" as many MJPEG cameras as the argument says: COUNT RATE WIDTH HEIGHT. When it ends, the times [s]
-are in the file TIMES as JSON: of message n, counted from 0, or by camera. Where PAGE is the descriptor of the page into
-which a simulated robot's pictures come, it is never more than a few ahead of them: nothing is to be lost on the way.
+with MODULE "cameras" MJPEG cameras: COUNT RATE WIDTH HEIGHT. At its end it writes the times [s] to the file TIMES as
+JSON: by message from 0 on, or by camera. If PAGE is the descriptor of the shared state that receives a simulated
+robot's images, it is never more than a few images ahead, so that none is lost.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from runtime.ipc.shared_state import SharedState
 from runtime.sim import node, standin
 from runtime.sim.mjpeg_server import MjpegServer
 
-_AHEAD = 4  # pictures; the queues of a transport have no fewer places
+_AHEAD = 4  # images; the queues of every transport are at least as long
 _LOOK_S = 0.0005
 
 
 class Pace:
-    """Lets a sender be a few pictures ahead of `arrived`; what has not come within `patience` [s] is lost."""
+    """Pace that allows a sender to be a few images ahead of `arrived`; images are lost after `patience` [s]."""
 
     def __init__(self, arrived: Callable[[], int], clock: Clock, patience: float = 0.05) -> None:
         self._arrived, self._clock, self._patience = arrived, clock, patience
         self._seen, self._ahead = arrived(), 0
 
     def wait(self) -> None:
-        """Until one more may be sent."""
+        """Wait until one more image may be sent."""
         end = self._clock.now() + self._patience
         while True:
             seen = self._arrived()
@@ -54,7 +54,7 @@ class Pace:
 
 
 class TimestampingNode:
-    """A node that notes when each of its ticks begins."""
+    """Node that records when each of its ticks begins."""
 
     def __init__(self, ticking: node.Ticking, clock: Clock, pace: Pace | None) -> None:
         self._ticking, self._clock, self._pace = ticking, clock, pace
@@ -68,7 +68,7 @@ class TimestampingNode:
 
 
 class TimestampingCameraServer(MjpegServer):
-    """A camera that notes when each of its pictures leaves."""
+    """Camera that records when each of its images is sent."""
 
     def __init__(self, width: int, height: int, rate: float) -> None:
         super().__init__(width, height, rate)
@@ -81,7 +81,7 @@ class TimestampingCameraServer(MjpegServer):
 
 @exit_on_broken_pipe
 def main(file: str, shared: str, module: str, *arguments: str) -> int:
-    """The exit code of the simulated robot."""
+    """Run the sender; return the exit code of the simulated robot."""
     if module == "cameras":
         return _cameras(Path(file), arguments)
     simulated = importlib.import_module(f"runtime.sim.{module}")

@@ -1,12 +1,11 @@
-"""The way of observations through each transport: three cameras and joints, from who sends them to the control loop.
+"""Delay of observations through each transport: three cameras and joints, from the sender to the control loop.
 
-The sender, the receiving side (`benchmarks.wires_receiver`, as reception) and the control
-loop are processes of their own. The control loop is this one: it looks at the page at 100 Hz, so that what it sees is
-evenly spread between two pictures. Live, pictures of 640x480 come at 30 Hz. How old they are is counted from the
-moment at which their sender began to draw and pack them: they carry their numbers. Recordings have no sender: their
-pictures are born when they are due. Afterwards another receiving side is given as many pictures as come in ten idle
-minutes, as fast as they go, and what it has grown by since the first of them is told. Where they do not go by within
-a few times the seconds of the live part, it is told how many minutes did.
+Sender, receiving side (`benchmarks.wires_receiver`, like reception) and control loop are separate processes. The
+control loop is this one: it polls shared state at 100 Hz, so that its readings are uniformly distributed between two
+images. Live images of 640x480 come at 30 Hz. Their age counts from the moment at which the sender began to draw and
+encode them, which is known by their number; images of recordings, which have no sender, count from their due time.
+Afterwards another receiving side gets the images of ten idle minutes as fast as possible, and its memory growth since
+the first of them is reported. If this takes more than a few times the live part, the number of minutes is reported.
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ from runtime.core.types import UInt8
 from runtime.ipc.shared_state import SharedState
 from runtime.sim.pictures import frame_number
 
-IDLE_FRAMES = 18_900  # of each camera: half a minute to warm up, and ten
-_WARM_FRAMES = 900  # after which memory is to stay as it is
+IDLE_FRAMES = 18_900  # of each camera: half a minute of warm-up, and ten minutes
+_WARM_FRAMES = 900  # after which memory should be constant
 _LIVE = (480, 640)
-_FLOOD = (120, 160)  # a picture that is kept is one whatever its size, and these go by in minutes
+_FLOOD = (120, 160)  # small, because a retained image counts whatever its size, and these are faster
 _FLOOD_HZ = 1000.0
-_IDLE_SHARE = 3.0  # of the seconds of the live part, at most
+_IDLE_SHARE = 3.0  # of the live part, at most
 _LOOKS_HZ = 100.0
 _SETTLE_S = 1.5  # after the first observation
 Row = dict[str, Any]
 
 
 def measure(seconds: float) -> list[Row]:
-    """A row per transport: each live for `seconds`, then with the pictures of ten minutes as fast as they go."""
+    """Return a row per transport: live for `seconds`, then with the images of ten minutes as fast as possible."""
     rows: list[Row] = []
     for case in cases():
         why = absent(case)
@@ -59,7 +58,7 @@ def _measured(case: Case, seconds: float) -> Row:
 
 
 def live(case: Case, seconds: float) -> Row:
-    """Pictures that a control loop sees at their usual rate, and the cost of receiving them."""
+    """Return the ages of images in a control loop at their usual rate, and the cost of receiving them."""
     with _staged(case, FPS, _LIVE) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=False)
@@ -82,7 +81,7 @@ def live(case: Case, seconds: float) -> Row:
 
 
 def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
-    """Memory growth of the receiving side from so many pictures of each camera, or over so long."""
+    """Return the memory growth of the receiving side over that many images of each camera, or over `seconds`."""
     with _staged(case, _FLOOD_HZ, _FLOOD, hurried=True) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=case.played)
@@ -113,7 +112,7 @@ def _staged(
 
 
 def _receiving(stage: CaseSetup, wired: CaseEndpoints, fast: bool) -> subprocess.Popen[str]:
-    """The process that fills the page."""
+    """Start the process that fills the shared state."""
     given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
     command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
     return stage.stack.enter_context(process(command, stage.page))
@@ -122,7 +121,11 @@ def _receiving(stage: CaseSetup, wired: CaseEndpoints, fast: bool) -> subprocess
 def _await(
     shared: SharedState, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf
 ) -> int:
-    """Count of pictures of every camera in the page after so many or so long; SystemExit where none come."""
+    """Return the number of images of every camera, after `frames` or `seconds`.
+
+    Raises:
+        SystemExit: If none arrive.
+    """
     seen, since = 0, time.monotonic()
     latest = since + seconds
     while seen < frames and time.monotonic() < latest:
@@ -139,11 +142,11 @@ def _await(
 
 Look = list[
     tuple[UInt8 | None, float, float]
-]  # per camera: the picture's head, when it was captured, and now
+]  # per camera: head and foot of the image, capture time, current time
 
 
 def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
-    """Looks of a control loop at each of its ticks, and the count of observations meanwhile."""
+    """Return the readings of a control loop at each of its ticks, and the number of observations meanwhile."""
     clock = MonotonicClock()
     first = int(shared.observation.read()["sequence"])
     looks: list[Look] = []
@@ -161,12 +164,12 @@ def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
 
 
 def number_marks(picture: UInt8) -> UInt8:
-    """Parts of a picture that tell its number: the strip at its head and the bar at its foot."""
+    """Return the parts of an image that encode its number: the strip at its head and the bar at its foot."""
     return np.concatenate([picture[:16], picture[-16:]])
 
 
 def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
-    """Of the oldest picture that each tick saw [s]; None where one was being overwritten."""
+    """Return the age of the oldest image at each tick [s]; None if an image was being overwritten."""
     found: list[float | None] = []
     for look in looks:
         births = [_birth(index, *one, born, sent) for index, one in enumerate(look)]
@@ -176,7 +179,7 @@ def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None
 
 
 def sent_hz(sent: Any, begun: float, took: float) -> float | None:
-    """Rate that the sender kept up with [Hz]; None for recordings."""
+    """Return the rate that the sender achieved [Hz]; None for recordings."""
     streams = [stream for stream in (sent if sent and isinstance(sent[0], list) else [sent]) if stream]
     rates = [sum(begun <= at <= begun + took for at in stream) / took for stream in streams]
     return min(rates, default=None)
@@ -185,7 +188,7 @@ def sent_hz(sent: Any, begun: float, took: float) -> float | None:
 def _birth(
     camera: int, marks: UInt8 | None, captured: float, now: float, born: str, sent: Any
 ) -> float | None:
-    """When a picture's sender began with it [s]."""
+    """Return when an image's sender began it [s]."""
     if born == "due":
         return captured
     if marks is None:
@@ -197,14 +200,14 @@ def _birth(
 
 
 def strip_number(marks: UInt8) -> int:
-    """The number in the strip; `frame_number` looks for it in the head of a whole picture."""
+    """Return the number in the strip; `frame_number` expects it in the head of a complete image."""
     whole = np.zeros((_LIVE[0], *marks.shape[1:]), np.uint8)
     whole[:16] = marks[:16]
     return frame_number(whole)
 
 
 def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
-    """When the newest picture left whose bar is as wide: widths come again every 80 pictures of 640 pixels."""
+    """Return when the newest image with this bar width was sent; widths repeat every 80 images of 640 pixels."""
     width, cycle = int((marks[-4].mean(axis=-1) > 127).sum()), marks.shape[1] // 8
     number = round((width - 1) / 8) % cycle
     left = [time for index, time in enumerate(times) if index % cycle == number and time <= now]
@@ -212,18 +215,18 @@ def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
 
 
 def _processor(process: psutil.Process) -> float:
-    """Processor time of a process and its children so far [s]."""
+    """Return the processor time of a process and its children so far [s]."""
     everybody = [process, *process.children(recursive=True)]
     return float(sum(sum(one.cpu_times()[:2]) for one in everybody))
 
 
 def _resident(process: psutil.Process) -> float:
-    """Memory of a process and its children [bytes]."""
+    """Return the memory of a process and its children [bytes]."""
     return float(sum(one.memory_info().rss for one in [process, *process.children(recursive=True)]))
 
 
 def _ended(receiver: subprocess.Popen[str]) -> Mapping[str, int]:
-    """End the receiving side; what went wrong there, by name."""
+    """End the receiving side; return its faults by name."""
     end(receiver)
     assert receiver.stdout is not None
     faults: Mapping[str, int] = json.loads(receiver.stdout.read())

@@ -19,7 +19,7 @@ from robots.loading import robot_folders
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns 0, or 1 where a description or the question is wrong."""
+    """Run one command; return 0, or 1 if a description or an argument is wrong."""
     options = _parser().parse_args(arguments)
     try:
         return int(options.run(options))
@@ -59,7 +59,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(_: argparse.Namespace) -> int:
-    """Every robot with its title; one that cannot be loaded hides none of the others."""
+    """q q^T is linear in the matrix; its row with the largest diagonal entry is the numerically safest
+    multiple of q.
+    """
     broken = 0
     for name in robot_names():
         try:
@@ -86,7 +88,7 @@ def _said(found: Inspection) -> int:
 
 
 def _with_group(name: str, group: str) -> Robot:
-    """The robot as it usually is, and with that group where it is an optional one."""
+    """Return the robot with its usual groups, plus that group if it is optional."""
     robot = load_robot(name)
     declared = description.read(robot.folder / "robot.toml").groups
     if group not in [entry.name for entry in declared if entry.optional]:
@@ -105,7 +107,7 @@ def _fk(options: argparse.Namespace) -> int:
         raise RobotError(
             f"{group.name} was given {q}; needed: {group.chain.size} finite numbers, {', '.join(group.urdf_joints)}"
         )
-    joints = robot.poses["home"].copy()  # what carries the arm stands as at home
+    joints = robot.poses["home"].copy()  # joints that carry the arm are as in the home pose
     joints[group.joint_dims] = q
     pose = group.pose(joints)
     own = joints[group.joint_dims]
@@ -122,7 +124,7 @@ def _fk(options: argparse.Namespace) -> int:
 
 
 def _new(options: argparse.Namespace) -> int:
-    """Drafts, then says what the draft comes to as `check` does, and what comes next."""
+    """Draft a robot, then print the findings of `check` on the draft, and the next steps."""
     into = options.into or next(iter(robot_folders()), Path())
     made = draft_robot(options.name, options.urdf, into, options.copies)
     said = _said(made.inspection)

@@ -1,4 +1,4 @@
-"""The chains of a robot's arms, what carries them, and where their copies of the URDF stand."""
+"""Kinematic chains of a robot's arms, the joints that carry them, and the mounts of their URDF copies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robots.urdf import Urdf
 
 
 def check_arm(key: str, table: GroupTable) -> None:
-    """End effector, frame and what only an arm has come together."""
+    """Raise RobotError unless end effector, frame and keys for arms only are declared together."""
     if (table.eef_link is None) != (table.frame is None):
         raise RobotError(f"{key}: eef_link and frame make an arm together; allowed: both or neither")
     if table.eef_link is not None:
@@ -36,7 +36,7 @@ def check_arm(key: str, table: GroupTable) -> None:
 def build_arm_chain(
     file: Path, tree: Urdf, table: GroupTable, group: Group, groups: Sequence[Group]
 ) -> Group:
-    """The group with the chain of its own joints, and with the chain that carries it where others move it."""
+    """Return the group with the chain of its own joints, and with the carrier chain if other groups move its base."""
     if table.eef_link is None or table.frame is None:
         return group
     key = f"{file}: groups.{table.name}"
@@ -72,7 +72,7 @@ def build_arm_chain(
 
 
 def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
-    """Pinned are joints that can move and that the group does not move itself."""
+    """Raise RobotError unless pinned joints are movable and not moved by the group itself."""
     for name in table.pinned:
         with error_context(key):
             joint = tree.joint(name)
@@ -81,7 +81,7 @@ def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
 
 
 def check_mounts(file: Path, tables: Sequence[GroupTable], groups: Sequence[Group]) -> None:
-    """A copy of the URDF stands in one place: that of its first group."""
+    """Raise RobotError if groups that share one copy of the URDF declare different mounts."""
     mounts = {table.name: table.mount for table in tables}
     for members in urdf_copies(groups):
         first = members[0].name

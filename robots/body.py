@@ -18,14 +18,15 @@ from robots.urdf import Joint, Urdf
 
 
 class BodyTables(NamedTuple):
-    """Joints between parts [P]: the value of a part's joint is coupling . q + offset, within bounds.
+    """Tables of the joints between parts [P]: a part's joint has the value coupling . q + offset, clipped to its
+    bounds.
 
-    Its transform behind the part `above` it (-1: in the scene; parents come first) is the sum of its four `motions`
-    [P, 4, 16], weighted by 1, the cosine and sine of that value, and the value.
+    A part's transform relative to the part `above` it (-1: the scene; parents come first) is the sum of its four
+    `motions` [P, 4, 16], weighted by 1, cosine and sine of that value, and the value.
     """
 
     motions: Float64
-    coupling: Float64  # [P, D], at most one number per row is not zero
+    coupling: Float64  # [P, D], at most one non-zero number per row
     offsets: Float64
     low: Float64
     high: Float64
@@ -33,11 +34,11 @@ class BodyTables(NamedTuple):
 
 
 class Body:
-    """The `parts` ("left_arm/link2", ...: links behind the group that moves them) of a robot, and their `poses`.
+    """Body of a robot: its `parts` ("left_arm/link2", ...: group that moves the link, link) and their `poses`.
 
-    A robot whose URDF describes one of several equal arms is one copy of the tree per arm; a URDF with the whole
-    body stands once. `jaws` names, for each group with a gripper, the indices of the parts that its fingers are;
-    `above` [P] has for each part the index of the one it hangs on, -1 for a root.
+    If the URDF describes one of several equal arms, there is one copy of the tree per arm; a URDF of the whole body
+    exists once. `jaws` maps each group with a gripper to the indices of its finger parts; `above` [P] is the index of
+    each part's parent, -1 for a root.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -68,24 +69,32 @@ class Body:
         self._layers = _layers(self.above)
 
     def part(self, name: str) -> int:
-        """The index of a part; RobotError lists the names where there is none."""
+        """Return the index of a part.
+
+        Raises:
+            RobotError: If it does not exist; the message lists the names.
+        """
         if name not in self.parts:
             raise RobotError(f"{self._name} has no part {name!r}; it has {', '.join(self.parts)}")
         return self.parts.index(name)
 
     def parts_showing(self, link: str) -> tuple[int, ...]:
-        """The indices of the parts that show a link of the URDF, one per copy; none where it has no such link."""
+        """Return the indices of the parts of a URDF link, one per copy; () if there is no such link."""
         return tuple(links[link] for links in self._links if link in links)
 
     def link_of(self, group: str, link: str) -> int:
-        """The index of a link in the copy that a group moves; RobotError lists the links where there is none."""
+        """Return the index of a link in the copy that a group moves.
+
+        Raises:
+            RobotError: If it does not exist; the message lists the links.
+        """
         links = self._links[self._copy_of[group]]
         if link not in links:
             raise RobotError(f"{self._name}: {group} has no link {link!r}; it has {', '.join(sorted(links))}")
         return int(links[link])
 
     def moving_mask(self) -> NDArray[np.bool_]:
-        """Which numbers of the robot's vector move which part, bool [P, D]: those that any joint above it follows."""
+        """Return which numbers of the robot's vector move which part, directly or through a parent: bool [P, D]."""
         moved: NDArray[np.bool_] = self._coupling != 0
         for parts, above in self._layers:
             moved[parts] |= moved[above]
@@ -93,11 +102,15 @@ class Body:
 
     @property
     def tables(self) -> BodyTables:
-        """Tables from which `poses` is computed, for other implementations of it."""
+        """Tables from which `poses` is computed, for other implementations."""
         return BodyTables(self._tables, self._coupling, self._offsets, self._low, self._high, self.above)
 
     def poses(self, q: Float64) -> Float64:
-        """Poses of the parts, scene <- part [..., P, 4, 4], for the robot's vector q [..., D]."""
+        """Return the poses of the parts, scene <- part [..., P, 4, 4], for the robot's vector q [..., D].
+
+        Raises:
+            RobotError: If q has the wrong shape.
+        """
         if q.shape[-1:] != (self._dim,):
             raise RobotError(
                 f"{self._name}: joints of shape {q.shape} were given; allowed: [..., {self._dim}]"
@@ -110,7 +123,7 @@ class Body:
 
 
 class _Copy:
-    """One copy of the tree: its links outwards from the root, and the table that places each in its parent."""
+    """One copy of the tree: its links outwards from the root, and the tables that place each in its parent."""
 
     def __init__(self, robot: Robot, tree: Urdf, groups: Sequence[Group]) -> None:
         self._tree = tree
@@ -132,7 +145,7 @@ class _Copy:
 
     @property
     def fingers(self) -> dict[str, list[str]]:
-        """The links that a gripper moves, by the name of its group."""
+        """Links that a gripper moves, by the name of its group."""
         return {
             group.name: [
                 link
@@ -144,12 +157,12 @@ class _Copy:
         }
 
     def above_from(self, start: int) -> NDArray[np.intp]:
-        """For each link the index of the one it hangs on, where this copy's first is `start`; the root's is -1."""
+        """Return the index of each link's parent if this copy's first link has index `start`; -1 for the root."""
         parents = [self.links.index(joint.parent) for joint in self._movers.values()]
         return np.array([-1, *(start + parent for parent in parents)], dtype=np.intp)
 
     def part(self, link: str) -> str:
-        """The link's name behind that of the group that moves it (of the first group, where none does)."""
+        """Return the link's name prefixed by the group that moves it, or by the first group if none does."""
         at = link
         while at in self._movers:
             master, _, _ = self._tree.master(self._movers[at])
@@ -162,11 +175,11 @@ class _Copy:
         return f"{self._groups[0].name}/{link}"
 
     def _placement(self, robot: Robot) -> Float64:
-        """Scene <- root: where the robot stands, then the mount of the copy's first group."""
+        """Return scene <- root: the robot's stand, then the mount of the copy's first group."""
         return transform_of(robot.stand) @ transform_of(self._groups[0].mount)
 
     def _drive(self, index: int, joint: Joint) -> None:
-        """The joint's value is coupling . q + offset within bounds; what no group moves stays as pinned or 0."""
+        """Set coupling, offset and bounds of a joint; a joint that no group moves stays at its pinned value or 0."""
         master, factor, offset = self._tree.master(joint)
         for group in self._groups:
             if master.name in group.urdf_joints:
@@ -188,7 +201,7 @@ class _Copy:
 
 
 def _layers(above: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Parts and the parts they hang on, layer by layer away from the roots (those on part -1)."""
+    """Return parts and their parents, layer by layer away from the roots (parent -1)."""
     depth = np.zeros(len(above), dtype=np.intp)
     for part, parent in enumerate(above):  # parents come first
         depth[part] = 0 if parent < 0 else depth[parent] + 1

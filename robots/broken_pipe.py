@@ -1,5 +1,7 @@
-"""A terminal that reads on no more (`... | head -1`), or a disk that is full (`... > FILE`), ends a command without a
-traceback; here, below all programs.
+"""Exit of a command without traceback if its output pipe is closed (`... | head -1`) or the disk is full (`... >
+FILE`).
+
+It is in this package because all programs may import it.
 """
 
 from __future__ import annotations
@@ -12,8 +14,8 @@ from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import ParamSpec, TextIO
 
-EXIT_BROKEN_PIPE = 141  # exit code, that of a shell for an end by SIGPIPE
-EXIT_WRITE_ERROR = 74  # exit code, EX_IOERR of sysexits.h
+EXIT_BROKEN_PIPE = 141  # exit code that shells report for an end by SIGPIPE
+EXIT_WRITE_ERROR = 74  # exit code EX_IOERR of sysexits.h
 
 _STREAMS = (0, 1, 2)  # standard input, output and error
 
@@ -21,10 +23,11 @@ Given = ParamSpec("Given")
 
 
 def exit_on_broken_pipe(main: Callable[Given, int]) -> Callable[Given, int]:
-    """`main`, with the exit code 141 where standard output or error is a pipe that nobody reads any more.
+    """Decorate `main` such that a closed pipe at standard output or error gives exit code 141.
 
-    Where the disk does not take standard output it is 74, and standard error says so. An OSError of anything else
-    stays one. A stream that was closed (`>&-`) goes nowhere, and the code is that of the command.
+    If standard output cannot be written, because the disk is full, the exit code is 74, with a message on standard
+    error; any other OSError is raised. Output to a closed stream (`>&-`) is discarded, and the exit code is the
+    command's own.
     """
 
     @wraps(main)
@@ -33,10 +36,10 @@ def exit_on_broken_pipe(main: Callable[Given, int]) -> Callable[Given, int]:
         try:
             try:
                 code = main(*given, **named)
-            except SystemExit:  # of argparse, which has printed its help
+            except SystemExit:  # argparse exits after printing its help
                 _flush()
                 raise
-            _flush()  # here, and not when the process ends
+            _flush()  # here, because errors at the end of the process could not be handled
         except BrokenPipeError:
             if not _silenced():
                 raise
@@ -52,7 +55,9 @@ def exit_on_broken_pipe(main: Callable[Given, int]) -> Callable[Given, int]:
 
 
 def _open_closed() -> None:
-    """Let closed streams go nowhere, here and in children: else the next file that is opened takes their number."""
+    """Connect closed standard streams to /dev/null, here and in children: otherwise the next opened file gets
+    their number.
+    """
     number = os.open(os.devnull, os.O_RDWR)
     while number <= _STREAMS[-1]:
         os.set_inheritable(number, True)
@@ -68,7 +73,7 @@ def _flush() -> None:
 
 
 def _refused(error: OSError) -> bool:
-    """True if standard output raised it: what could not be written waits in it, and goes nowhere now."""
+    """Return True if standard output raised the error; its pending data is then discarded."""
     try:
         _flush()
     except OSError as again:
@@ -79,7 +84,7 @@ def _refused(error: OSError) -> bool:
 
 
 def _silenced() -> bool:
-    """True if one of our streams has no reader; what waits to be written there goes nowhere from now on."""
+    """Return True if the reader of one of our streams is gone; its pending data is then discarded."""
     unread = [
         number for number in map(_descriptor, (sys.stdout, sys.stderr)) if number >= 0 and _unread(number)
     ]
@@ -97,7 +102,7 @@ def _to_nowhere(descriptors: Sequence[int]) -> None:
 def _descriptor(stream: TextIO) -> int:
     try:
         return stream.fileno()
-    except (AttributeError, io.UnsupportedOperation):  # there is none, or it is no file
+    except (AttributeError, io.UnsupportedOperation):  # no stream, or not a file
         return -1
 
 

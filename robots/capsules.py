@@ -1,4 +1,4 @@
-"""Capsules that stand for the links of a robot where it must not run into itself or the table."""
+"""Capsules that approximate the links of a robot in checks for collisions with itself and the table."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from robots.robot import Robot
 from robots.rotations import Float64
 from robots.shapes import Shape
 
-PIECES = 2  # capsules that a link has at most: each one more makes a good deal more pairs
-_ROUND = 24  # corners of the polygon about a circle
-_STEPS = 100  # towards the middle of what is to be covered
-_about: dict[bytes, tuple[Capsule, ...]] = {}  # by what the shapes are; some dozens for each robot
+PIECES = 2  # greatest number of capsules per link; more capsules make many more pairs
+_ROUND = 24  # corners of the polygon around a circle
+_STEPS = 100  # steps of the smallest circle
+_about: dict[bytes, tuple[Capsule, ...]] = {}  # cache by the content of the shapes; some dozens per robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
-    """All points within `radius` of the segment from `start` to `end`, float64 [3] in the link's frame [m]."""
+    """Points within `radius` of the segment from `start` to `end`, float64 [3] in the link's frame [m]."""
 
     start: Float64
     end: Float64
@@ -30,9 +30,9 @@ class Capsule:
 
 
 def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
-    """Capsules by link of the URDF: those that robot.toml declares, else those about the link's shapes.
+    """Return the capsules by URDF link: declared in robot.toml, else computed from the link's shapes.
 
-    Links without shapes, and those that robot.toml leaves out, have none.
+    Links without shapes, and links excluded in robot.toml, have none.
     """
     by_link: dict[str, list[Shape]] = {}
     for shape in shapes.read_shapes(robot.urdf):
@@ -43,7 +43,7 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
 
 
 def _remembered(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
-    """`about`, once for each link that looks like this: a station asks for the same robot several times."""
+    """Return the cached `covering_capsules`, because a station asks for the same robot several times."""
     key = b"".join(_content(shape) for shape in shown)
     if key not in _about:
         made = covering_capsules(shown)
@@ -61,10 +61,10 @@ def _content(shape: Shape) -> bytes:
 
 
 def covering_capsules(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
-    """At most `PIECES` capsules that cover the shapes of one link: one bent round a corner is two, not a fat one.
+    """Return at most `PIECES` capsules that cover the shapes of one link; a bent link gets two instead of a thick one.
 
-    Each shape begins with a capsule of its own; the two whose common one takes least more room are joined, again
-    and again.
+    Greedy merging: each shape starts with its own capsule, and the pair whose common capsule adds the least volume is
+    merged repeatedly.
     """
     pieces = [[shape] for shape in shown]
     rooms = [_capsule_volume(piece) for piece in pieces]
@@ -89,18 +89,18 @@ def covering_capsules(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
 
 
 def _capsule_volume(shown: Sequence[Shape]) -> float:
-    """The volume [m3] of a capsule about the shapes."""
+    """Return the volume of a capsule around the shapes [m3]."""
     capsule = smallest_capsule(shown, steps=1)
     length = float(np.linalg.norm(capsule.end - capsule.start))
     return float(np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius))
 
 
 def smallest_capsule(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
-    """A capsule that covers the shapes: along the longest axis of their common box, as thin as covers them all.
+    """Return a capsule that covers the shapes, along the longest axis of their bounding box.
 
-    Its line goes through the middle of the smallest circle about the shapes as seen along that axis (the better,
-    the more `steps`); its ends are as near to each other as still covers them. What is round is hugged; a box
-    sticks out nowhere, and the capsule sticks out of its faces.
+    Its line passes through the centre of the smallest circle around the shapes seen along that axis (more accurate
+    with more `steps`); its ends are as close as still covers them. The fit is tight for round shapes; for boxes the
+    capsule extends beyond the faces.
     """
     centres, sizes = _balls(shown)  # [n, 3], [n]
     lower, upper = (centres - sizes[:, None]).min(axis=0), (centres + sizes[:, None]).max(axis=0)
@@ -109,7 +109,7 @@ def smallest_capsule(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
     middle = _smallest_circle(centres[:, across], sizes, (lower + upper)[across] / 2, steps)
     off = np.linalg.norm(centres[:, across] - middle, axis=1)
     radius = float((off + sizes).max())
-    # A ball that is `off` the line is covered by an end that is no farther from it along the line than this.
+    # A ball at distance `off` from the line is covered if the end is at most this far from it along the line.
     reach = np.sqrt(np.maximum((radius - sizes) ** 2 - off**2, 0.0))
     along = centres[:, axis]
     first, last = float((along + reach).min()), float((along - reach).max())
@@ -124,7 +124,9 @@ def _declared(table: CapsuleTable) -> Capsule:
 
 
 def _balls(shown: Sequence[Shape]) -> tuple[Float64, Float64]:
-    """Balls whose hull covers the shapes, in the link's frame: centres [n, 3] and radii [n]; corners have none."""
+    """Return balls whose convex hull covers the shapes, in the link's frame: centres [n, 3], radii [n]; 0 for
+    corners.
+    """
     centres, sizes = [], []
     for shape in shown:
         corners, size = _corners(shape)
@@ -147,7 +149,7 @@ def _corners(shape: Shape) -> tuple[Float64, float]:
 
 
 def _smallest_circle(points: Float64, sizes: Float64, start: Float64, steps: int) -> Float64:
-    """The middle of the smallest circle about discs [n, 2] (Badoiu and Clarkson 2003: ever smaller steps outwards)."""
+    """Return the centre of the smallest circle around discs [n, 2], iteratively (Badoiu and Clarkson 2003)."""
     middle, best, least = start, start, np.inf
     for step in range(1, steps + 1):
         off = points - middle

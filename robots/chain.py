@@ -1,4 +1,4 @@
-"""The kinematic chain from a frame to a tip: forward kinematics and the geometric Jacobian."""
+"""Kinematic chain from a frame to a tip: forward kinematics and geometric Jacobian."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _AFTER = np.array([2, 0, 1])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingJoint:
-    """A joint that turns about the unit vector `axis` [3], or `slides` along it, by factor * q[drive] + offset.
+    """Joint that rotates about the unit vector `axis` [3], or `slides` along it, by factor * q[drive] + offset.
 
-    `origin` [4, 4] places it behind the moving joint before it, at the value 0.
+    `origin` [4, 4] is its pose relative to the previous moving joint at the value 0.
     """
 
     origin: Float64
@@ -31,11 +31,14 @@ class MovingJoint:
 
 
 class Chain:
-    """The joints between two links of a URDF, driven by `joints` [n] (rad; prismatic: m), all others pinned.
+    """Chain between two links of a URDF, driven by `joints` [n] (rad; prismatic: m), with all others pinned.
 
-    Each moving joint's transform is linear in (1, cos v, sin v, v), so all of them come out of one product
-    with a table made once; a mimic is driven by the joint it follows. Raises RobotError where a joint on the
-    way is neither driven, pinned nor a mimic of such a one, or where a driven one moves nothing.
+    The transform of each moving joint is linear in (1, cos v, sin v, v), so that all transforms follow from one
+    product with a precomputed table. A mimic joint is driven by the joint that it follows.
+
+    Raises:
+        RobotError: If a joint on the path is neither driven, pinned nor a mimic of such a joint, or a driven joint
+            moves nothing.
     """
 
     def __init__(
@@ -55,12 +58,12 @@ class Chain:
 
     @property
     def size(self) -> int:
-        """Count of numbers that drive the chain."""
+        """Number of values that drive the chain."""
         return len(self.joints)
 
     @property
     def moving(self) -> tuple[MovingJoint, ...]:
-        """The joints that move, from the frame outwards."""
+        """Moving joints, from the frame outwards."""
         return tuple(
             MovingJoint(
                 origin=(table[0] + table[1]).reshape(4, 4),
@@ -77,11 +80,11 @@ class Chain:
 
     @property
     def tail(self) -> Float64:
-        """Transform from the last moving joint to the tip, [4, 4]."""
+        """Transform from the last moving joint to the tip [4, 4]."""
         return self._tail
 
     def forward(self, q: Float64) -> Float64:
-        """The tip in the frame, transforms [..., 4, 4], for joints [..., n]."""
+        """Return the pose of the tip in the frame as transforms [..., 4, 4], for joints [..., n]."""
         steps = self._steps(q)
         transform = steps[..., 0, :, :]
         for index in range(1, steps.shape[-3]):
@@ -90,7 +93,7 @@ class Chain:
         return tip
 
     def pose(self, q: Float64) -> Float64:
-        """The tip in the frame, [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
+        """Return the pose of the tip in the frame [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
         tip = self.forward(q)
         pose = np.empty((*tip.shape[:-2], 7))
         pose[..., :3] = tip[..., :3, 3]
@@ -98,14 +101,14 @@ class Chain:
         return pose
 
     def jacobian(self, q: Float64) -> tuple[Float64, Float64]:
-        """The tip [4, 4] and d(position, rotation vector)/dq [6, n] in the frame's axes, at q [n]."""
+        """Return the tip [4, 4] and d(position, rotation vector)/dq [6, n] in the frame's axes, at q [n]."""
         steps = self._steps(q)
         frames = np.empty_like(steps)
         frames[0] = steps[0]
         for index in range(1, len(steps)):
             np.matmul(frames[index - 1], steps[index], out=frames[index])
         tip = frames[-1] @ self._tail
-        # A turn about its own axis leaves a joint's axis and origin where they were.
+        # Rotation about its own axis does not move a joint's axis and origin.
         axes = (frames[:, :3, :3] @ self._axes)[..., 0]
         arms = tip[:3, 3] - frames[:, :3, 3]
         turns = axes[:, _NEXT] * arms[:, _AFTER] - axes[:, _AFTER] * arms[:, _NEXT]
@@ -115,7 +118,7 @@ class Chain:
         return tip, columns if self._plain else columns @ self._coupling
 
     def _steps(self, q: Float64) -> Float64:
-        """Transforms [..., moving joints, 4, 4], each with the fixed ones before it folded in."""
+        """Return the transforms [..., moving joints, 4, 4], each including the fixed joints before it."""
         if q.shape[-1:] != (self.size,):
             raise RobotError(
                 f"{self._path}: the chain {self.frame} to {self.tip} was given joints of shape {q.shape}; "
@@ -159,7 +162,7 @@ class Chain:
         self._plain = square and bool((self._coupling == np.eye(self.size)).all()) and not self._offsets.any()
 
     def _drive(self, urdf: Urdf, joint: Joint, pinned: Mapping[str, float]) -> tuple[Float64, float]:
-        """Dependence of the joint on q: its value is row [n] . q + offset."""
+        """Return the dependence of a joint on q as (row [n], offset): its value is row . q + offset."""
         row = np.zeros(self.size)
         factor, offset = 1.0, 0.0
         seen = [joint.name]
@@ -182,7 +185,7 @@ class Chain:
 
 
 def motion_table(fixed: Float64, joint: Joint) -> Float64:
-    """Four matrices [4, 16] whose sum weighted by (1, cos v, sin v, v) is `fixed` times the joint's motion.
+    """Return four matrices [4, 16] whose sum weighted by (1, cos v, sin v, v) is `fixed` times the joint's motion.
 
     A rotation about the unit vector a is a a^T + (I - a a^T) cos v + [a]x sin v (Rodrigues).
     """
@@ -200,7 +203,7 @@ def motion_table(fixed: Float64, joint: Joint) -> Float64:
 
 
 def motions(values: Float64, tables: Float64) -> Float64:
-    """The transforms [..., N, 4, 4] of joints with these values [..., N] and motion tables [N, 4, 16]."""
+    """Return the transforms [..., N, 4, 4] of joints with these values [..., N] and motion tables [N, 4, 16]."""
     terms = np.empty((*values.shape, 1, 4))
     terms[..., 0, 0] = 1.0
     terms[..., 0, 1] = np.cos(values)

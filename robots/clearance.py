@@ -1,4 +1,4 @@
-"""Distances of a robot's links from each other and from the table: a coarse check, capsules for links."""
+"""Distances of a robot's links from each other and from the table; a coarse check with capsules."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from robots.description import TABLE
 from robots.robot import Robot
 from robots.rotations import Float64
 
-MARGIN = 0.005  # [m] within which links count as touching, unless somebody says otherwise
-_POSTURES = 256  # at which is looked whether two links ever part
-_NEARLY_ALWAYS = 0.95  # of them
-_LEVEL = 1e-3  # [m] by which the height of what only turns about the vertical changes
-_DIP = 0.01  # [m] that the middle of a finger may be below the table: a mount is no truer, and fingers press
-_REACHING = ("arm", "hand")  # kinds of groups that come down to the table
-_BLOCK = 16  # postures at once: what lies in between then fits the caches
+MARGIN = 0.005  # [m] default distance below which links count as touching
+_POSTURES = 256  # random postures for finding links that always touch
+_NEARLY_ALWAYS = 0.95  # share of postures
+_LEVEL = 1e-3  # [m] change of height below which a part only rotates about the vertical
+_DIP = 0.01  # [m] allowed depth of a finger's axis below the table: mounts are inaccurate, and fingers press
+_REACHING = ("arm", "hand")  # kinds of groups that reach the table
+_BLOCK = 16  # postures per block, so that intermediate results fit the caches
 
 _Indices = NDArray[np.intp]
 
 
 class Clearance:
-    """Distances of the `pairs` that are looked at, by the names of parts ("left_arm/link5") or "table".
+    """Distances of the checked `pairs`, named by parts ("left_arm/link5") or "table".
 
-    A pair of links is there once for each pair of their capsules. Fingers reach down to the table on purpose: over it
-    they count as the lines in the middle of their capsules, and may dip in a little (`least`).
+    A pair of links occurs once per pair of their capsules. Fingers reach the table on purpose: their distance to it is
+    measured from the capsules' axes, which may be slightly below it (`touch_thresholds`).
 
-    Looked at are links of different arms, links of one body, and links over the table (the plane z = 0 of the
-    scene). Left out, for they say nothing:
+    Checked are links of different arms, links of one body, and links over the table (plane z = 0 of the scene).
+    Excluded, because they are not informative:
 
-    * links with at most one of the robot's joints between them (grippers do not count, nor joints that no group
-      moves); of two arms that each stand for themselves, links that nothing moves;
-    * pairs that touch at nearly every posture (95 %), as in a wrist, in this arm and in others like it;
-    * the table under what no arm or hand moves (a torso stands beside it) or what only turns about the vertical;
-    * what robot.toml says under collision.ignore and collision.without.
+    * links with at most one of the robot's joints between them (not counting grippers and joints that no group moves);
+      of two arms with separate roots, links that nothing moves;
+    * pairs that touch at nearly every posture (95 %), as in a wrist, in this arm or in its equal copies;
+    * the table for parts that no arm or hand moves (a torso next to it) or that only rotate about the vertical;
+    * everything in collision.ignore and collision.without of robot.toml.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -62,7 +62,7 @@ class Clearance:
         self._look_at(*self._telling(robot))
 
     def distances(self, q: Float64) -> Float64:
-        """Distances of the pairs [m], [..., K], below zero for overlap, for the robot's vector [..., D]."""
+        """Return the distances of the pairs [m], [..., K], negative for overlap, for the robot's vector [..., D]."""
         if q.ndim == 1:
             return self._distances(q)
         flat = q.reshape(-1, q.shape[-1])
@@ -84,13 +84,15 @@ class Clearance:
         return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
 
     def touch_thresholds(self, margin: float) -> Float64:
-        """Distances [K] under which pairs count as touching: `margin`, and for fingers over the table less than 0."""
+        """Return the distances [K] below which pairs count as touching: `margin`, negative for fingers over
+        the table.
+        """
         least = np.full(len(self.pairs), margin)
         least[len(self._first) :][self._fingers[self._over]] = -_DIP
         return least
 
     def _look_at(self, first: _Indices, second: _Indices, over: _Indices) -> None:
-        """The pairs from now on: capsules `first` and `second`, and those `over` the table."""
+        """Set the checked pairs: capsules `first` and `second`, and capsules `over` the table."""
         self._first, self._second, self._over = first, second, over
         standing = np.where(self._fingers[over], 0.0, self._radii[over])
         self._thick = np.concatenate([self._radii[first] + self._radii[second], standing])
@@ -101,7 +103,7 @@ class Clearance:
         )
 
     def _telling(self, robot: Robot) -> tuple[_Indices, _Indices, _Indices]:
-        """The pairs whose distance says something: they part somewhere, and what is over the table has a height."""
+        """Return the informative pairs: their distance varies, and they are not always touching."""
         lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
         upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
         apart = self.distances(np.random.default_rng(0).uniform(lower, upper, (_POSTURES, robot.dim)))
@@ -122,18 +124,18 @@ class Clearance:
 
 @lru_cache(maxsize=32)
 def get_clearance(robot: Robot) -> Clearance:
-    """That of a robot, found once for all who judge it in a process."""
+    """Return the clearance of a robot, cached for all its users in a process."""
     return Clearance(robot)
 
 
 def _mirror_key(pair: tuple[str, str]) -> tuple[str, ...]:
-    """Common part of a pair and the same links of another arm like it; the pair itself, if of two arms."""
+    """Return a key shared by the same pair in equal arms; the pair itself if it is of two arms."""
     (group, _, link), (other_group, _, other) = (name.partition("/") for name in pair)
     return (link, other or other_group) if group == other_group or not other else pair
 
 
 def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _Indices, _Indices]:
-    """Pairs of capsules that could touch without being neighbours, and capsules that could reach the table."""
+    """Return pairs of capsules that are not neighbours, and capsules that may reach the table."""
     moved = body.moving_mask()[parts]
     grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
     reaching = np.zeros(robot.dim, dtype=bool)
@@ -174,7 +176,9 @@ def _root(body: Body, part: np.intp) -> int:
 
 
 def collision_problems(robot: Robot, margin: float = MARGIN) -> list[str]:
-    """Faults of the robot's [collision], in sentences: pairs that touch at a named pose, or no pairs."""
+    """Return the faults of the robot's [collision] as sentences: pairs that touch at a named pose, or no
+    pairs at all.
+    """
     clearance = Clearance(robot)
     least = dict(zip(clearance.pairs, clearance.touch_thresholds(margin).tolist(), strict=True))
     if not clearance.pairs:

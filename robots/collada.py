@@ -1,4 +1,4 @@
-"""Reads the points of a COLLADA file where its scene puts them, in m; what they look like is for those who draw it."""
+"""Reader of the points of a COLLADA file, placed by its scene [m]; appearance is ignored."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from robots.rotations import Float64
 from robots.urdf import parsed
 
 _NAMESPACE = "{*}"
-_MOST_NODES = 20_000  # a file of some lines can show one a billion times
+_MOST_NODES = 20_000  # limit, because a few lines can reference a node a billion times
 
 
 def read_points(path: Path) -> Float64:
-    """All points [n, 3] of the geometries that the scene shows, units applied; ValueError where it is no COLLADA.
+    """Return all points [n, 3] of the geometries in the scene, in metres.
 
-    The file's up axis is left as it is, as robots' viewers do.
+    The file's up axis is ignored, as in other viewers of robots.
+
+    Raises:
+        ValueError: If it is not COLLADA.
     """
     try:
         root = parsed(path)
@@ -42,7 +45,7 @@ def read_points(path: Path) -> Float64:
 
 
 def _positions(geometry: ET.Element) -> Float64:
-    """The points [n, 3] of a geometry's meshes."""
+    """Return the points [n, 3] of a geometry's meshes."""
     sources = {f"#{one.get('id')}": one for one in geometry.iterfind(f".//{_NAMESPACE}source")}
     parts = []
     for element in geometry.iterfind(f".//{_NAMESPACE}vertices/{_NAMESPACE}input"):
@@ -56,7 +59,7 @@ def _positions(geometry: ET.Element) -> Float64:
 def _instances(
     node: ET.Element, above: Float64, library: dict[str, ET.Element], depth: int, visits: Iterator[int]
 ) -> Iterator[tuple[str, Float64]]:
-    """The geometries that a node and those below it show, and where; `visits` ends with the nodes allowed."""
+    """Yield the geometries of a node and its descendants with their transforms; `visits` limits the number of nodes."""
     if next(visits, None) is None:
         raise ValueError(f"more than {_MOST_NODES} nodes, with those that it shows again")
     if depth > 64:
@@ -77,7 +80,7 @@ def _instances(
 
 
 def _motion(kind: str, numbers: Float64) -> Float64:
-    """The transform [4, 4] of one element of a node."""
+    """Return the transform [4, 4] of one element of a node."""
     motion = np.eye(4)
     if kind == "matrix":
         return numbers.reshape(4, 4)

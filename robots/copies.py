@@ -1,4 +1,4 @@
-"""Which groups share one copy of the URDF: a file that describes one of several equal arms stands for each of them."""
+"""Assignment of groups to copies of the URDF: a file that describes one of several equal arms is used once per arm."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from robots.robot import Group
 
 
 def urdf_copies(groups: Sequence[Group]) -> list[list[Group]]:
-    """The groups, sorted into copies of the URDF such that no joint is moved twice in one copy."""
+    """Return the groups by copy of the URDF, such that each joint is moved at most once per copy."""
     found: list[tuple[set[str], list[Group]]] = []
     for group in groups:
         joints = {*filter(None, group.urdf_joints), *(group.gripper.fingers if group.gripper else ())}
@@ -23,5 +23,5 @@ def urdf_copies(groups: Sequence[Group]) -> list[list[Group]]:
 
 
 def copy_of(group: Group, groups: Sequence[Group]) -> list[Group]:
-    """The groups of the copy that `group` belongs to."""
+    """Return the groups of the copy to which `group` belongs."""
     return next(members for members in urdf_copies(groups) if group in members)

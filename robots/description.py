@@ -1,4 +1,4 @@
-"""Contents of a robot.toml: one model per table, strict, every key documented."""
+"""Schema of robot.toml: one strict model per table, with every key documented."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
 Quadruple = Annotated[list[float], Field(min_length=4, max_length=4)]
 Positive = Annotated[float, Field(gt=0)]
 Reason = Annotated[str, Field(min_length=1)]
-Label = Annotated[str, Field(min_length=1)]  # of a joint: what the wire or the URDF calls it
+Label = Annotated[str, Field(min_length=1)]  # name of a joint on the wire or in the URDF
 Topic = Annotated[str, Field(pattern=r"^[~/A-Za-z][A-Za-z0-9_/~]*$")]
 Kind = Literal["arm", "hand", "head", "torso", "base", "other"]
-TABLE = "table"  # in pairs of [collision]: the plane z = 0 of the scene
+TABLE = "table"  # name in pairs of [collision]: the plane z = 0 of the scene
 
 
 class Table(BaseModel):
-    """A table of robot.toml: nothing is coerced, unknown keys are errors that list the known ones."""
+    """Table of robot.toml: values are not converted, and unknown keys are errors that list the known ones."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -42,49 +42,52 @@ class Table(BaseModel):
 
 
 class TipTable(Table):
-    """A frame in `eef_link` between the fingertips: z the way they point, y the way they open."""
+    """Frame between the fingertips, in `eef_link`: z in the direction in which they point, y in that in which
+    they open.
+    """
 
     xyz: Triple
     wxyz: Quadruple
 
 
 class GripperTable(Table):
-    """A group's gripper, one number in the robot's own unit."""
+    """Gripper of a group: one number in the robot's own unit."""
 
     index: Annotated[int, Field(ge=0)]
-    """Its place inside the group, from 0."""
+    """Index in the group, from 0."""
     unit: Annotated[str, Field(min_length=1)]
-    """The unit of its number on the wire."""
+    """Unit of the number on the wire."""
     lower: float
     upper: float
     open: float
     close: float
     velocity: Positive
-    """In units per second."""
+    """[unit/s]"""
     binary: bool = False
-    """Whether it knows only open and close."""
+    """Whether it can only open and close."""
     threshold: float | None = None
-    """Where a binary gripper switches; a value at or above it means open if `open` is above `close`."""
+    """Value at which a binary gripper switches; values at or above it mean open if `open` is above `close`."""
     hysteresis: Annotated[float, Field(ge=0, lt=1)] | None = None
-    """Around the threshold, the part of its travel within which a binary gripper stays as it was; 0.05 where it is
-    not given, less where the threshold is nearer to an end than that."""
+    """Share of the travel, around the threshold, within which a binary gripper keeps its state. Default:
+    0.05, or less if the threshold is closer to an end.
+    """
     fingers: dict[str, Pair] = {}
-    """URDF joints that move with it: their values [rad or m] at `lower` and at `upper`; drawing only."""
+    """URDF joints that move with it: their values [rad or m] at `lower` and at `upper`; for drawing only."""
     apart: Pair | None = None
-    """How far its fingers are apart [m] at `close` and at `open`; else the number itself where `unit` is "m"."""
+    """Distance of the fingers [m] at `close` and at `open`. Default: the number itself if `unit` is "m"."""
     tip: TipTable | None = None
-    """Where its fingertips are; else read off the fingers of the URDF, the sliding children of `eef_link`."""
+    """Frame of the fingertips. Default: derived from the fingers of the URDF, the sliding children of `eef_link`."""
 
 
 class PlaceTable(Table):
-    """Place of an object."""
+    """Pose of an object."""
 
     xyz: Triple
     wxyz: Quadruple
 
 
 class CapsuleTable(Table):
-    """A capsule that stands for a link in the collision check, in the link's frame [m]."""
+    """Capsule that approximates a link in the collision check, in the link's frame [m]."""
 
     start: Triple
     end: Triple
@@ -99,20 +102,20 @@ Capsules = Annotated[list[CapsuleTable], BeforeValidator(_several), Field(min_le
 
 
 class CollisionTable(Table):
-    """Input of the coarse collision check; without it, capsules from the shapes of each link."""
+    """Input of the coarse collision check. Default: capsules from the shapes of each link."""
 
     capsules: dict[str, Capsules] = {}
-    """Links with a capsule of their own, or a list of some, instead of those that their shapes give."""
+    """Links with declared capsules, one or a list, instead of those from their shapes."""
     without: list[str] = []
-    """Links that are left out: fingers that touch each other, covers, cameras."""
+    """Links excluded from the check: fingers that touch each other, covers, cameras."""
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = []
     """Pairs that may come close: links of one copy of the URDF, "table", or GROUP/LINK for links of two arms.
-
-    Neighbours beyond one joint, and pairs that touch at every posture, are left out anyway."""
+    Neighbours up to one joint apart, and pairs that touch at every posture, are always excluded.
+    """
 
 
 class RosGroupTable(Table):
-    """The topics of one group; what is absent the robot's stack does not have."""
+    """Topics of one group; absent ones do not exist in the robot's ROS stack."""
 
     state: Topic | None = None
     command: Topic | None = None
@@ -125,7 +128,7 @@ class RosGroupTable(Table):
 
 
 class RosTable(Table):
-    """The topics of the robot's own ROS stack."""
+    """Topics of the robot's own ROS stack."""
 
     version: Literal[1, 2]
     cameras: dict[Name, Topic] = {}
@@ -134,7 +137,7 @@ class RosTable(Table):
 
 
 class OverrideTable(Table):
-    """Limits that replace the URDF's for one joint, and why."""
+    """Limits that replace the URDF's for one joint, with the reason."""
 
     joint: Label
     lower: float | None = None
@@ -144,55 +147,60 @@ class OverrideTable(Table):
 
 
 class GroupTable(Table):
-    """Joints that travel together on the wire, in this order."""
+    """Joints that are sent together on the wire, in this order."""
 
     name: Name
     joints: Annotated[list[Label], Field(min_length=1)]
-    """Names on the wire, the gripper's included."""
+    """Names on the wire, including the gripper."""
     urdf_joints: list[str]
-    """Their names in the URDF, in the same order, without the gripper; "" for a number that moves no link of it
-    (a base's speed), whose limits are then an override."""
+    """Names in the URDF, in the same order, without the gripper; "" for a number that moves no link (speed of
+    a base), whose limits must be an override.
+    """
     kind: Kind | None = None
-    """What it is, for pages; "arm" where it has an end effector, else "other"."""
+    """Kind of group, for pages. Default: "arm" with an end effector, else "other"."""
     optional: bool = False
-    """Part of the robot only where a deployment's `groups` names it."""
+    """Whether it is part of the robot only if a deployment's `groups` names it."""
     gripper: GripperTable | None = None
     frame: str | None = None
-    """The link in which the end effector's pose is expressed."""
+    """Link in which the end effector's pose is expressed."""
     eef_link: str | None = None
-    """The link that is the end effector."""
+    """Link that is the end effector."""
     pinned: dict[str, float] = {}
-    """Values of URDF joints between `frame` and `eef_link` that no group moves (a frozen torso)."""
+    """Values of URDF joints between `frame` and `eef_link` that no group moves (a fixed torso)."""
     mount: PlaceTable | None = None
-    """Where the root of its copy of the URDF stands in `mount_frame`."""
+    """Pose of the root of its copy of the URDF in `mount_frame`."""
     overrides: list[OverrideTable] = []
 
 
 class RobotTable(Table):
-    """The whole robot.toml."""
+    """Complete robot.toml."""
 
     title: Annotated[str, Field(min_length=1)]
     urdf: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+\.urdf$")]
     """File name of the URDF in the same folder."""
     limits_source: Reason
-    """Where the joint limits come from."""
+    """Origin of the joint limits."""
     control_rate: Positive
-    """Commands per second that the robot is run at unless a deployment says otherwise."""
+    """Default number of commands per second [Hz]; a deployment may override it."""
     cameras: dict[Name, Name]
     """Logical name = observation key."""
     mount_frame: Name = "world"
-    """Name of the frame in which mounts are given: one that all arms have in common."""
+    """Name of the frame in which mounts are given, common to all arms."""
     stand: PlaceTable | None = None
-    """Where `mount_frame` stands in the scene, whose z = 0 is the table: drawings and the simulated bench."""
+    """Pose of `mount_frame` in the scene, whose table is z = 0: for drawings and the simulated bench."""
     collision: CollisionTable = CollisionTable()
     ros: RosTable | None = None
     groups: Annotated[list[GroupTable], Field(min_length=1)]
     poses: dict[Name, dict[str, list[float]]]
-    """Named poses, a vector per group; "home" is required."""
+    """Named poses, one vector per group; "home" is required."""
 
 
 def read(path: Path) -> RobotTable:
-    """The tables of the file; RobotError lists every wrong key with what was given and what is allowed."""
+    """Return the tables of the file.
+
+    Raises:
+        RobotError: If the file is invalid; it lists every wrong key with the given and the allowed values.
+    """
     try:
         with path.open("rb") as file:
             given = tomllib.load(file)

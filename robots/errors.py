@@ -1,7 +1,7 @@
-"""One base for every error of the robot descriptions."""
+"""Base of all errors of robot descriptions."""
 
 from __future__ import annotations
 
 
 class RobotError(Exception):
-    """A robot's folder is absent or wrong; says which file and key, what was given, what is allowed."""
+    """A robot's folder is missing or wrong; the message names file and key, the given value, and what is allowed."""

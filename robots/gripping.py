@@ -1,4 +1,4 @@
-"""A group's gripper: what its table says, what a deployment chooses, where its fingertips are."""
+"""Gripper of a group: its table, a deployment's choices, and the frame of its fingertips."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from robots.robot import Gripper
 from robots.rotations import Float64, matrix_of_quaternion
 from robots.urdf import Urdf
 
-_HYSTERESIS = 0.05  # of the travel
+_HYSTERESIS = 0.05  # share of the travel
 
 
 @dataclass(frozen=True, slots=True)
 class GripperChoice:
-    """A deployment's changes to a gripper; None keeps what the robot's description says."""
+    """Changes of a deployment to a gripper; None keeps the value of the robot's description."""
 
     binary: bool | None = None
     threshold: float | None = None
@@ -105,7 +105,9 @@ def _fingers(key: str, tree: Urdf, table: Mapping[str, list[float]]) -> dict[str
 
 
 def tip_frame(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
-    """The frame of the fingertips in `eef_link`: what is declared, else what the URDF's fingers show."""
+    """Return the frame of the fingertips in `eef_link` [4, 4]: declared, else derived from the URDF; None for
+    other groups.
+    """
     if table.eef_link is None or table.gripper is None:
         return None
     declared = table.gripper.tip
@@ -122,9 +124,9 @@ def tip_frame(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
 
 
 def _between_fingers(tree: Urdf, link: str) -> Float64:
-    """Midway between the origins of the link's sliding children, in the link's axes turned about z only.
+    """Return the frame midway between the origins of the link's sliding children, rotated about the link's z only.
 
-    y is the way the first of them slides; the link itself where nothing slides on it across its z.
+    y is the direction in which the first of them slides; the identity if none slides across z.
     """
     tip = np.eye(4)
     fingers = [joint for joint in tree.joints.values() if joint.parent == link and joint.kind == "prismatic"]

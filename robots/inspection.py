@@ -1,4 +1,4 @@
-"""Findings on a robot's description, in sentences: `python -m robots check`."""
+"""Findings on a robot's description, as sentences: `python -m robots check`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from robots.rotations import Float64
 from robots.urdf import Urdf
 from robots.visuals import scene_of
 
-GUESS = "GUESS"  # what a drafted robot.toml says where nobody has looked yet
-_FASTEST = 10.0  # rad/s: an arm's joint that is said to be faster has limits that nobody meant
+GUESS = "GUESS"  # mark of unverified values in a drafted robot.toml
+_FASTEST = 10.0  # [rad/s] arm joints with a higher limit probably have a placeholder
 
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """`lines` say what is declared, `warnings` what somebody should look at, `errors` what is wrong."""
+    """`lines` describe the declarations, `warnings` are points to verify, `errors` are faults."""
 
     lines: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -34,13 +34,17 @@ class Inspection:
 
 
 def inspect_robot(name: str | Path) -> Inspection:
-    """Looks at a robot with all of its groups and without the optional ones; RobotError where it cannot be loaded."""
+    """Return the findings on a robot with and without its optional groups.
+
+    Raises:
+        RobotError: If it cannot be loaded.
+    """
     usual = load_robot(name)
     file = usual.folder / "robot.toml"
     table = description.read(file)
     whole = load_robot_with_optional_groups(name)
     tree = urdf.read(whole.urdf)
-    scene_of(whole)  # meshes that are missing
+    scene_of(whole)  # raises for missing meshes
     lines = [
         *_heading(usual, table, whole),
         *_standing(whole, tree),
@@ -72,7 +76,7 @@ def _heading(robot: Robot, table: RobotTable, whole: Robot) -> Iterator[str]:
 
 
 def _standing(robot: Robot, tree: Urdf) -> Iterator[str]:
-    """The URDF, its copies and where they stand."""
+    """Yield lines on the URDF, its copies and their poses."""
     members = urdf_copies(robot.groups)
     moving = [joint.name for joint in tree.joints.values() if joint.kind != "fixed" and joint.mimic is None]
     yield f"{tree.path.name}: {len(tree.links)} links from {tree.root}, {len(moving)} joints that move by themselves"
@@ -114,7 +118,7 @@ def _group(robot: Robot, group: Group, table: RobotTable) -> Iterator[str]:
 
 
 def _numbers(robot: Robot, group: Group, declared: GroupTable) -> Iterator[str]:
-    """A line for each number: limits, where they come from, home."""
+    """Yield a line for each number: limits, their source, and home."""
     home = robot.poses["home"]
     overrides = {override.joint: override for override in declared.overrides}
     joints = iter(group.urdf_joints)
@@ -198,7 +202,7 @@ def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iter
 
 
 def _low_fingertips(robot: Robot) -> Iterator[str]:
-    """Fingertips below the table, which the collision check lets pass: they reach down to it on purpose."""
+    """Yield warnings on fingertips below the table, which the collision check allows on purpose."""
     body = Body(robot)
     for name, q in robot.poses.items():
         for arm in robot.arms:

@@ -1,4 +1,4 @@
-"""The limits of a group's numbers: of the URDF, of the overrides, of the gripper."""
+"""Limits of a group's numbers, from the URDF, overrides and the gripper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ class Limits:
 
 
 def group_limits(file: Path, tree: Urdf, table: GroupTable) -> Limits:
-    """The limits of a group's joints, of its URDF joints or the override, and of the gripper table."""
+    """Return the limits of a group's joints, from the URDF or the overrides, and from the gripper table.
+
+    Raises:
+        RobotError: If a limit is missing or invalid.
+    """
     key = f"{file}: groups.{table.name}"
     reject_duplicates(
         file, f"groups.{table.name}.overrides", [override.joint for override in table.overrides]

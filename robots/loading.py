@@ -1,4 +1,4 @@
-"""Makes a Robot of a folder with robot.toml and a URDF, and checks one against the other."""
+"""Loading of a Robot from a folder with robot.toml and URDF, and checks of their consistency."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _FILE = "robot.toml"
 
 
 def robot_names() -> tuple[str, ...]:
-    """The robots that come with the program, and those in the folders of $EVA_ROBOTS (as in a search path)."""
+    """Return the names of the included robots, and of those in the folders of $EVA_ROBOTS (a search path)."""
     return tuple(sorted(_known()))
 
 
 def robot_folders() -> tuple[Path, ...]:
-    """The folders of $EVA_ROBOTS, in which robots of one's own lie."""
+    """Return the folders of $EVA_ROBOTS, which contain additional robots."""
     parts = os.environ.get("EVA_ROBOTS", "").split(os.pathsep)
     return tuple(Path(part).expanduser() for part in parts if part)
 
 
 def _known() -> dict[str, Path]:
-    """Folders by name; what comes with the program is never replaced by another of the same name."""
+    """Return the folders by name; an included robot cannot be replaced by another of the same name."""
     found: dict[str, Path] = {}
     for root in (_HERE, *robot_folders()):
         for file in sorted(root.glob(f"*/{_FILE}")):
@@ -49,10 +49,15 @@ def load_robot(
     groups: Sequence[str] | None = None,
     grippers: Mapping[str, GripperChoice] | None = None,
 ) -> Robot:
-    """The robot of that name or in that folder; RobotError says which file and key, given, allowed.
+    """Return the robot of that name or in that folder.
 
-    `groups` are those that are part of it, in the description's order; without, all that are not optional.
-    `grippers` are choices by the name of their group.
+    Args:
+        robot: Name or folder.
+        groups: Groups that are part of it, in the description's order; None for all that are not optional.
+        grippers: Choices by group.
+
+    Raises:
+        RobotError: If it is invalid; the message names file and key, the given and the allowed values.
     """
     folder = _folder(robot)
     file = folder / _FILE
@@ -96,12 +101,12 @@ def load_robot(
 
 
 def load_robot_with_optional_groups(robot: str | Path) -> Robot:
-    """The same robot with the optional groups too."""
+    """Return the robot including all optional groups."""
     return load_robot(robot, [group.name for group in description.read(_folder(robot) / _FILE).groups])
 
 
 def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list[GroupTable]:
-    """The groups that are part of the robot, in the file's order."""
+    """Return the groups that are part of the robot, in the file's order."""
     known = [group.name for group in table.groups]
     unknown = [name for name in groups or () if name not in known]
     if unknown or (groups is not None and not groups):
@@ -124,7 +129,7 @@ def _tree(file: Path, path: Path) -> Urdf:
 
 
 def _check_ros(file: Path, table: RobotTable) -> None:
-    """Topics may name only cameras and groups that there are."""
+    """Raise RobotError if topics name unknown cameras or groups."""
     if table.ros is None:
         return
     for key, given, known in (
@@ -137,7 +142,7 @@ def _check_ros(file: Path, table: RobotTable) -> None:
 
 
 def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
-    """Collision may name only links of the URDF; in pairs also those of one group's copy, and the table."""
+    """Raise RobotError if [collision] names unknown links; pairs may also contain GROUP/LINK and the table."""
     collision = table.collision
     groups = [group.name for group in table.groups]
     for key, named in (("capsules", list(collision.capsules)), ("without", collision.without)):

@@ -1,4 +1,4 @@
-"""Files with meshes: where a robot's lie, and how far what they show reaches."""
+"""Mesh files: their location for a robot, and their bounding boxes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from robots.rotations import Float64
 ENVIRONMENT = "EVA_ROBOT_MESHES"
 SUFFIXES = (".stl", ".obj", ".dae")
 Bounds = tuple[Float64, Float64]
-_SPACE = r"[^\S\n]"  # within a line
+_SPACE = r"[^\S\n]"  # blanks within a line
 _CORNER = 3 * rf"{_SPACE}+(\S+)"
 
 
 def mesh_roots(folder: Path) -> tuple[Path, ...]:
-    """The folders in which meshes of the robot in `folder` may lie: its own and $EVA_ROBOT_MESHES/<its name>."""
+    """Return the folders that may contain meshes of the robot in `folder`: its own, and
+    $EVA_ROBOT_MESHES/<its name>.
+    """
     given = os.environ.get(ENVIRONMENT, "")
     if not given:
         return (folder.resolve(),)
@@ -34,9 +36,12 @@ def mesh_roots(folder: Path) -> tuple[Path, ...]:
 
 
 def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
-    """The file that a URDF in `folder` names for `owner`: relative to the URDF, package://NAME/... or file://...
+    """Return the file that a URDF in `folder` names for `owner`: relative path, package://NAME/... or file://...
 
-    It has to lie in one of the `roots`, links followed; RobotError says where it was looked for.
+    It must be within one of the `mesh_roots` after resolving links.
+
+    Raises:
+        RobotError: If it is missing or not allowed; the message lists the searched paths.
     """
     if Path(filename).suffix.lower() not in SUFFIXES:
         raise RobotError(f"{owner}: mesh {filename!r}; allowed: files {', '.join(SUFFIXES)}")
@@ -44,7 +49,7 @@ def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
     try:
         places = [place for root in allowed for place in _places(root, owner, filename)]
         there = [place for place in places if place.is_file()]
-    except (OSError, ValueError) as error:  # longer than a file system has names, or with a null in it
+    except (OSError, ValueError) as error:  # name too long for the file system, or with a NUL character
         raise RobotError(f"{owner}: mesh {filename!r:.120} is no name of a file: {error!s:.80}") from error
     for place in places:
         if not any(place.is_relative_to(root) for root in allowed):
@@ -60,7 +65,7 @@ def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
 
 
 def replacement_mesh(folder: Path, link: str) -> Path | None:
-    """$EVA_ROBOT_MESHES/<robot>/<link>.stl, .obj or .dae, which is shown instead of what the URDF says; else None."""
+    """Return $EVA_ROBOT_MESHES/<robot>/<link>.stl, .obj or .dae, which replaces the URDF's visuals; None if absent."""
     for root in mesh_roots(folder)[1:]:
         for suffix in SUFFIXES:
             place = (root / f"{link}{suffix}").resolve()
@@ -70,7 +75,11 @@ def replacement_mesh(folder: Path, link: str) -> Path | None:
 
 
 def mesh_bounds(path: Path) -> Bounds:
-    """The least and the greatest corner [3] of what the file shows, in its own axes [m]; RobotError if unreadable."""
+    """Return the lower and upper corner [3] of the file's content, in its own axes [m].
+
+    Raises:
+        RobotError: If it cannot be read.
+    """
     try:
         return _bounds(path, path.stat().st_mtime_ns)
     except (OSError, ValueError) as error:
@@ -78,7 +87,7 @@ def mesh_bounds(path: Path) -> Bounds:
 
 
 def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
-    """Paths in `root` at which the file may lie; a package is the folder of its name there, or the root."""
+    """Yield the paths in `root` at which the file may be; a package is the folder of its name there, or the root."""
     scheme, separator, rest = filename.partition("://")
     if not separator:
         yield (root / filename).resolve()
@@ -108,7 +117,7 @@ def _bounds(path: Path, _changed: int) -> Bounds:
 
 
 def _stl(content: bytes) -> Float64:
-    """The corners [n, 3] of an STL's triangles: binary where its length says so, else text."""
+    """Return the corners [n, 3] of an STL's triangles: binary if its length is consistent, else text."""
     count = int.from_bytes(content[80:84], "little")
     if len(content) >= 84 and len(content) == 84 + 50 * count:
         triangle = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -120,6 +129,6 @@ def _stl(content: bytes) -> Float64:
 
 
 def _obj(text: str) -> Float64:
-    """The vertices [n, 3] of an OBJ."""
+    """Return the vertices [n, 3] of an OBJ file."""
     found = re.findall(rf"^{_SPACE}*v{_CORNER}", text, re.MULTILINE)
     return np.array(found, dtype=np.float64).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Places of a description as read-only vectors [7] = x, y, z, qw, qx, qy, qz."""
+"""Poses of a description as read-only vectors [7] = x, y, z, qw, qx, qy, qz."""
 
 from __future__ import annotations
 

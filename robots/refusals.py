@@ -1,4 +1,4 @@
-"""Faults of a description, said with file and key."""
+"""Shared checks of a description, whose errors name file and key."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from robots.urdf import Urdf
 
 @contextmanager
 def error_context(key: str) -> Iterator[None]:
-    """Name the key that asked for the URDF in errors about it that are raised in here."""
+    """Prefix errors that are raised inside with the key that refers to the URDF."""
     try:
         yield
     except RobotError as error:

@@ -1,4 +1,4 @@
-"""A robot as the rest of the program sees it: groups of joints, cameras, poses, limits, one flat vector."""
+"""Robot as used by all other code: groups of joints, cameras, poses, limits, one flat vector."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """One number of a group in the robot's own `unit`; `index` is its place inside the group.
+    """Gripper: one number of a group in the robot's own `unit`; `index` is its position in the group.
 
-    `fingers` are URDF joints and their values [rad or m] where the number is `lower` and where it is `upper`;
-    `apart` is how far the fingers are apart [m] at `close` and at `open`, None where nobody said. A binary one
-    switches at `threshold`, with a `hysteresis` that is a part of its travel; else both are None.
+    `fingers` are URDF joints with their values [rad or m] at `lower` and at `upper`; `apart` is the distance of the
+    fingers [m] at `close` and at `open`, None if unknown. A binary gripper switches at `threshold`, with a
+    `hysteresis` as a share of its travel; else both are None.
     """
 
     index: int
@@ -44,14 +44,14 @@ class Gripper:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Joints that travel together; `joints` are names on the wire, `slice` their place in the robot's vector.
+    """Joints that are sent together; `joints` are names on the wire, `slice` their place in the robot's vector.
 
-    `urdf_joints` name the same joints in the URDF, without the gripper, "" for what moves no link. An arm has
-    an end effector: `eef_link`, whose pose is given in `frame`. Its `chain` of own joints begins at `frame`, or,
-    where other groups of the robot move what lies between (a torso), at the end of `carrier`, which leads there
-    from `frame` and is driven by `carrier_dims` of the robot's vector. `mount` [7] (x, y, z, qw, qx, qy, qz) places
-    the root of the group's copy of the URDF in the robot's mount frame. `tip` [4, 4] in `eef_link` lies between
-    the fingertips, z the way they point, y the way they open; None where there is no gripper.
+    `urdf_joints` name the same joints in the URDF, without the gripper, "" for numbers that move no link. An arm has
+    an end effector `eef_link`, whose pose is given in `frame`. Its `chain` of own joints begins at `frame` or, if
+    other groups move joints in between (a torso), at the end of `carrier`, which begins at `frame` and is driven by
+    `carrier_dims` of the robot's vector. `mount` [7] (x, y, z, qw, qx, qy, qz) is the pose of the root of the group's
+    URDF copy in the robot's mount frame. `tip` [4, 4] is the frame between the fingertips in `eef_link`, z in the
+    direction in which they point, y in the opening direction; None without a gripper.
     """
 
     name: str
@@ -70,41 +70,45 @@ class Group:
 
     @property
     def dof(self) -> int:
-        """Count of the group's numbers, its gripper included."""
+        """Number of the group's values, including its gripper."""
         return len(self.joints)
 
     @property
     def gripper_dim(self) -> int | None:
-        """The gripper's place in the robot's vector."""
+        """Index of the gripper in the robot's vector, None without one."""
         return None if self.gripper is None else int(self.slice.start) + self.gripper.index
 
     @property
     def joint_dims(self) -> NDArray[np.intp]:
-        """The places of `urdf_joints` in the robot's vector."""
+        """Indices of `urdf_joints` in the robot's vector."""
         return _dims(self.slice.start, self.slice.stop, -1 if self.gripper is None else self.gripper.index)
 
     def carried(self, q: Float64) -> Float64:
-        """Start of the chain in `frame`: transforms [..., 4, 4] for the robot's vector [..., D]."""
+        """Return the start of the chain in `frame` as transforms [..., 4, 4], for the robot's vector [..., D]."""
         if self.carrier is None:
             return np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
         return self.carrier.forward(q[..., self.carrier_dims])
 
     def transform(self, q: Float64) -> Float64:
-        """The end effector in `frame`, [..., 4, 4], for the robot's vector [..., D]; RobotError if it has none."""
+        """Return the end effector in `frame` [..., 4, 4], for the robot's vector [..., D].
+
+        Raises:
+            RobotError: If the group has no end effector.
+        """
         if self.chain is None:
             raise RobotError(f"group {self.name} has no end effector")
         own = self.chain.forward(q[..., self.joint_dims])
         return own if self.carrier is None else self.carried(q) @ own
 
     def pose(self, q: Float64) -> Float64:
-        """The same as [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
+        """Return the end effector in `frame` [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
         transform = self.transform(q)
         return np.concatenate([transform[..., :3, 3], quaternion_of_matrix(transform[..., :3, :3])], axis=-1)
 
 
 @functools.cache
 def _dims(start: int, stop: int, without: int) -> NDArray[np.intp]:
-    """The places from `start` on without one of them; looked up at every step of every arm."""
+    """Return the indices from `start` to `stop` without one; cached, because it is used at every step of every arm."""
     dims = np.array([start + place for place in range(stop - start) if place != without], dtype=np.intp)
     dims.flags.writeable = False
     return dims
@@ -112,7 +116,7 @@ def _dims(start: int, stop: int, without: int) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera's logical `name` and the `key` under which observations carry its picture."""
+    """Camera with its logical `name` and the `key` of its image in observations."""
 
     name: str
     key: str
@@ -120,11 +124,11 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """A robot description; vectors are in group order, rad and rad/s, grippers in their own unit.
+    """Robot description; vectors are in group order, in rad and rad/s, grippers in their own unit.
 
-    `lower`, `upper`, `velocity` and every pose are read-only float64 [dim]. `overrides` are sentences, one
-    for each limit that differs from the URDF. `mount_frame` names what mounts are given in, `stand` [7] places
-    it in the scene, whose z = 0 is the table.
+    `lower`, `upper`, `velocity` and every pose are read-only float64 [dim]. `overrides` are sentences, one per limit
+    that differs from the URDF. `mount_frame` is the frame of the mounts, and `stand` [7] its pose in the scene, whose
+    table is z = 0.
     """
 
     name: str
@@ -152,7 +156,7 @@ class Robot:
 
     @property
     def arms(self) -> tuple[Group, ...]:
-        """The groups with an end effector; each has one 8-vector, whose last number is 0 without a gripper."""
+        """Groups with an end effector; each has an 8-vector, whose last number is 0 without a gripper."""
         return tuple(group for group in self.groups if group.chain is not None)
 
     @property
@@ -162,28 +166,30 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """A name for every number of the robot's vector, "group.joint"."""
+        """Name of every number of the robot's vector, "group.joint"."""
         return tuple(f"{group.name}.{joint}" for group in self.groups for joint in group.joints)
 
     @property
     def eef_names(self) -> tuple[str, ...]:
-        """A name for every number of the end-effector vector, "arm.x" ... "arm.qz", "arm.gripper"."""
+        """Name of every number of the end-effector vector, "arm.x" ... "arm.qz", "arm.gripper"."""
         return tuple(f"{arm.name}.{field}" for arm in self.arms for field in EEF_FIELDS)
 
     @property
     def gripper_dims(self) -> tuple[int, ...]:
-        """The places of all grippers in the robot's vector."""
+        """Indices of all grippers in the robot's vector."""
         return tuple(group.gripper_dim for group in self.groups if group.gripper_dim is not None)
 
     @property
     def binary_dims(self) -> tuple[int, ...]:
-        """The places of the grippers that know only open and close."""
+        """Indices of the binary grippers in the robot's vector."""
         binary = [group for group in self.groups if group.gripper is not None and group.gripper.binary]
         return tuple(group.gripper_dim for group in binary if group.gripper_dim is not None)
 
     @property
     def speed_dims(self) -> tuple[int, ...]:
-        """The places of numbers that are speeds and not places: those of a base that move no link; 0 stands still."""
+        """Indices of numbers that are speeds instead of positions: those of a base that move no link; 0 is
+        standstill.
+        """
         return tuple(
             int(dim)
             for group in self.groups
@@ -193,7 +199,11 @@ class Robot:
         )
 
     def group(self, name: str) -> Group:
-        """The group of that name; RobotError lists the names where there is none."""
+        """Return the group of that name.
+
+        Raises:
+            RobotError: If it does not exist; the message lists the names.
+        """
         for group in self.groups:
             if group.name == name:
                 return group
@@ -202,7 +212,7 @@ class Robot:
         )
 
     def split(self, vector: ArrayLike) -> dict[str, NDArray[Any]]:
-        """Views of [..., dim] by group, each [..., dof]."""
+        """Return views of [..., dim] by group, each [..., dof]."""
         array = np.asarray(vector)
         if array.shape[-1:] != (self.dim,):
             raise RobotError(
@@ -211,7 +221,7 @@ class Robot:
         return {group.name: array[..., group.slice] for group in self.groups}
 
     def join(self, parts: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
-        """The float32 vector [..., dim] of parts [..., dof] by group; every group exactly once."""
+        """Return the float32 vector [..., dim] of parts [..., dof] by group; every group exactly once."""
         if set(parts) != {group.name for group in self.groups}:
             allowed = ", ".join(group.name for group in self.groups)
             raise RobotError(

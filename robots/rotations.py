@@ -11,9 +11,9 @@ Float64 = NDArray[np.float64]
 
 
 def _outer_product_map() -> Float64:
-    """The matrix [9, 16] that takes a flat rotation matrix R to 4 q q^T - I, flat."""
+    """Return the matrix [9, 16] that maps a flat rotation matrix R to the flat 4 q q^T - I."""
     w, x, y, z = range(4)
-    terms = {  # entry of 4 q q^T -> (row, column, sign) of R
+    terms = {  # entry of 4 q q^T: (row, column, sign) of R
         (w, w): [(0, 0, 1), (1, 1, 1), (2, 2, 1)],
         (x, x): [(0, 0, 1), (1, 1, -1), (2, 2, -1)],
         (y, y): [(0, 0, -1), (1, 1, 1), (2, 2, -1)],
@@ -38,7 +38,7 @@ _IDENTITY = np.eye(4)
 
 
 def matrix_of_rpy(roll: float, pitch: float, yaw: float) -> Float64:
-    """Rotation [3, 3] = Rz(yaw) Ry(pitch) Rx(roll), the URDF's fixed-axis convention [rad]."""
+    """Return the rotation [3, 3] = Rz(yaw) Ry(pitch) Rx(roll), the URDF's fixed-axis convention [rad]."""
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
     return np.array(
@@ -51,7 +51,7 @@ def matrix_of_rpy(roll: float, pitch: float, yaw: float) -> Float64:
 
 
 def matrix_of_quaternion(quaternion: Float64) -> Float64:
-    """Rotations [..., 3, 3] of unit quaternions [..., 4]."""
+    """Return the rotations [..., 3, 3] of unit quaternions [..., 4]."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -66,7 +66,7 @@ def matrix_of_quaternion(quaternion: Float64) -> Float64:
 
 
 def transform_of(pose: Float64) -> Float64:
-    """The transforms [..., 4, 4] of poses [..., 7] = x, y, z, unit quaternion w, x, y, z."""
+    """Return the transforms [..., 4, 4] of poses [..., 7] = x, y, z, unit quaternion w, x, y, z."""
     transform = np.zeros((*pose.shape[:-1], 4, 4))
     transform[..., :3, :3] = matrix_of_quaternion(pose[..., 3:])
     transform[..., :3, 3] = pose[..., :3]
@@ -75,10 +75,7 @@ def transform_of(pose: Float64) -> Float64:
 
 
 def quaternion_of_matrix(matrix: Float64) -> Float64:
-    """Unit quaternions [..., 4] with w >= 0 of rotations [..., 3, 3].
-
-    4 q q^T is linear in the matrix; the row with the largest diagonal entry is its safest multiple of q.
-    """
+    """Return the unit quaternions [..., 4] with w >= 0 of rotations [..., 3, 3]."""
     outer = (matrix.reshape(*matrix.shape[:-2], 9) @ _OUTER).reshape(*matrix.shape[:-2], 4, 4) + _IDENTITY
     largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     if matrix.ndim == 2:
@@ -91,7 +88,7 @@ def quaternion_of_matrix(matrix: Float64) -> Float64:
 
 
 def rotation_vector(matrix: Float64) -> Float64:
-    """Axis times angle [..., 3] with the angle in [0, pi] rad of rotations [..., 3, 3]."""
+    """Return axis times angle [..., 3] of rotations [..., 3, 3], with the angle in [0, pi] rad."""
     quaternion = quaternion_of_matrix(matrix)
     imaginary = quaternion[..., 1:]
     sine = np.sqrt(np.sum(imaginary * imaginary, axis=-1, keepdims=True))
@@ -101,7 +98,7 @@ def rotation_vector(matrix: Float64) -> Float64:
 
 
 def quaternion_product(left: Float64, right: Float64) -> Float64:
-    """The rotation `left` after the rotation `right`, as unit quaternions [..., 4]."""
+    """Return the rotation `left` after the rotation `right`, as unit quaternions [..., 4]."""
     aw, ax, ay, az = np.moveaxis(left, -1, 0)
     bw, bx, by, bz = np.moveaxis(right, -1, 0)
     terms = (
@@ -114,7 +111,8 @@ def quaternion_product(left: Float64, right: Float64) -> Float64:
 
 
 def slerp(start: Float64, end: Float64, part: Float64) -> Float64:
-    """Unit quaternions [..., 4] at `part` [...] of the shorter way from `start` to `end`, on the side of `start`.
+    """Return the unit quaternions [..., 4] at `part` [...] of the shorter path from `start` to `end`, in the
+    hemisphere of `start`.
 
     Shoemake 1985; the angle by atan2, because the arc cosine of a number near 1 loses half its digits.
     """

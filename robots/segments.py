@@ -1,4 +1,4 @@
-"""The distance of two segments."""
+"""Distance of two line segments."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ import numpy as np
 
 from robots.rotations import Float64
 
-_TINY = 1e-300  # instead of a division by zero
-_PARALLEL = 1e-12  # of the squared sine between two segments: any point of the first is as good to begin with
+_TINY = 1e-300  # avoids division by zero
+_PARALLEL = (
+    1e-12  # squared sine of the angle below which segments count as parallel: any starting point will do
+)
 
 
 def segment_distances(start: Float64, way: Float64, other: Float64, other_way: Float64) -> Float64:
-    """Distances of segments [..., 3] from `start` along `way` to those from `other` along `other_way`, [...].
+    """Return the distances [...] of segments [..., 3] from `start` along `way` to those from `other` along
+    `other_way`.
 
-    The nearest points of the two lines, brought back into the segments one after the other (Ericson, Real-Time
-    Collision Detection, 5.1.9); segments may be points, and parallel.
+    Closest points of the two lines, clamped to the segments one after the other (Ericson, Real-Time Collision
+    Detection, 5.1.9); segments may be points, and parallel.
     """
     between = start - other
     a, e = _dot(way, way), _dot(other_way, other_way)

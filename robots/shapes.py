@@ -1,4 +1,4 @@
-"""Reads the visible shapes of a URDF's links: boxes, cylinders, spheres and meshes with their colours."""
+"""Reader of the visible shapes of a URDF's links: boxes, cylinders, spheres and meshes with their colours."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from robots.urdf import document, numbers, origin_of, text_of
 
 Colour = tuple[float, float, float, float]
 KINDS = ("box", "cylinder", "sphere", "mesh")
-PLAIN: Colour = (0.7, 0.7, 0.7, 1.0)  # of a shape without a material
+PLAIN: Colour = (0.7, 0.7, 0.7, 1.0)  # colour of a shape without a material
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """One shape of a link: box (x, y, z), cylinder (radius, length along z) or sphere (radius,) in m, or a mesh.
+    """Shape of a link: box (x, y, z), cylinder (radius, length along z) or sphere (radius,) in m, or a mesh.
 
-    A mesh is what `file` shows, its axes stretched by `size` (x, y, z); simple shapes have no file. `origin` [4, 4]
-    places its centre (a mesh's origin) in the link; `colour` is red, green, blue, opacity, 0 to 1, of a mesh too.
+    A mesh is the content of `file`, scaled by `size` (x, y, z); other shapes have no file. `origin` [4, 4] is the pose
+    of its centre (a mesh's origin) in the link; `colour` is red, green, blue, opacity, 0 to 1, for a mesh too.
     """
 
     link: str
@@ -35,14 +35,18 @@ class Shape:
     file: Path | None = None
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """The least and the greatest corner [3] of the shape's box in its own frame [m], before `origin`."""
+        """Return the lower and upper corner [3] of the shape's box in its own frame [m], before `origin`."""
         return shape_bounds(self.kind, self.size, self.file)
 
 
 def shape_bounds(kind: str, size: tuple[float, ...], file: Path | None) -> tuple[Float64, Float64]:
-    """The corners [3] of the box around a shape in its own frame [m]; RobotError where a mesh cannot be read."""
+    """Return the corners [3] of the box around a shape in its own frame [m].
+
+    Raises:
+        RobotError: If a mesh cannot be read.
+    """
     if kind == "mesh":
-        assert file is not None  # a mesh is read from a file
+        assert file is not None  # a mesh always has a file
         corners = np.array(meshes.mesh_bounds(file)) * size
         return corners.min(axis=0), corners.max(axis=0)
     if kind == "box":
@@ -54,15 +58,20 @@ def shape_bounds(kind: str, size: tuple[float, ...], file: Path | None) -> tuple
 
 
 def read_shapes(path: Path) -> tuple[Shape, ...]:
-    """The shapes in the file's order; RobotError names the file, the link and what is wrong with it.
+    """Return the shapes in the file's order.
 
-    They are the same whatever the environment holds, except for links that show meshes, which may lie there.
+    The result depends on the environment only for links with meshes, which may be in $EVA_ROBOT_MESHES.
+
+    Raises:
+        RobotError: If a shape is invalid; the message names file, link and fault.
     """
     return _read(path, everywhere=False)
 
 
 def displayed_shapes(path: Path) -> tuple[Shape, ...]:
-    """The same for drawing: every link with a mesh of its name under $EVA_ROBOT_MESHES shows that and nothing else."""
+    """Return the shapes for drawing: every link with a mesh of its name under $EVA_ROBOT_MESHES is shown as
+    that mesh.
+    """
     return _read(path, everywhere=True)
 
 
@@ -70,7 +79,7 @@ def _read(path: Path, *, everywhere: bool) -> tuple[Shape, ...]:
     robot = document(path)
     materials = {
         text_of(path, element, "name"): _colour(path, f"material {element.get('name')!r}", colour)
-        for element in robot.iter("material")  # one that a visual declares is known by its name to all others
+        for element in robot.iter("material")  # a material declared in a visual can be used by name elsewhere
         if element.get("name") and (colour := element.find("color")) is not None
     }
     return tuple(
@@ -112,7 +121,7 @@ def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Co
 
 
 def size_of(path: Path, owner: str, element: ET.Element) -> tuple[float, ...]:
-    """Lengths in m, of a mesh the factors along its axes (1 where nothing is said; below zero they mirror)."""
+    """Return the lengths [m], for a mesh the scale factors (default 1; negative values mirror)."""
     if element.tag == "mesh":
         text = element.get("scale", "1 1 1")
         scale = numbers(path, owner, "mesh scale", text, 3)

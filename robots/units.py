@@ -1,4 +1,4 @@
-"""In which unit each number of a robot's vector is."""
+"""Units of the numbers of a robot's vector."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from robots.urdf import Urdf
 
 
 def units_of(robot: Robot) -> tuple[str, ...]:
-    """A unit for every number: "rad", "m" for what slides, a gripper's own, "" for what moves no link."""
+    """Return a unit for every number: "rad", "m" for prismatic joints, a gripper's own, "" if it moves no link."""
     tree = urdf.read(robot.urdf)
     return tuple(unit for group in robot.groups for unit in _units(group, tree))
 

@@ -1,4 +1,6 @@
-"""Reads the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics; shapes are read elsewhere."""
+"""Reader of the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics; shapes are in another
+module.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +18,16 @@ from robots.errors import RobotError
 from robots.rotations import Float64, matrix_of_rpy
 
 KINDS = ("fixed", "revolute", "continuous", "prismatic")
-HELD = ("floating", "planar")  # kinds that no group moves: they are read as fixed, where the URDF draws them
+HELD = (
+    "floating",
+    "planar",
+)  # joints that no group moves: they are read as fixed, at their position in the URDF
 _ENCODING = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"']*)["'][^>]*\?>""")
 
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """This joint's position is multiplier * (position of `joint`) + offset."""
+    """Mimic: the joint's position is multiplier * (position of `joint`) + offset."""
 
     joint: str
     multiplier: float
@@ -31,9 +36,9 @@ class Mimic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """One joint: `origin` [4, 4] places the joint in its parent link, `axis` is a unit vector [3] there.
+    """Joint; `origin` [4, 4] is its pose in the parent link, `axis` a unit vector [3] there.
 
-    Limits in rad and rad/s (prismatic: m and m/s), None where not declared; infinite if continuous.
+    Limits are in rad and rad/s (prismatic: m and m/s), None if not declared, infinite if continuous.
     """
 
     name: str
@@ -50,9 +55,9 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Urdf:
-    """A tree of links: `joints` by name in the file's order, `root` the one link without a parent.
+    """Tree of links: `joints` by name in the file's order, `root` the only link without a parent.
 
-    `held` are the names of those that are floating or planar, and read as fixed.
+    `held` are the names of floating and planar joints, which are read as fixed.
     """
 
     path: Path
@@ -62,13 +67,21 @@ class Urdf:
     held: tuple[str, ...]
 
     def joint(self, name: str) -> Joint:
-        """The joint of that name; RobotError lists the names where there is none."""
+        """Return the joint of that name.
+
+        Raises:
+            RobotError: If it does not exist; the message lists the names.
+        """
         if name not in self.joints:
             raise RobotError(f"{self.path}: no joint {name!r}; it has {', '.join(self.joints)}")
         return self.joints[name]
 
     def between(self, frame: str, tip: str) -> tuple[Joint, ...]:
-        """The joints from link `frame` out to link `tip`; RobotError where `tip` does not hang on `frame`."""
+        """Return the joints from link `frame` out to link `tip`.
+
+        Raises:
+            RobotError: If a link does not exist, or `tip` is not a descendant of `frame`.
+        """
         for link in (frame, tip):
             if link not in self.links:
                 raise RobotError(f"{self.path}: no link {link!r}; it has {', '.join(sorted(self.links))}")
@@ -83,17 +96,19 @@ class Urdf:
         return tuple(reversed(chain))
 
     def outwards(self) -> tuple[Joint, ...]:
-        """The joints in an order in which every parent link comes before its children."""
+        """Return the joints in an order in which every parent link precedes its children."""
         order: list[Joint] = []
         links = [self.root]
-        for link in links:  # grows while it is walked
+        for link in links:  # the list grows during the loop
             below = [joint for joint in self.joints.values() if joint.parent == link]
             order += below
             links += [joint.child for joint in below]
         return tuple(order)
 
     def master(self, joint: Joint) -> tuple[Joint, float, float]:
-        """The joint that this one follows (itself, unless it is a mimic): value = factor * its value + offset."""
+        """Return the joint that this one follows (itself, unless it is a mimic): value = factor * its value +
+        offset.
+        """
         factor, offset, seen = 1.0, 0.0, [joint.name]
         while joint.mimic is not None:
             offset += factor * joint.mimic.offset
@@ -106,7 +121,11 @@ class Urdf:
 
 
 def read(path: Path) -> Urdf:
-    """The kinematic tree in the file; RobotError names the file, the joint and what is wrong with it."""
+    """Return the kinematic tree in the file.
+
+    Raises:
+        RobotError: If it is invalid; the message names file, joint and fault.
+    """
     robot = document(path)
     links = [text_of(path, link, "name") for link in robot.findall("link")]
     joints = [_joint(path, element) for element in robot.findall("joint")]
@@ -122,7 +141,11 @@ def read(path: Path) -> Urdf:
 
 
 def document(path: Path) -> ET.Element:
-    """The file's outermost element, <robot>."""
+    """Return the outermost element of the file, <robot>.
+
+    Raises:
+        RobotError: If it is not a URDF.
+    """
     robot = parsed(path)
     if _is_xacro(robot):
         made = f"xacro {path.name} > {path.name.split('.')[0]}.urdf"
@@ -133,16 +156,20 @@ def document(path: Path) -> ET.Element:
 
 
 def parsed(path: Path, comments: bool = False) -> ET.Element:
-    """The outermost element of an XML file in any encoding that Python knows; RobotError. `comments` are kept."""
+    """Return the outermost element of an XML file in any encoding that Python knows, with `comments` if requested.
+
+    Raises:
+        RobotError: If it cannot be read.
+    """
     parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=comments))
     try:
         content = path.read_bytes()
-        if content.startswith(codecs.BOM_UTF8):  # it is that, whatever is declared behind it
+        if content.startswith(codecs.BOM_UTF8):  # the byte order mark overrides the declared encoding
             content = _ENCODING.sub(b"", content.removeprefix(codecs.BOM_UTF8), count=1)
         declared = _ENCODING.match(content)
         if declared is None:
             parser.feed(content)
-        else:  # expat itself knows a few, and none with more than one byte but Unicode's
+        else:  # expat supports few encodings, and no multi-byte ones except Unicode's
             encoding = declared[1].decode("ascii", "replace")
             try:
                 codecs.lookup(encoding)
@@ -158,7 +185,7 @@ def parsed(path: Path, comments: bool = False) -> ET.Element:
 
 
 def _is_xacro(robot: ET.Element) -> bool:
-    """True if macros or placeholders are left in it."""
+    """Return True if it contains macros or placeholders."""
     return any(
         "xacro" in element.tag or any("${" in value or "$(" in value for value in element.attrib.values())
         for element in robot.iter()
@@ -173,7 +200,7 @@ def _joint(path: Path, element: ET.Element) -> Joint:
         kind = "fixed"
     if kind not in KINDS:
         raise RobotError(f"{path}: joint {name!r} has type {kind!r}; allowed: {', '.join((*KINDS, *HELD))}")
-    endless, moves = kind == "continuous", kind != "fixed"  # what does not count may be anything
+    endless, moves = kind == "continuous", kind != "fixed"  # ignored values may be invalid
     bounded = moves and not endless
     lower, upper = (_limit(path, element, name, key) if bounded else None for key in ("lower", "upper"))
     return Joint(
@@ -191,7 +218,11 @@ def _joint(path: Path, element: ET.Element) -> Joint:
 
 
 def text_of(path: Path, element: ET.Element, key: str) -> str:
-    """An attribute that has to be there."""
+    """Return a required attribute.
+
+    Raises:
+        RobotError: If it is missing.
+    """
     value = element.get(key)
     if not value:
         raise RobotError(f"{path}: a <{element.tag}> has no {key!r}")
@@ -206,7 +237,11 @@ def _end(path: Path, element: ET.Element, name: str, which: str) -> str:
 
 
 def numbers(path: Path, owner: str, what: str, text: str, count: int) -> list[float]:
-    """`count` finite numbers in `text`; RobotError names the file, the owner and what of it."""
+    """Return `count` finite numbers from `text`.
+
+    Raises:
+        RobotError: If it has others; the message names file, owner and attribute.
+    """
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
@@ -217,7 +252,7 @@ def numbers(path: Path, owner: str, what: str, text: str, count: int) -> list[fl
 
 
 def origin_of(path: Path, owner: str, element: ET.Element) -> Float64:
-    """The transform [4, 4] that the element's <origin> declares; the identity where it has none."""
+    """Return the transform [4, 4] of the element's <origin>; the identity if there is none."""
     matrix = np.eye(4)
     origin = element.find("origin")
     if origin is not None:
@@ -259,7 +294,7 @@ def _refuse_twice(path: Path, what: str, names: list[str]) -> None:
 
 
 def _root(path: Path, links: list[str], joints: list[Joint]) -> str:
-    """The one link that every other hangs on."""
+    """Return the only link without a parent, after checking that the joints form one tree."""
     children = [joint.child for joint in joints]
     _refuse_twice(path, "the joint above link", children)
     names = {joint.name for joint in joints}
@@ -278,7 +313,7 @@ def _root(path: Path, links: list[str], joints: list[Joint]) -> str:
     for joint in joints:
         below.setdefault(joint.parent, []).append(joint.child)
     reached = [roots[0]]
-    for link in reached:  # which grows meanwhile
+    for link in reached:  # the list grows during the loop
         reached += below.get(link, [])
     if in_circles := sorted(set(links) - set(reached)):
         raise RobotError(

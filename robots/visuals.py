@@ -1,4 +1,4 @@
-"""Looks of a robot, for drawing; kinematics never uses them."""
+"""Visual appearance of a robot, for drawing; kinematics does not use it."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from robots.robot import Robot
 from robots.rotations import Float64
 from robots.shapes import Colour
 
-_THINNEST = 1e-4  # m, of a box around a mesh that is flat
+_THINNEST = 1e-4  # [m] least thickness of the box around a flat mesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visual:
-    """One shape: `kind` box (x, y, z), cylinder (radius, length along z) or sphere (radius,), in m, or a mesh.
+    """Shape: `kind` box (x, y, z), cylinder (radius, length along z) or sphere (radius,), in m, or mesh.
 
-    `part` is the index of the part that carries it, `origin` float64 [4, 4] its centre in that part, `colour`
-    red, green, blue, opacity, 0 to 1. A mesh is what `file` shows, stretched by `size` (x, y, z).
+    `part` is the index of its part, `origin` float64 [4, 4] the pose of its centre in that part, `colour` red, green,
+    blue, opacity, 0 to 1. A mesh is the content of `file`, scaled by `size` (x, y, z).
     """
 
     part: int
@@ -32,11 +32,11 @@ class Visual:
     file: Path | None = None
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """The least and the greatest corner [3] of the shape's box in its own frame [m], before `origin`."""
+        """Return the lower and upper corner [3] of the shape's box in its own frame [m], before `origin`."""
         return shapes.shape_bounds(self.kind, self.size, self.file)
 
     def simple(self) -> Visual:
-        """The same for those who can draw no mesh: the box around it."""
+        """Return the shape, with a mesh replaced by its bounding box, for renderers without meshes."""
         if self.kind != "mesh":
             return self
         lower, upper = self.bounds()
@@ -47,7 +47,7 @@ class Visual:
 
 
 class RobotScene(Body):
-    """A robot's body with the `visuals` that its parts carry."""
+    """Body of a robot with the `visuals` of its parts."""
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
@@ -59,5 +59,9 @@ class RobotScene(Body):
 
 
 def scene_of(robot: Robot) -> RobotScene:
-    """The robot's parts and shapes; RobotError where its URDF shows what cannot be drawn, or a mesh is missing."""
+    """Return the robot's parts and shapes.
+
+    Raises:
+        RobotError: If a shape cannot be drawn, or a mesh is missing.
+    """
     return RobotScene(robot)

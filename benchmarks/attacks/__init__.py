@@ -1,1 +1,1 @@
-"""Attackers in the way of an e-stop, each a program of its own at nice 19."""
+"""Attackers that try to delay an e-stop, each a separate program at nice 19."""

@@ -1,6 +1,7 @@
-"""`python -m benchmarks.attacks NAME READY_FILE DATA`: one attack on the lab that announced itself there.
+"""`python -m benchmarks.attacks NAME READY_FILE DATA`: one attack on the lab that is described in READY_FILE.
 
-Prints a line of JSON when it has begun and, once standard input ends, one with what it did, counted.
+Prints a line of JSON when the attack has begun and, after the end of standard input, a line with counts of what it
+did.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def main() -> int:
     os.nice(_NICE)
     target = _target(given)
     print(json.dumps(ATTACKS[given.name](target)), flush=True)
-    os._exit(0)  # whatever still waits for an answer
+    os._exit(0)  # without waiting for requests in progress
 
 
 def _target(given: argparse.Namespace) -> Target:

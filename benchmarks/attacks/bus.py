@@ -1,4 +1,4 @@
-"""A client of the station that asks and asks, and hears no answer."""
+"""Client that floods a station with requests, and ignores the answers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SOCKETS = (("coordinator", "commands"), ("guard", "estop"))
 
 
 def status_flood(target: Target) -> Counter[str]:
-    """Ask the coordinator and guard for their status as fast as their sockets take it."""
+    """Request the status of coordinator and guard as fast as their sockets accept it."""
     sent: Counter[str] = Counter()
     for process, key in _SOCKETS:
         threading.Thread(target=_flood, args=(target, process, key, sent), daemon=True).start()
@@ -30,5 +30,5 @@ def _flood(target: Target, process: str, key: str, sent: Counter[str]) -> None:
     endpoints = Endpoints(target.data / "stations" / PRESSED)
     client = CommandClient(zmq.Context.instance(), endpoints.read(process)[key])
     while not target.ended.is_set():
-        client.send(Command(str(uuid4()), "status"))  # waits where the queue is full
+        client.send(Command(str(uuid4()), "status"))  # blocks while the queue is full
         sent[process] += 1

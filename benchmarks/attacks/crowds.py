@@ -1,4 +1,4 @@
-"""Loads on the web's event loop, each part of them allowed or cheap: pings, handshakes, pages, REST."""
+"""Loads on the web's event loop, each allowed or cheap in itself: pings, handshakes, pages, REST."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import PRESSED
 
 _PINGS, _HANDSHAKES, _PAGES, _CLIENTS = 60, 3000, 600, 400
-_PING = b"\x89\x80\x00\x00\x00\x00" * 500  # masked, of no bytes
+_PING = b"\x89\x80\x00\x00\x00\x00" * 500  # masked, empty payload
 _PATIENCE_S = 20.0
-_BEGUN_S = 2.0  # at most, until each of a crowd has had an answer
+_BEGUN_S = 2.0  # longest wait until each client of a crowd has had an answer
 _AGAIN_S = 0.1
-_Then = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[object]]  # once it is answered
+_Then = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[object]]  # called after the answer
 
 
 def pings(target: Target) -> Counter[str]:
-    """Sockets of people who are logged in that ping as fast as they are read; those that are closed come again."""
+    """Ping from logged-in sockets as fast as they are read; closed sockets are reopened."""
     return asyncio.run(_crowd(target, _PINGS, _head(target, _socket(target)), _pings))
 
 
 def handshakes(target: Target) -> Counter[str]:
-    """Handshakes of websockets by nobody in particular, each closed as soon as it is answered."""
+    """Open websockets without a valid login, each closed after its answer."""
     head = _head(target, f"{_socket(target, 'made-up')}")
     return asyncio.run(_crowd(target, _HANDSHAKES, head, _no_more))
 
 
 def pages(target: Target) -> Counter[str]:
-    """The page of the station, opened by so many at once again and again."""
+    """Open the station's page from many clients, repeatedly."""
     head = _head(
         target, f"GET /stations/{PRESSED}/debug/ HTTP/1.1\r\n{_session(target)}Connection: close\r\n"
     )
@@ -40,7 +40,7 @@ def pages(target: Target) -> Counter[str]:
 
 
 def rest_clients(target: Target) -> Counter[str]:
-    """Clients of REST that ask for the station over and over."""
+    """Request the station over REST from many clients, repeatedly."""
     head = _head(
         target, f"GET /api/v1/stations/{PRESSED} HTTP/1.1\r\n{_session(target)}Connection: close\r\n"
     )
@@ -65,7 +65,7 @@ def _head(target: Target, lines: str) -> bytes:
 
 
 async def _crowd(target: Target, size: int, head: bytes, then: _Then) -> Counter[str]:
-    """So many connections at once, each followed by another one; how often which answer came."""
+    """Keep `size` connections open, replacing each that ends; return the number of answers by kind."""
     done: Counter[str] = Counter()
     answered = [asyncio.Event() for _ in range(target.part(size))]
     tasks = [asyncio.create_task(_over_and_over(target, head, then, done, one)) for one in answered]
@@ -100,7 +100,7 @@ async def _over_and_over(
 
 
 async def _no_more(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """The answer is all."""
+    """Do nothing after the answer."""
 
 
 async def _whole(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,4 +1,4 @@
-"""A database that answers nothing."""
+"""Database that does not respond."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PATIENCE_MS = 20_000
 
 
 def hangs(target: Target) -> Counter[str]:
-    """SQLite: somebody writes and does not end; PostgreSQL: none of its processes is scheduled."""
+    """Block the database: by an open write transaction (SQLite), or by stopping its processes (PostgreSQL)."""
     if target.database is None:
         return _written_to(target)
     return _not_scheduled(target, target.database)

@@ -1,4 +1,4 @@
-"""Pages that say the same thing a thousand times: to a station that is dead, and without the right to."""
+"""Pages that flood with messages: to a dead station, and without permission."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from runtime.ipc.bus import Endpoints
 
 _STOPS, _PRESSES = 5000, 1500
 _SLOW = 2 << 20
-_QUIET_S = 5.0  # after which nothing more is answered
+_QUIET_S = 5.0  # time without an answer after which no more are expected
 
 
 class _Page(LivePage):
-    """A page of which only acknowledgements are counted."""
+    """Page that only counts acknowledgements."""
 
     def __init__(self, visitor: RestClient, station: str) -> None:
         self.answered = 0
@@ -37,12 +37,12 @@ class _Page(LivePage):
         return bool(self._failure)
 
     def say(self, message: Mapping[str, Any], times: int) -> None:
-        """Say it so often, each with a uuid of its own."""
+        """Send a message `times` times, each with its own uuid."""
         for _ in range(times):
             self._send({**message, "uuid": str(uuid4())})
 
     def shout(self, text: str) -> None:
-        """Send it as it is."""
+        """Send a text unchanged."""
         try:
             self._socket.send(text)
         except ConnectionClosed as error:
@@ -53,19 +53,19 @@ class _Page(LivePage):
 
 
 def dead_station(target: Target) -> Counter[str]:
-    """Press the e-stop of a station whose guard and the coordinator are there and answer nothing."""
+    """Press the e-stop of a station whose guard and coordinator are stopped."""
     message = {"type": "estop", "why": "somebody leans on it"}
     with _stopped(target, "guard", "coordinator"):
         return _waves(target, OTHER, message, target.part(_PRESSES))
 
 
 def viewer_stops(target: Target) -> Counter[str]:
-    """Ask for stop as somebody who may not command the station."""
+    """Send stops as a user who may not command the station."""
     return _waves(target, PRESSED, {"type": "stop", "epoch": 0}, target.part(_STOPS))
 
 
 def slow_frames(target: Target) -> Counter[str]:
-    """Messages of 2 MiB that take long to parse, over two sockets of a viewer."""
+    """Send messages of 2 MiB that are slow to parse, over two sockets of a viewer."""
     visitor = target.visitor("viewer")
     texts = [long_to_parse(target.part(_SLOW), number) for number in (0, 1)]
 
@@ -82,7 +82,7 @@ def slow_frames(target: Target) -> Counter[str]:
 
 @contextmanager
 def _stopped(target: Target, *processes: str) -> Iterator[None]:
-    """Processes of the other station, not scheduled meanwhile."""
+    """Stop processes of the other station (SIGSTOP) for the duration of the block."""
     found = Endpoints(target.data / "stations" / OTHER).read("supervisor")
     pids = [int(found[process]) for process in processes]
     for pid in pids:
@@ -95,7 +95,7 @@ def _stopped(target: Target, *processes: str) -> Iterator[None]:
 
 
 def _waves(target: Target, station: str, message: Mapping[str, Any], times: int) -> Counter[str]:
-    """Say it `times` times, and again when that is answered; a page that is closed is opened again."""
+    """Send `times` messages, wait for the answers, and repeat; a closed page is reopened."""
     done: Counter[str] = Counter()
     visitor = target.visitor("viewer")
     while not target.ended.is_set():
@@ -116,7 +116,7 @@ def _waves(target: Target, station: str, message: Mapping[str, Any], times: int)
 
 
 def _await(target: Target, page: _Page, sent: int) -> None:
-    """Until all is answered, or nothing more is."""
+    """Wait until all messages are answered, or no more answers come."""
     answered, since = page.answered, time.monotonic()
     while page.answered < sent and not page.closed and not target.ended.wait(0.05):
         if page.answered != answered:

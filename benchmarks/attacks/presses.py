@@ -1,4 +1,4 @@
-"""Presses at the process for stops by others: with tokens that nobody has, and halts of an operator."""
+"""Requests to the process for stops: presses with unknown tokens, and halts of an operator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TOKENS, _HALTS = 64, 32
 
 
 def made_up_tokens(target: Target) -> Counter[str]:
-    """Press the e-stop from 64 clients, each time with a token of its own that nobody has."""
+    """Press the e-stop from 64 clients, each time with a new unknown token."""
 
     def press(target: Target, number: int) -> str:
         program = RestPresser(target.stops, {"Authorization": f"Bearer eva_{uuid4().hex}"})
@@ -25,7 +25,7 @@ def made_up_tokens(target: Target) -> Counter[str]:
 
 
 def halts(target: Target) -> Counter[str]:
-    """Halt under no lease from 32 clients of one operator, over and over."""
+    """Halt without a lease from 32 clients of one operator, repeatedly."""
     operator = target.visitor(Role.OPERATOR)
     headers = {"Cookie": operator.cookies, "X-CSRFToken": operator.csrf_token}
 

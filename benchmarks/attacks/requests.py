@@ -1,4 +1,4 @@
-"""Loads on a web over HTTP: half requests, passwords, bodies, what is slow to read, exports."""
+"""Loads over HTTP: incomplete requests, passwords, long bodies, slow documents, exports."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _EXPORTS, _PLANS, _TRIALS = 36, 40, 6000
 _SLOW, _SLOW_POSTS = 250_000, 8
 _HALF = b"POST /login/ HTTP/1.1\r\nHost: localhost\r\nContent-Le"
 _ANSWER_S = 30.0
-_OPENING_S = 5.0  # at most, until all connections stand
+_OPENING_S = 5.0  # longest wait until all connections are open
 
 
 def half_open(target: Target) -> Counter[str]:
-    """Keep connections that send nothing, or half a request; those that are closed are opened again."""
+    """Hold connections that send nothing or half a request; closed ones are reopened."""
     return asyncio.run(_half_open(target))
 
 
@@ -65,7 +65,7 @@ async def _one(target: Target, number: int, opened: Counter[str], tried: asyncio
 
 
 def logins(target: Target) -> Counter[str]:
-    """Ten at once, again and again, every second one with a password that is wrong."""
+    """Log in from ten clients, repeatedly, every second time with a wrong password."""
     return again_and_again(target, _LOGINS, _login)
 
 
@@ -76,7 +76,7 @@ def _login(target: Target, number: int) -> str:
 
 
 def bodies(target: Target) -> Counter[str]:
-    """Post 200 MB without saying who it is, four at a time."""
+    """Post 200 MB without a login, from four clients."""
     return again_and_again(target, _BODIES, _body)
 
 
@@ -94,7 +94,7 @@ def _body(target: Target, number: int) -> str:
 
 
 def toml(target: Target) -> Counter[str]:
-    """Import a file of one key, or one table, of twenty thousand parts, as an administrator."""
+    """Import a file with a key, or a table, of twenty thousand parts, as an administrator."""
     visitor = target.visitor("admin")
     return again_and_again(target, 1, partial(_import, visitor))
 
@@ -134,7 +134,7 @@ def exports(target: Target) -> Counter[str]:
 
 
 def _seed(target: Target) -> None:
-    """Evaluations as after years in the lab's database."""
+    """Fill the lab's database with evaluations as after years."""
     import django
 
     os.environ |= {"EVA_DATA_DIR": str(target.data), "DJANGO_SETTINGS_MODULE": "evaweb.settings"}
@@ -145,7 +145,7 @@ def _seed(target: Target) -> None:
 
 
 def slow_json(target: Target) -> Counter[str]:
-    """Post JSON that takes long to parse to the process for stops, as nobody, eight at a time."""
+    """Post JSON that is slow to parse to the process for stops, without a login, from eight clients."""
     address = urlsplit(target.stops)
 
     def post(target: Target, number: int) -> str:
@@ -159,13 +159,13 @@ def slow_json(target: Target) -> Counter[str]:
 
 
 def long_to_parse(size: int, number: int) -> str:
-    """JSON of about `size` bytes that makes many objects, or digits, by turns."""
+    """Return about `size` bytes of JSON with many objects, or with long numbers, alternately."""
     part = "[]" if number % 2 else "9" * 4000
     return f'{{"type": "watch", "streams": [{",".join([part] * (size // (len(part) + 1)))}]}}'
 
 
 def again_and_again(target: Target, at_once: int, ask: Callable[[Target, int], str]) -> Counter[str]:
-    """Ask from so many threads, each again when it has its answer; how often which came."""
+    """Call `ask` repeatedly from `at_once` threads; return the number of answers by kind."""
     done: Counter[str] = Counter()
 
     def requests() -> None:

@@ -1,4 +1,4 @@
-"""The lab that is attacked, and when an attack begins and ends."""
+"""Target of an attack: the lab, and the signals of the attack's begin and end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaweb.lab.visitor import RestClient
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A lab of `benchmarks.estop_lab`; `share` of the whole attack, so that a test can make a short one."""
+    """Lab of `benchmarks.estop_lab`; `share` scales the attack, so that tests can use a small one."""
 
     url: str
     stops: str  # address of its process for stops
@@ -21,7 +21,7 @@ class Target:
     data: Path
     database: Path | None  # folder of a PostgreSQL server; None: the SQLite file in `data`
     share: float
-    begun: Callable[[], None]  # to be called once it is under way
+    begun: Callable[[], None]  # to be called when the attack has begun
     ended: threading.Event
 
     @property
@@ -31,11 +31,11 @@ class Target:
         return found.hostname or "", found.port or 80
 
     def part(self, whole: int) -> int:
-        """The share of a number, at least 1."""
+        """Return the scaled number, at least 1."""
         return max(1, round(self.share * whole))
 
     def visitor(self, username: str) -> RestClient:
-        """Somebody who has logged in."""
+        """Return a logged-in client."""
         found = RestClient(self.url)
         found.login(username, self.passwords[username])
         return found

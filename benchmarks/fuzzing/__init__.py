@@ -1,1 +1,1 @@
-"""Random scenarios that are fully told by a seed, and what they find wrong: `once(seed)` of each module."""
+"""Random scenarios, each determined by a seed, and the violations they find: `once(seed)` of each module."""

@@ -1,4 +1,4 @@
-"""Policy servers that answer twice, by chance: no answer is taken for that to another question."""
+"""Policy servers that randomly answer twice: no answer may be taken for that to another request."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
 from runtime.sim.websocket_server import Frames, WebsocketServer
 
 _QUESTIONS = 12
-_SIZE = (24, 32)  # of pictures
-_NEAR = 0.05  # [rad] of where it was seen, within which a gesture begins
+_SIZE = (24, 32)  # of images
+_NEAR = 0.05  # [rad] tolerance between the observed joints and the start of a chunk
 _ARENA = {"cameras": {"cam_high": "first", "cam_left_wrist": "wrist"}, "cartesian_position": "zeros"}
 _ROBOT = robots.load_robot("dual_franka", ["left_arm"])
 _VIEWS = [camera.key for camera in _ROBOT.cameras]
@@ -31,7 +31,7 @@ _VIEWS = [camera.key for camera in _ROBOT.cameras]
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """A client's kind and settings, and the server that it is for."""
+    """Kind and settings of a client, and its server."""
 
     kind: str
     server: Callable[[], WebsocketServer]
@@ -56,7 +56,7 @@ _PROTOCOLS = (
 
 
 def once(seed: int) -> list[str]:
-    """Ask the server of this seed some questions; each wrong answer in a sentence, none where all is well."""
+    """Send requests to the server of this seed; return each violation as a sentence."""
     random = np.random.default_rng(seed)
     chosen = _PROTOCOLS[int(random.integers(len(_PROTOCOLS)))]
     values = random.permutation(np.linspace(0.1, 1.3, _QUESTIONS))
@@ -76,7 +76,7 @@ def once(seed: int) -> list[str]:
 
 
 def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
-    """Violations, question by question."""
+    """Return the violations, request by request."""
     found: list[str] = []
     for value in values.tolist():
         near = np.clip(value, _ROBOT.lower, _ROBOT.upper)
@@ -92,7 +92,7 @@ def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
 
 
 def _doubling(server: WebsocketServer, random: np.random.Generator) -> Callable[[], int]:
-    """Have the server send answers once more, at once or when the next question comes; how many it has."""
+    """Make the server repeat some answers, at once or at the next request; return a function that counts them."""
     send, before, count = server._send, dict[Any, Frames](), 0
 
     def sending(connection: Any, reply: Frames, number: int) -> bool:

@@ -1,4 +1,4 @@
-"""Robots as fuzzers take them: what their numbers can do, with all their groups, and joints that turn for ever."""
+"""Robots for fuzzers: limits of their numbers, with all groups, and joints without limits."""
 
 from __future__ import annotations
 
@@ -15,11 +15,16 @@ from runtime.safety.limits import Limits
 from runtime.spaces.binary_grippers import BinaryGripper, binary_grippers_of
 from runtime.station.spec import StationSpec
 
-_WHOLE = ("left_arm", "right_arm", "torso", "base")  # of an R1 Lite: the one robot here that drives
+_WHOLE = (
+    "left_arm",
+    "right_arm",
+    "torso",
+    "base",
+)  # groups of an R1 Lite, the only bundled robot with a mobile base
 
 
 class Body(NamedTuple):
-    """Limits of a robot, numbers of it that do not blend, its binary grippers, and its ready pose [D]."""
+    """Limits of a robot, its non-blending dimensions, binary grippers, and ready pose [D]."""
 
     name: str
     limits: Limits
@@ -30,7 +35,7 @@ class Body(NamedTuple):
 
 @cache
 def body(name: str, groups: tuple[str, ...] | None = None) -> Body:
-    """The robot `name` with these of its groups."""
+    """Return the robot `name` with these groups."""
     robot = robots.load_robot(name, groups and list(groups))
     spec = StationSpec.__new__(StationSpec)
     object.__setattr__(spec, "robot", robot)
@@ -39,14 +44,14 @@ def body(name: str, groups: tuple[str, ...] | None = None) -> Body:
 
 
 def drawn(rng: np.random.Generator) -> Body:
-    """One of the bundled robots, now and then with everything that it has, or with joints without limits."""
+    """Return a random bundled robot, sometimes with all groups, or with joints without limits."""
     name = str(rng.choice([*sorted(robots.robot_names()), "r1_lite"]))
     made = body(name, _WHOLE if name == "r1_lite" and rng.random() < 0.5 else None)
     return _endless(made, rng) if rng.random() < 0.3 else made
 
 
 def _endless(made: Body, rng: np.random.Generator) -> Body:
-    """The robot with two joints that have no limits, near half a turn, where a reading begins anew."""
+    """Return the robot with two joints without limits, near half a turn, where encoder readings wrap."""
     turning = np.sort(rng.choice(np.flatnonzero(made.limits.position_mask), 2, replace=False))
     lower, upper, ready = made.limits.lower.copy(), made.limits.upper.copy(), made.ready.copy()
     lower[turning], upper[turning] = -np.inf, np.inf

@@ -1,4 +1,4 @@
-"""Policies that run about near the walls of a workspace box: no command ever has the end effector outside."""
+"""Policies that move near the walls of a workspace box: no command may put the end effector outside."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.safety.workspace import Workspace
 from tests.runtime.tick_bench import Bench
 
 _TICKS = 150
-_HALF = 0.12  # [m] of each box
+_HALF = 0.12  # [m] half the size of each box
 
 
 @cache
@@ -29,7 +29,7 @@ def _walled(name: str) -> tuple[Workspace, Float64]:
 
 
 def once(seed: int) -> list[str]:
-    """Violations in the scenario of `seed`, in words; [] where there are none."""
+    """Return the violations in the scenario of `seed`, as sentences."""
     rng = np.random.default_rng(seed)
     name = str(rng.choice(sorted(robots.robot_names())))
     workspace, start = _walled(name)

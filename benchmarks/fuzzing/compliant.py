@@ -1,4 +1,4 @@
-"""An arm that stands below its command, under a steady load: nothing that is done to it while it stands moves it."""
+"""Arm with a steady error under load: nothing that happens while it stands may move it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from tests.runtime.compliant import Compliant, standing
 from tests.runtime.tick_bench import wave
 
 _HAPPENINGS = 14
-_STILL = 2e-3  # [rad] that the noise of its encoders may move it by
-_LARGEST = 0.095  # [rad] of the steady error: what more is has let go, by `safety.steady_error`
+_STILL = 2e-3  # [rad] movement that encoder noise may cause
+_LARGEST = 0.095  # [rad] steady error; more counts as released, by `safety.steady_error`
 
 
 def once(seed: int) -> list[str]:
-    """Violations in the scenario of `seed`, in words; [] where there are none."""
+    """Return the violations in the scenario of `seed`, as sentences."""
     rng = np.random.default_rng(seed)
     bench = standing(
         rng.uniform(-_LARGEST, _LARGEST, 2), noise=float(rng.choice([0.0, 1e-4])), following_error=0.5
@@ -35,7 +35,7 @@ def once(seed: int) -> list[str]:
 
 
 def _move(bench: Compliant, rng: np.random.Generator, run: int) -> None:
-    """Somewhere else, by a motion or by chunks, perhaps stopped on the way; then it stands for two seconds."""
+    """Move elsewhere, by a motion or by chunks, perhaps stopped on the way; then stand for two seconds."""
     here = np.array(bench.status["commanded"], np.float64)
     if rng.random() < 0.5:
         bench.say("motion", goal=rng.uniform(-0.8, 0.8, 2), speed=1.0)

@@ -1,4 +1,4 @@
-"""A robot with faulty encoders, whatever it does: what it is told stays within limits, and never jumps away from it."""
+"""Robot with faulty encoders: its commands must stay within limits, and never jump away from the robot."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from runtime.spaces.binary_grippers import MIN_SWITCH_INTERVAL_S
 from tests.runtime.tick_bench import PERIOD, Bench
 
 _TICKS = 240
-_NOISE = 2e-5  # [rad] of a sound encoder
-_NEAR = 0.35  # [rad] from the robot that a command may step to: how far it goes while samples agree
+_NOISE = 2e-5  # [rad] of an intact encoder
+_NEAR = (
+    0.35  # [rad] distance from the robot to which a command may step: how far it moves while samples agree
+)
 _MARGIN = 1.05
 _SOUND = 12  # ticks
 _RESTS = round(MIN_SWITCH_INTERVAL_S / PERIOD)  # ticks between two switches of a gripper
@@ -23,9 +25,9 @@ _JITTER = 0.05  # [rad] of a noisy encoder
 
 
 class Scenario(Bench):
-    """A robot that follows its commands late, seen through encoders that now and then fail.
+    """Robot that follows its commands with a delay, seen through encoders that sometimes fail.
 
-    Joints without limits are read in one turn, or in all of them. A node that leads moves the robot by itself.
+    Joints without limits are read within one turn, or over several. In node-driven mode the robot moves by itself.
     """
 
     def __init__(self, seed: int) -> None:
@@ -38,38 +40,38 @@ class Scenario(Bench):
         self.fault, self.since, self.kept = "", 0, self.body
         kind = str(self.rng.choice(["async", "naive", "ensemble"]))
         super().__init__({"kind": kind}, limits, dims, switches=switches)
-        for dim in self.ends:  # it may hold something
+        for dim in self.ends:  # it may hold an object
             self.body[dim] = self.rng.uniform(limits.lower[dim], limits.upper[dim])
         self.measured = self.body
-        self.wish = self.body  # where a hand, or the node's own leader, moves the robot to
+        self.wish = self.body  # target of a hand, or of the node's own leader, that moves the robot
         self.pushed = False
         self.sound = 0  # ticks without a fault
         self.run_number = self.chunks = 0
         self.previous: Float64 | None = None
-        self.velocity = np.zeros((2, self.dim))  # the least and the most that the last command counts as
-        self.switched = dict.fromkeys(self.ends, -_RESTS)  # the tick of each gripper's last switch
+        self.velocity = np.zeros((2, self.dim))  # bounds of the last command's velocity
+        self.switched = dict.fromkeys(self.ends, -_RESTS)  # tick of each gripper's last switch
         self.violations: list[str] = []
 
     def _stand(self) -> None:
-        """As long as it takes to know that its encoders are never still."""
+        """Stand until it is known that the encoders are never still."""
         for _ in range(3 * _SOUND):
             self.observe(qpos=self.read().astype(np.float32))
             self.tick(self.step, self.clock.now())
             self.clock.advance(PERIOD)
 
-    # --- what happens --------------------------------------------------------------------------------------
+    # --- events -------------------------------------------------------------------------------------------------
 
     def act(self) -> None:
-        """Something, now and then."""
+        """Cause a random event, occasionally."""
         if self.rng.random() < 0.06:
             kinds = ["follow", "follow", "motion", "hold", "estop", "push", "sim", "yield", "lock"]
             stopped = self.shared.estop is EStop.LATCHED and self.rng.random() < 0.5
             getattr(self, "_clear" if stopped else f"_{self.rng.choice(kinds)}")()
         self.sound = 0 if self.fault else self.sound + 1
-        # The first samples, and those after a gap, cannot be told from sound ones by their numbers.
+        # The first samples, and those after a gap, cannot be distinguished from intact ones by their values.
         if self.sound > _SOUND and self.rng.random() < 0.05:
             faults = [*FAULTS, *KEPT]
-            if self.pushed:  # at full speed, values that are exchanged are not each other's any more
+            if self.pushed:  # at full speed, swapped values no longer match each other
                 faults.remove("swapped")
             self.fault, self.since = str(self.rng.choice(faults)), 0
             free = np.where(self.places & (self.rng.random(self.dim) < 0.5), self._somewhere(1.0), self.body)
@@ -86,7 +88,7 @@ class Scenario(Bench):
         )
 
     def _anything(self, reach: float) -> Float64:
-        """The same, with grippers and speeds of any number that they can have."""
+        """Return random joints with grippers and speeds at any value within their limits."""
         place, free = self._somewhere(reach), ~self.places
         place[free] = self.rng.uniform(self.limits.lower[free], self.limits.upper[free])
         return place
@@ -131,10 +133,10 @@ class Scenario(Bench):
         way[:, jumps] = self._anything(0.0)[jumps]
         self.chunk(self.chunks, way, run=self.run_number)
 
-    # --- one tick ------------------------------------------------------------------------------------------
+    # --- one tick ------------------------------------------------------------------------------------------------
 
     def read(self) -> Float64:
-        """Readings of the encoders."""
+        """Return the readings of the encoders."""
         sound = self._turned(self.body + self.rng.normal(0.0, _NOISE, self.dim) * self.places)
         return self._faulty(sound) if self.fault else sound
 
@@ -152,7 +154,7 @@ class Scenario(Bench):
         return np.where(self.places, faulty, sound)
 
     def run_tick(self) -> None:
-        """One tick: the robot is seen, told, and moves."""
+        """Run one tick: observe the robot, command it, and move it."""
         self._begun = True
         for process in ("coordinator", "guard"):
             self.shared.beat(process, self.clock.now())
@@ -166,7 +168,7 @@ class Scenario(Bench):
         self._move()
 
     def _move(self) -> None:
-        """Whoever moves the robot does so for a tick."""
+        """Move the robot for one tick, by command, hand, or its own node."""
         led = self.behaviour == "yield"
         if led and self.rng.random() < 0.05:
             self.wish = self._somewhere(0.5)
@@ -178,18 +180,18 @@ class Scenario(Bench):
         follow = self.body + np.clip(0.6 * self._apart(goal, self.body), -most, most)
         self.body = np.where(self.places | self.pushed, follow, goal)
 
-    # --- what is wrong -------------------------------------------------------------------------------------
+    # --- violations ----------------------------------------------------------------------------------------------
 
     def _apart(self, there: Float64, here: Float64) -> Float64:
         return difference(there, here, self.dims.wrapping)
 
     @property
     def _known(self) -> Float64:
-        """Known joints of the robot; moves of an arm by others that are not seen cannot be known."""
+        """Joints as far as the runtime can know them: external motion during a frozen encoder is invisible."""
         return self.kept if self.fault == "frozen" else self.body
 
     def check(self, sent: list[Float64]) -> None:
-        """Note the violations in what was sent in this tick."""
+        """Record the violations in the commands of this tick."""
         record = self.records()[-1]
         if len(sent) > 1 or (sent and self.behaviour == "yield"):
             self._wrong("told twice in one tick, or beside the node that leads")
@@ -209,7 +211,7 @@ class Scenario(Bench):
         self.previous = told
 
     def _look_at_grippers(self, told: Float64, stopped: bool) -> None:
-        """An e-stop that takes the robot over, and the hold after it, leave them where they are."""
+        """Check that e-stops and the hold after them leave grippers as they are, and that switches are rare."""
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]
             switches = not np.isclose(told[dim], told[dim] if before is None else before)
@@ -224,7 +226,7 @@ class Scenario(Bench):
         moved = (told - before) / PERIOD
         if "where the robot is" in notes:
             hardest = 60.0 * self.limits.radian_scale * _MARGIN * PERIOD
-            onwards = np.clip(moved, -hardest, hardest)  # it counts as at rest, or has moved on from there
+            onwards = np.clip(moved, -hardest, hardest)  # it counts as at rest, or has continued from there
             self.velocity = np.array([np.minimum(onwards, 0.0), np.maximum(onwards, 0.0)])
             apart = np.abs(told - before) > 1e-6
             near = np.maximum(np.abs(self._apart(before, self._known)), _NEAR)
@@ -254,9 +256,7 @@ class Scenario(Bench):
 
 
 class EncoderOffsetScenario(Bench):
-    """A robot that stands, one joint of which is read elsewhere from a tick on: it must not run away, nor may a run
-    begin meanwhile.
-    """
+    """Standing robot with one faulty joint encoder: it must not run away, and no run may begin meanwhile."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -266,9 +266,11 @@ class EncoderOffsetScenario(Bench):
         self.measured = self.body
         self._joint = int(rng.choice(np.flatnonzero(limits.position_mask)))
         self._offset, self._scale = rng.uniform(-1.5, 1.5), float(rng.choice([-1.0, 1.0, 1.0, 1.2]))
-        self._within = float(rng.choice([PERIOD, 0.5, 2.0]))  # [s] in which the offset grows
-        self._comes_and_goes = bool(rng.random() < 0.5)  # never long enough to be believed again
-        self._lag = float(rng.choice([1.0, 0.3]))  # the part of its way to its command that it goes in a tick
+        self._within = float(rng.choice([PERIOD, 0.5, 2.0]))  # [s] time in which the offset grows
+        self._comes_and_goes = bool(rng.random() < 0.5)  # never long enough to be trusted again
+        self._lag = float(
+            rng.choice([1.0, 0.3])
+        )  # share of the distance to its command that it moves per tick
         self._stopped = bool(rng.random() < 0.5)
         self._fault = str(rng.choice(["off", "off", "no number", "noise", "drift"]))
         if self._fault == "drift":
@@ -276,7 +278,7 @@ class EncoderOffsetScenario(Bench):
         self._rng = rng
 
     def violations(self) -> list[str]:
-        """Violations in what it was told, in words."""
+        """Return the violations in its commands, as sentences."""
         self.say("motion", goal=self.body)
         self.run(10)
         if self._stopped:
@@ -300,7 +302,7 @@ class EncoderOffsetScenario(Bench):
         return [f"{self.name}, encoder of {joint}: {self._fault}: {what}" for what in sorted(found)]
 
     def _read(self, since: float) -> Float64:
-        """Readings of the encoders [D], `since` the fault began [s]."""
+        """Return the readings of the encoders [D], `since` [s] after the fault began."""
         read = self.body.copy()
         if self._fault == "no number":
             read[self._joint] = np.nan
@@ -313,7 +315,7 @@ class EncoderOffsetScenario(Bench):
         return read
 
     def _wrong(self, read: Float64) -> set[str]:
-        """Violations in the tick in which the joints were `read` [D]."""
+        """Return the violations in the tick in which the joints were `read` [D]."""
         found, told, places = set[str](), self.sent[-1], self.limits.position_mask
         if not np.isfinite(told).all() or (self.limits.excess(told) > 1e-5 * self.limits.radian_scale).any():
             found.add("told beyond the limits, or no number")
@@ -325,13 +327,13 @@ class EncoderOffsetScenario(Bench):
         return found
 
     def _bound(self, begins: Float64) -> float:
-        """One believed displacement [rad]: the following error, and how far the encoder is off."""
+        """Return the largest trusted displacement [rad]: the following error plus the encoder's offset."""
         scaled = abs((self._scale - 1.0) * begins[self._joint])
         return float(self.safety.following_error + abs(self._offset) + scaled + 0.1)
 
 
 def once(seed: int) -> list[str]:
-    """Violations in the scenario of `seed`, in words; [] where there are none."""
+    """Return the violations in the scenario of `seed`, as sentences."""
     scenario = Scenario(seed)
     for _ in range(_TICKS):
         scenario.run_tick()

@@ -1,4 +1,4 @@
-"""Faults of encoders: what is read in place of `joints` [D], `since` samples after the fault began."""
+"""Encoder faults: readings instead of `joints` [D], `since` samples after the fault began."""
 
 from __future__ import annotations
 
@@ -50,5 +50,5 @@ FAULTS: dict[str, Fault] = {
     "swapped": _swapped,
     "missing": _missing,
 }
-# They keep what they read when they begin, or a number of their own.
+# They keep a value: the reading at their begin, or a random one.
 KEPT = ("frozen", "stuck")

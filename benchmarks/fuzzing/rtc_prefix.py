@@ -1,8 +1,8 @@
-"""RTC: what a request declares fixed is what control plans for these steps, whatever comes in between.
+"""RTC: rows that a request declares as fixed are exactly those that control plans for these steps, whatever happens.
 
-A whole station on the virtual clock, a robot that is at once where it is told to be, and a policy that changes its
-mind with every answer and keeps the contract of real-time chunking, or does not. Answers are late by chance, are
-lost, and the run is halted, taken up again, tuned and started anew.
+A complete station on the virtual clock, a robot that reaches each command at once, and a policy whose answers disagree
+and which honours the contract of real-time chunking, or does not. Answers are late or lost at random, and the run is
+halted, resumed, tuned and restarted.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 
 _TICKS = 240
-_HAIR = 1e-6  # of a step
-_ROUNDING = 2e-5  # [rad, m] of float32 there and back through the model's own numbers
-_POSES = 2e-3  # [m, and of a quaternion's numbers] that inverse kinematics meets poses to
+_HAIR = 1e-6  # [steps] tolerance
+_ROUNDING = 2e-5  # [rad, m] float32 conversion through the model's own numbers
+_POSES = 2e-3  # [m, and quaternion components] tolerance of inverse kinematics
 _ROBOTS = ("agilex_piper", "ur5e", "r1_lite", "arx_r5", "dual_franka", "agibot_g2")
 _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
@@ -50,18 +50,18 @@ class Scenario:
     action_hz: float | None  # None: the control rate
     horizon: int
     space: str
-    own: bool  # the server returns rows of the model's own space
-    keeps: bool  # the server keeps the contract
-    endless: bool  # one joint has no limits, and turns across half a turn
-    wander: float  # [rad] by which answers differ
-    delay: tuple[int, int]  # ticks, least and most
-    lost: float  # part of the answers
+    own: bool  # the server returns rows in the model's own space
+    keeps: bool  # the server honours the contract
+    endless: bool  # one joint has no limits, and crosses half a turn
+    wander: float  # [rad] disagreement of answers
+    delay: tuple[int, int]  # [ticks] least and most
+    lost: float  # share of the answers
     seen_every: int  # ticks per observation
     strategy: dict[str, Any]
 
 
 def scenario(seed: int) -> Scenario:
-    """The scenario of this seed."""
+    """Return the scenario of a seed."""
     random = np.random.default_rng(seed)
     control = float(random.choice([20.0, 30.0, 50.0]))
     least = int(random.integers(1, 6))
@@ -77,7 +77,7 @@ def scenario(seed: int) -> Scenario:
     if random.random() < 0.3:
         strategy["inference_rate"] = float(random.choice([2.0, 5.0, 10.0]))
     eef = random.random() < 0.15
-    if eef:  # what is asked for is to be reached: no jumps
+    if eef:  # targets must be reachable: no jumps
         strategy = {"kind": "rtc", "blend_window": int(random.integers(4, 13))}
     rate = float(random.choice([10.0, 15.0, 24.0, 60.0])) if random.random() < 0.35 else None
     return Scenario(
@@ -89,7 +89,7 @@ def scenario(seed: int) -> Scenario:
         own=not eef and random.random() < 0.5,
         keeps=random.random() < 0.7,
         endless=not eef and random.random() < 0.2,
-        wander=float(random.choice([0.01, 0.04] if eef else [0.01, 0.04, 0.15])),  # poses are to be reached
+        wander=float(random.choice([0.01, 0.04] if eef else [0.01, 0.04, 0.15])),  # poses must be reachable
         delay=(least, most),
         lost=0.1 if random.random() < 0.3 else 0.0,
         seen_every=int(random.choice([1, 1, 2])),
@@ -98,7 +98,7 @@ def scenario(seed: int) -> Scenario:
 
 
 def once(seed: int) -> list[str]:
-    """Run the scenario of this seed on the virtual clock; each violation in a sentence, none where all is well."""
+    """Run the scenario of a seed on the virtual clock; return each violation as a sentence."""
     made, random = scenario(seed), np.random.default_rng([seed, 1])
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), made)
@@ -108,20 +108,20 @@ def once(seed: int) -> list[str]:
 
 
 class RandomDelayRunner(LockstepRunner):
-    """Hands each result over after a number of ticks that is chance."""
+    """Runner that delivers each result after a random number of ticks."""
 
     def __init__(self, least: int, most: int, random: np.random.Generator) -> None:
         super().__init__(least)
         self._least, self._most, self._random = least, most, random
 
     def submit(self, call: Any) -> Any:
-        """As in lockstep, with a delay of its own."""
+        """Submit a call with a random delay."""
         self._delay = int(self._random.integers(self._least, self._most + 1))
         return super().submit(call)
 
 
 class SlowlyObservedRobot(InstantRobot):
-    """Stands at `position` in the beginning, and is seen every so many ticks."""
+    """Robot that starts at `position`, and is observed every few ticks."""
 
     def __init__(self, robot: Robot, clock: Clock, position: Float64, every: int) -> None:
         super().__init__(robot, clock)
@@ -129,21 +129,21 @@ class SlowlyObservedRobot(InstantRobot):
         self._every, self._looked = every, 0
 
     def receive(self, timeout: float) -> Observation | None:
-        """Observation of the robot, at its own rate."""
+        """Return an observation at the robot's own rate, else None."""
         self._looked += 1
         return super().receive(timeout) if self._looked % self._every == 0 else None
 
 
 @dataclass(frozen=True, slots=True)
 class DeclaredPrefix:
-    """Content of a request: rows [d, W] that are fixed, the first for control step `step`."""
+    """Fixed rows [d, W] of a request, the first for control step `step`."""
 
     step: int
     rows: Float64
 
 
 class PrefixKeepingPolicy(Policy):
-    """Wanders about where it stands; continues what it is told, where it keeps the contract."""
+    """Policy that moves around a fixed posture, and continues the committed rows if it honours the contract."""
 
     def __init__(self, made: Scenario, spec: StationSpec, random: np.random.Generator) -> None:
         self._made, self._random = made, random
@@ -158,11 +158,15 @@ class PrefixKeepingPolicy(Policy):
         self.declared: list[DeclaredPrefix] = []
 
     def connect(self) -> PolicyInfo:
-        """Nothing to reach."""
+        """Return the policy's properties; there is no server."""
         return PolicyInfo("keeper", horizon=self._made.horizon, rate=self._made.action_hz, supports_rtc=True)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Its rows; PolicyLostError by chance."""
+        """Return the rows.
+
+        Raises:
+            PolicyLostError: At random.
+        """
         rows = self._wandering(observation)
         if conditioning is not None:
             fixed = conditioning.remaining_rows[: conditioning.predicted_delay].astype(np.float64)
@@ -182,16 +186,16 @@ class PrefixKeepingPolicy(Policy):
         )
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing: there is no state."""
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: there are no resources."""
 
     def apart(self, row: Float64, at: float, planned: dict[int, Float64], missed: float) -> str:
-        """Deviation of a fixed row for control step `at` from the plan, in words; "" where there is none.
+        """Return the deviation of a fixed row for control step `at` from the plan as text, "" if there is none.
 
-        Between two steps it is compared with both, to within what the plan bends there; poses to within what inverse
-        kinematics has `missed`.
+        Between two steps the row is compared with both, with the plan's curvature as tolerance; for poses the error
+        `missed` of inverse kinematics is added.
         """
         before, part = math.floor(at + _HAIR), at - math.floor(at + _HAIR)
         steps = [before, before + 1] if part > _HAIR else [before]
@@ -211,18 +215,18 @@ class PrefixKeepingPolicy(Policy):
         return f"is {off[worst]:.2e} off in number {worst}, allowed {allowed[worst]:.2e}"
 
     def _bend(self, before: int, planned: dict[int, Float64]) -> Float64:
-        """Bend of the plan about that step: what is cut off corners between two steps."""
+        """Return the curvature of the plan around a step: the error of interpolation between two steps."""
         rows = [self._of(planned[step]) for step in range(before - 2, before + 4) if step in planned]
         steps = [self._difference(later, sooner) for sooner, later in pairwise(rows)]
         bends = [np.abs(later - sooner) for sooner, later in pairwise(steps)]
         return np.max(bends, axis=0, initial=0.0) if bends else np.zeros(len(rows[0]))
 
     def _of(self, joints: Float64) -> Float64:
-        """Planned joints in the numbers of rows."""
+        """Return planned joints in the space of the rows."""
         return self._eef.eef_of(joints).astype(np.float64) if self._made.space == "eef" else joints
 
     def _difference(self, one: Float64, other: Float64) -> Float64:
-        if self._made.space == "eef":  # of quaternions the nearer sign
+        if self._made.space == "eef":  # quaternions with the nearer sign
             one, other = one.reshape(*one.shape[:-1], -1, EEF_WIDTH).copy(), other.reshape(-1, EEF_WIDTH)
             turns = one[..., 3:7]
             turns *= np.where((turns * other[..., 3:7]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
@@ -230,7 +234,7 @@ class PrefixKeepingPolicy(Policy):
         return difference(one, other, (0,) if self._made.endless else ())
 
     def _wandering(self, observation: Observation) -> Float64:
-        """A smooth path about where it stands, another one with every answer, on the branch that servers answer on."""
+        """Return a random smooth path around the posture, with quaternion signs as servers answer."""
         robot, random = self._robot, self._random
         rate = self._made.action_hz or self._made.control_hz
         seconds = observation.step / self._made.control_hz + np.arange(self._made.horizon) / rate
@@ -246,7 +250,7 @@ class PrefixKeepingPolicy(Policy):
         return np.asarray(joints)
 
     def _continued(self, rows: Float64, left: Float64, fixed: int) -> Float64:
-        """The rows with what is fixed in place of their own, and over to their own within 6 more."""
+        """Return the rows with the fixed ones in place, and a transition to its own rows within 6 more."""
         count = min(len(left), len(rows), fixed + 6)
         weights = np.clip((fixed + 6 - np.arange(count)) / 7.0, 0.0, 1.0)
         weights[:fixed] = 1.0
@@ -276,21 +280,21 @@ def _plan(data: Path, made: Scenario) -> StationSpec:
 
 @dataclass(slots=True)
 class Planned:
-    """By control step what was planned, before safety, where something was, and the steps in which no run was."""
+    """Planned actions by control step, before safety, and steps without a run."""
 
     rows: dict[int, Float64]
     held: set[int]
-    arrived: dict[int, int]  # by the step of the observation: that from which on the answer is the plan
-    other: set[int]  # steps in which another strategy was in force
-    missed: dict[int, float]  # by the step of the observation: what poses are missed by at most [m, rad]
+    arrived: dict[int, int]  # by step of the observation: first step from which the answer is the plan
+    other: set[int]  # steps with another strategy
+    missed: dict[int, float]  # by step of the observation: largest error of poses [m, rad]
     end: int
 
     def arrived_for(self, step: int) -> int:
-        """When the first answer to what was asked from `step` on is the plan: an answer that is lost keeps nothing."""
+        """Return when the first answer to a request from `step` on is the plan; lost answers fix nothing."""
         return min((at for asked, at in self.arrived.items() if asked >= step), default=self.end)
 
     def missed_before(self, step: int, horizon: int) -> float:
-        """Largest miss of the answers that may make this step and those after it."""
+        """Return the largest error of the answers that may contribute to this step and those after it."""
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
@@ -315,7 +319,7 @@ def _run(
             if np.isfinite(row).all():
                 planned.rows[step] = row
             if session.state is not SessionState.RUNNING:
-                planned.held |= {step, step + 1}  # in the former an answer may be laid that is told no more
+                planned.held |= {step, step + 1}  # in the first of them, an unreported answer may be merged
             if not station.coordinator.inference.continues:
                 planned.other.add(step + 1)
             shown = station.coordinator.inference.shown
@@ -334,7 +338,7 @@ def _run(
 
 
 def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
-    """Do what the operator might do now."""
+    """Do what an operator might do now."""
     state = station.coordinator.session.state
     if state is SessionState.READY:
         station.command("run")
@@ -348,7 +352,7 @@ def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -
 
 
 def _violations(made: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -> list[str]:
-    """Each fixed row that is not what was planned for its step, by more than its arithmetic."""
+    """Return each fixed row that differs from the plan for its step by more than the arithmetic tolerance."""
     found: list[str] = []
     pace = (made.action_hz or made.control_hz) / made.control_hz
     binding = made.keeps and made.action_hz is None and "k_max" not in made.strategy
@@ -360,7 +364,7 @@ def _violations(made: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -
             at = declared.step + place / pace
             steps = range(declared.step, math.ceil(at - _HAIR) + 1)
             if steps[-1] >= over or any(step in planned.held for step in steps):
-                break  # the run was held meanwhile, or an answer is laid that need not continue
+                break  # the run was held, or an answer was merged that need not continue the prefix
             off = keeper.apart(row, at, planned.rows, planned.missed_before(declared.step, made.horizon))
             if off:
                 found.append(f"row {place} of the request about step {declared.step} ({made}) {off}")

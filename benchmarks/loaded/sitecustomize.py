@@ -1,6 +1,6 @@
-"""On PYTHONPATH, has each process write which modules it loaded, when it ends: a file per program in $EVA_LOADED.
+"""On PYTHONPATH: each process writes its loaded modules at its end, to one file per program in $EVA_LOADED.
 
-For benchmarks.start and tests alone. Modules that EVA_BROKEN names, with commas, cannot be imported.
+Only for benchmarks.start and tests. Modules listed in EVA_BROKEN, separated by commas, cannot be imported.
 """
 
 import atexit
@@ -13,7 +13,7 @@ from types import ModuleType
 
 
 class _Broken(MetaPathFinder):
-    """Finds no module of these names."""
+    """Finder that refuses modules of these names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names

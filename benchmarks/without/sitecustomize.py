@@ -1,6 +1,6 @@
-"""On PYTHONPATH, takes the measures of runtime.core.realtime that EVA_WITHOUT names from control and the bare loop.
+"""On PYTHONPATH: disables measures of runtime.core.realtime listed in EVA_WITHOUT, in control and the bare loop.
 
-For benchmarks.measures alone: the runtime itself has no such switch.
+Only for benchmarks.measures: the runtime itself has no such switch.
 """
 
 import os

@@ -1,1 +1,1 @@
-"""REST under /api/v1, one file per resource."""
+"""REST interface under /api/v1, one module per resource."""

@@ -1,4 +1,4 @@
-"""The caller's own account."""
+"""Account of the caller."""
 
 from __future__ import annotations
 

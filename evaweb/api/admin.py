@@ -1,4 +1,4 @@
-"""Accounts and tokens in the admin pages: a user has one role, and is made with it."""
+"""Administration of accounts and tokens: a user has exactly one role, from creation on."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _role_field() -> forms.ChoiceField:
 
 
 class NewAccountForm(UserCreationForm):
-    """A name, a password, a role."""
+    """Form of a new account: name, password, role."""
 
     role = _role_field()
 
@@ -44,7 +44,7 @@ class NewAccountForm(UserCreationForm):
 
 
 class AccountForm(UserChangeForm):
-    """The same for one that there is; no administrator takes their own rights away by mistake."""
+    """Form of an existing account; administrators cannot remove their own rights by mistake."""
 
     role = _role_field()
     asking: User | None = None
@@ -54,7 +54,7 @@ class AccountForm(UserChangeForm):
         self.fields["role"].initial = role_of(self.instance).value
 
     def clean(self) -> dict[str, Any]:
-        """Refuse to lock oneself out."""
+        """Check that administrators do not lock themselves out."""
         cleaned: dict[str, Any] = super().clean() or self.cleaned_data
         loses = cleaned.get("role") != Role.ADMIN or not cleaned.get("is_active")
         if self.asking is not None and self.asking.pk == self.instance.pk and loses:
@@ -65,16 +65,16 @@ class AccountForm(UserChangeForm):
 
 
 class RoleFilter(admin.SimpleListFilter):
-    """By role."""
+    """Filter of accounts by role."""
 
     title, parameter_name = "role", "role"
 
     def lookups(self, request: HttpRequest, model_admin: Any) -> list[tuple[str, str]]:
-        """The three of them."""
+        """Return the roles."""
         return [(role.value, role.value) for role in Role]
 
     def queryset(self, request: HttpRequest, queryset: QuerySet[User]) -> QuerySet[User]:
-        """Users whose highest role it is."""
+        """Return the users with this highest role."""
         if self.value() not in set(Role):
             return queryset
         users = queryset.prefetch_related("groups")
@@ -82,7 +82,7 @@ class RoleFilter(admin.SimpleListFilter):
 
 
 class AccountAdmin(UserAdmin):
-    """Accounts and their roles."""
+    """Administration of accounts and their roles."""
 
     form, add_form = AccountForm, NewAccountForm
     list_display = ("username", "full_name", "role", "is_active", "last_login")
@@ -101,32 +101,32 @@ class AccountAdmin(UserAdmin):
     filter_horizontal = ()
 
     def get_readonly_fields(self, request: HttpRequest, obj: User | None = None) -> tuple[str, ...]:
-        """An account keeps its name: records name people by it."""
+        """Make the name of an existing account read-only: records refer to people by name."""
         return (*self.readonly_fields, "username") if obj else self.readonly_fields
 
     def get_form(self, request: HttpRequest, obj: User | None = None, **named: Any) -> Any:
-        """The form knows the user."""
+        """Return the form class with the user who edits."""
         made = super().get_form(request, obj, **named)
         return type(made.__name__, (made,), {"asking": request.user})
 
     def save_model(self, request: HttpRequest, obj: User, form: Any, change: bool) -> None:
-        """The account, then its role."""
+        """Save the account, then its role."""
         super().save_model(request, obj, form, change)
         if "role" in form.cleaned_data:
             set_role(user=obj, role=Role(form.cleaned_data["role"]))
 
     def has_delete_permission(self, request: HttpRequest, obj: User | None = None) -> bool:
-        """Never: accounts are switched off, records refer to them."""
+        """Return False: accounts are deactivated, because records refer to them."""
         return False
 
     @admin.display(description="name")
     def full_name(self, user: User) -> str:
-        """First and last name."""
+        """Return first and last name."""
         return user.get_full_name()
 
     @admin.display(description="role")
     def role(self, user: User) -> str:
-        """The highest role."""
+        """Return the highest role."""
         return role_of(user).value
 
 
@@ -137,22 +137,22 @@ admin.site.register(User, AccountAdmin)
 
 @admin.register(Token)
 class TokenAdmin(admin.ModelAdmin):
-    """Tokens are made by `manage.py api_token USER NAME`, and revoked here by deleting them."""
+    """Administration of tokens: created by `manage.py api_token USER NAME`, revoked here by deletion."""
 
     list_display = ("name", "user", "created_at", "ends_at", "used_at")
     list_filter = ("user",)
     search_fields = ("name", "user__username")
 
     def has_add_permission(self, request: HttpRequest) -> bool:
-        """Never: it could not be shown."""
+        """Return False: a new token could not be displayed here."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Token | None = None) -> bool:
-        """Never."""
+        """Return False: tokens are immutable."""
         return False
 
     def log_deletions(self, request: HttpRequest, queryset: QuerySet[Token]) -> Any:
-        """Also where logins are logged."""
+        """Log deletions in the log of logins too."""
         for token in queryset:
             log.info(
                 "token %a of %a is withdrawn by %a",
@@ -165,22 +165,22 @@ class TokenAdmin(admin.ModelAdmin):
 
 @admin.register(AccessAttempt)
 class AttemptAdmin(admin.ModelAdmin):
-    """Logins that failed of late; removing them unlocks the name at that address."""
+    """Administration of recent failed logins; deleting them unlocks the name at that address."""
 
     list_display = ("username", "ip_address", "failures_since_start", "attempt_time", "locks")
     search_fields = ("username", "ip_address")
     fields = ("username", "ip_address", "user_agent", "failures_since_start", "attempt_time")
 
     def has_add_permission(self, request: HttpRequest) -> bool:
-        """Never."""
+        """Return False: attempts are only recorded."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: AccessAttempt | None = None) -> bool:
-        """Never."""
+        """Return False: attempts are only recorded."""
         return False
 
     @admin.display(boolean=True, description="locks the name there")
     def locks(self, attempt: AccessAttempt) -> bool:
-        """True if it alone reaches the limit of failures and still counts."""
+        """Return True if this attempt alone reaches the limit of failures and is still recent."""
         counts = timezone.now() - attempt.attempt_time < settings.AXES_COOLOFF_TIME
         return counts and attempt.failures_since_start >= settings.AXES_FAILURE_LIMIT

@@ -1,4 +1,4 @@
-"""Shapes and sentences that all answers share: errors, pages of rows."""
+"""Schemas and sentences shared by all answers: errors, pages of rows."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pydantic import ConfigDict
 
 Row = TypeVar("Row")
 MAX_PAGE_SIZE = 1000
-_WRAPPERS = ("given", "filters", "paging")  # parameters of views that stand for the whole question
-_MOST_SAID = 10  # faults of one question
+_WRAPPERS = ("given", "filters", "paging")  # view parameters that stand for the whole query or body
+_MOST_SAID = 10  # errors listed per request
 
 
 class ErrorOut(Schema):
@@ -48,7 +48,7 @@ class Paging(Schema):
     offset: Annotated[int, Field(ge=0, le=2**53)] = 0
 
     def page(self, rows: QuerySet[Any], shape: Any, *seen: Any) -> dict[str, Any]:
-        """The page of `rows`, each through `shape.of`, which is also given what is `seen` of them."""
+        """Return total, limit, offset and the items of one page, converted by `shape.of(row, *seen)`."""
         found = rows[self.offset : self.offset + self.limit]
         return {
             "total": rows.count(),
@@ -62,7 +62,7 @@ FAILURES = {frozenset({400, 401, 403, 404, 409, 422, 503}): ErrorOut}
 
 
 def describe_errors(faults: Sequence[Mapping[str, Any]]) -> str:
-    """Faults of a question, as pydantic found them: each place, what stood there, and what is allowed."""
+    """Return pydantic's errors as one text: for each the place, the given value, and what is allowed."""
     said = [_sentence(fault) for fault in faults[:_MOST_SAID]]
     more = len(faults) - len(said)
     return "; ".join(said) + (f"; and {more} more" if more > 0 else "")

@@ -1,4 +1,4 @@
-"""REST under /api/v1: every entity, every statistic, every command; errors become answers here and nowhere else."""
+"""REST interface under /api/v1: routers, authentication, and the only place that converts errors to answers."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ log = logging.getLogger(__name__)
 
 
 class _Api(NinjaAPI):
-    """Says of a malformed question what was given, where Ninja says only what is allowed."""
+    """NinjaAPI whose validation errors include the given value; Ninja's own only state what is allowed."""
 
     def validation_error_from_error_contexts(
         self, error_contexts: list[ValidationErrorContext]
     ) -> ValidationError:
-        """Every error with its place and what stood there."""
+        """Return every validation error with its place and the given value."""
         return ValidationError(
             [
                 {key: error[key] for key in ("loc", "type", "msg", "input")}
@@ -63,8 +63,8 @@ api = _Api(
     urls_namespace="api",
     description="Every entity and every statistic of the lab. Log in, or send `Authorization: Bearer TOKEN`.",
     auth=[Bearer(), Session()],
-    openapi_url=None,  # served below, to those who are logged in
-    docs_url=None,  # its pages fetch scripts from elsewhere
+    openapi_url=None,  # served below, to logged-in users
+    docs_url=None,  # its pages would fetch external scripts
 )
 api.add_decorator(reject_unknown_parameters)
 api.add_router("", accounts.router)
@@ -87,7 +87,7 @@ api.add_router("/find", find.router)
 
 @api.get("/openapi.json", include_in_schema=False, url_name="openapi")
 def openapi(request: HttpRequest) -> Any:
-    """This interface, as OpenAPI describes it."""
+    """Return the OpenAPI document of this interface."""
     return api.get_openapi_schema()
 
 
@@ -108,7 +108,7 @@ def _malformed(request: HttpRequest, fault: ValidationError) -> HttpResponse:
 
 @api.exception_handler(HttpError)
 def _http(request: HttpRequest, fault: HttpError) -> HttpResponse:
-    cause = fault.__cause__  # why a body was not read: Ninja itself says only that it was not
+    cause = fault.__cause__  # the reason why the body was not read; Ninja's own message lacks it
     if isinstance(cause, Exception) and not isinstance(cause, bounded.UnreadableDocument):
         return api.on_exception(request, cause)
     return _failure(request, str(cause or fault), fault.status_code)

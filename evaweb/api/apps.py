@@ -1,17 +1,17 @@
-"""Registers the app."""
+"""Django configuration of the app."""
 
 from django.apps import AppConfig
 
 
 class ApiConfig(AppConfig):
-    """REST under /api/v1, one file per resource."""
+    """REST interface under /api/v1."""
 
     name = "evaweb.api"
     default_auto_field = "django.db.models.BigAutoField"
     verbose_name = "Tokens of programs"
 
     def ready(self) -> None:
-        """Listen to changes of passwords; the administration calls the library that counts logins what it is."""
+        """Connect the receiver of password changes, and name the app that counts failed logins."""
         from django.apps import apps
 
         from evaweb.api import passwords  # noqa: F401  its receiver

@@ -1,4 +1,4 @@
-"""Authentication of a caller: a logged-in browser, or a program with a token."""
+"""Authentication of a caller: logged-in browser, or program with a token."""
 
 from __future__ import annotations
 
@@ -27,16 +27,20 @@ NOT_LOGGED_IN = fixed(
 
 
 class NotLoggedIn(EvaError):
-    """An unknown user."""
+    """Unknown user or token."""
 
     status = 401
 
 
 class Bearer(HttpBearer):
-    """`Authorization: Bearer TOKEN`, as `manage.py api_token` prints it."""
+    """Authentication by `Authorization: Bearer TOKEN`, with a token of `manage.py api_token`."""
 
     def authenticate(self, request: HttpRequest, token: str) -> Any:
-        """The token's user; a wrong token is an error, even where a session would do."""
+        """Return the token's user.
+
+        Raises:
+            NotLoggedIn: If the token is invalid, even if the request has a valid session.
+        """
         user = credentials.look_up(TOKEN, token)
         if user is None:
             audit.log_token_refused(client_address(request), UNKNOWN)
@@ -45,14 +49,14 @@ class Bearer(HttpBearer):
 
 
 class Session(SessionAuth):
-    """The session cookie of a logged-in browser; what changes anything needs the X-CSRFToken header as well."""
+    """Authentication by the session cookie of a browser; requests with changes need the X-CSRFToken header too."""
 
     openapi_description = (
         "Named eva_session_ and what the file lab_id of the data folder says, as each lab has its own"
     )
 
     def _get_key(self, request: HttpRequest) -> str | None:
-        if not request.user.is_authenticated:  # 401 before CSRF's 403: log in first
+        if not request.user.is_authenticated:  # so that 401 (log in first) precedes CSRF's 403
             return None
         key = super()._get_key(request)
         if key:

@@ -33,12 +33,12 @@ class CheckpointOut(Schema):
 
     @staticmethod
     def resolve_parent(checkpoint: Checkpoint) -> str | None:
-        """The name of the one it was trained on from; null where that is hidden."""
+        """Return the name of the parent checkpoint; null if it is hidden."""
         return checkpoint.parent.name if checkpoint.parent else None
 
     @staticmethod
     def of(checkpoint: Checkpoint) -> Checkpoint:
-        """As it is."""
+        """Return the row itself, whose fields match."""
         return checkpoint
 
 

@@ -1,4 +1,4 @@
-"""Sessions of collecting: opened, closed, resumed, published; what they have, and what the worker does for them."""
+"""Collecting sessions: open, close, resume, publish; their episodes, and the worker's jobs for them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SessionOut(Schema):
 
     @staticmethod
     def of(session: CollectSession) -> dict[str, Any]:
-        """With names."""
+        """Return the session with names of station and operator."""
         plain = ("uuid", "dataset", "task", "target", "opened_at", "closed_at")
         names = {"station": session.station.name, "operator": session.operator.get_username()}
         return {**{name: getattr(session, name) for name in plain}, **names}
@@ -92,7 +92,7 @@ class SessionDetail(SessionOut):
 
     @staticmethod
     def of(session: CollectSession) -> dict[str, Any]:
-        """All of it."""
+        """Return the session with all details."""
         dataset = selectors.dataset_of(session=session)
         return {
             **SessionOut.of(session),
@@ -157,7 +157,7 @@ class QueuedOut(JobOut):
 
     @staticmethod
     def of(item: QueueItem, sight: Visibility) -> dict[str, Any]:
-        """The job with what the queue knows of it."""
+        """Return the job with the queue's additional facts."""
         return {**JobOut.of(item.job, sight), "episode": item.episode, "left_s": item.left_s}
 
 

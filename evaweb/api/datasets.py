@@ -1,4 +1,4 @@
-"""Datasets of the data folder, ours and those of others: what they are, their episodes, what is done to them."""
+"""Datasets of the data folder, our own and others': properties, episodes, and operations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DatasetOut(Schema):
 
     @staticmethod
     def of(found: Overview) -> dict[str, Any]:
-        """With what its newest check found."""
+        """Return the dataset with the findings of its newest check."""
         own = [name for name in DatasetOut.model_fields if name != "check"]
         checked = None if found.problem else dataset_jobs.latest_check(found.name)
         check = checked and {name: getattr(checked, name) for name in CheckOut.model_fields}
@@ -66,7 +66,7 @@ class DatasetEpisodeOut(Schema):
 
     @staticmethod
     def of(row: listing.DatasetRow) -> dict[str, Any]:
-        """As the dataset lists it, with the newest verdict of the lab."""
+        """Return the episode as listed in the dataset, with the lab's newest verdict."""
         plain = ("index", "seconds", "task", "success", "result", "verdict")
         return {**{name: getattr(row, name) for name in plain}, "rows": row.length, "uuid": row.uuid or None}
 

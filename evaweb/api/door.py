@@ -1,8 +1,8 @@
-"""Stops of a robot over REST, answered before Django is asked for anything: no database, no thread of a page.
+"""Stops over REST, answered in front of Django: without the database and without a thread of a page.
 
-E-stop, stop and halt of a station, and whether this way to them stands. Everything else goes on to the application;
-evaweb.api.stations describes all of it. It stands before the web, and alone in the process for stops
-(`stop_application`).
+It answers e-stop, stop and halt of a station, and whether this path to them works. All other requests are passed to
+the application; evaweb.api.stations documents the requests. It runs in front of the web, and alone in the process for
+stops (`stop_application`).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _UNKNOWN_TOKEN = Pattern(
 )
 _CSRF_CHECK_FAILED = fixed("api.door.csrf_check_failed", "CSRF check Failed")
 _PATH = re.compile(r"/api/v1/stations/([^/]+)/(estop|commands)")
-_LARGEST = 64 * 1024  # bytes of a stop; what is longer is another command, but for a press
+_LARGEST = 64 * 1024  # [bytes] of a stop; longer bodies are other commands, except e-stop presses
 _ASKED = {
     ("POST", "estop"),
     ("POST", "commands"),
@@ -67,13 +67,13 @@ _ASKED = {
     ("OPTIONS", "estop"),
     ("OPTIONS", "commands"),
 }
-_PREFLIGHT = [  # what a browser may send from the web's port to another one, and for how long it need not ask again [s]
+_PREFLIGHT = [  # CORS answer: what pages of the web's port may send to another port, cached for 7200 s
     (b"access-control-allow-methods", b"GET, POST"),
     (b"access-control-allow-headers", b"content-type, x-csrftoken"),
     (b"access-control-max-age", b"7200"),
 ]
 _BUSY = (b"retry-after", b"%d" % RETRY_AFTER_S)
-_MOST_TOKENS = 4  # of one request
+_MOST_TOKENS = 4  # per request
 _STOP_AGAIN = Pattern("api.door.stop_again", "{why}: stop again; the e-stop works")
 _STOPS_ALONE = Pattern(
     "api.door.stops_alone",
@@ -89,7 +89,7 @@ Answered = tuple[int, dict[str, Any]]
 
 
 class Refused(EvaError):
-    """With its HTTP status."""
+    """Refusal with an HTTP status."""
 
     def __init__(self, sentence: str, status: int) -> None:
         super().__init__(sentence)
@@ -97,7 +97,7 @@ class Refused(EvaError):
 
 
 class StopGateway:
-    """An ASGI application in front of another one; `web_port` where it is in a process of its own beside the web's."""
+    """ASGI application for stops in front of another one; `web_port` is set in the separate process for stops."""
 
     def __init__(self, application: Callable[..., Awaitable[Any]], web_port: int | None = None) -> None:
         self._application, self._web_port = application, web_port
@@ -125,7 +125,7 @@ class StopGateway:
         except LookupOverload as fault:
             answered = (503, refusal(_STOP_AGAIN(why=fault)))
             told.append(_BUSY)
-        except Exception as fault:  # whatever it is: who stops must be told
+        except Exception as fault:  # whatever fails, the caller must get an answer
             log.exception("a stop at %s was not answered", scope["path"][:200])
             answered = (500, refusal(f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"))
         if answered is None:
@@ -139,7 +139,7 @@ class StopGateway:
         return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
 
     async def _ready(self, scope: dict[str, Any]) -> Answered:
-        """Make the caller known here: their first press is not their first look-up."""
+        """Return the caller's name, which also caches their credentials, so that a first press needs no lookup."""
         try:
             user = (await _resolve_presser(scope)).username
         except Unverifiable:
@@ -147,7 +147,7 @@ class StopGateway:
         return 200, {"user": user, "alone": self._web_port is not None}
 
     def _told_browsers(self, scope: dict[str, Any]) -> _Headers:
-        """That a page of ours may read the answer, and no other."""
+        """Return the CORS headers that allow only our own pages to read the answer."""
         origin, host = _header(scope, b"origin"), _header(scope, b"host")
         if not _is_known(host) or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
             return [(b"vary", b"origin")]
@@ -158,7 +158,9 @@ class StopGateway:
         ]
 
     def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
-        """A request of the web's own pages at its other port as one of this port's: Django knows of one origin."""
+        """Return the scope with the origin of this port for requests of the web's pages, because Django knows
+        one origin only.
+        """
         host = _header(scope, b"host")
         origin = _header(scope, b"origin")
         if self._web_port is None or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
@@ -169,7 +171,7 @@ class StopGateway:
 
 
 def stop_application(web_port: int) -> StopGateway:
-    """The application of the process for stops, for pages of the web at that port."""
+    """Return the application of the process for stops, for pages of the web at that port."""
     said = refusal(_STOPS_ALONE(port=web_port))
 
     async def nothing_else(scope: dict[str, Any], receive: _Receive, send: Any) -> None:
@@ -179,7 +181,7 @@ def stop_application(web_port: int) -> StopGateway:
 
 
 async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes) -> Answered | None:
-    """Status and answer; None for a command that stops nothing."""
+    """Return status and answer; None for a command that is not a stop."""
     if what == "estop":
         return await _estop(scope, station, _parse_body(body))
     press = pressing.parse_json_press(body, "kind")
@@ -194,7 +196,7 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
     unverified, username, user = "", UNVERIFIED, None
     try:
         login = await _resolve_presser(scope)
-    except (Unverifiable, LookupOverload) as fault:  # no crowd refuses an e-stop
+    except (Unverifiable, LookupOverload) as fault:  # overload must not refuse an e-stop
         unverified = str(fault)
         audit.estop_unverified(station, fault)
     else:
@@ -233,7 +235,13 @@ def _answer_body(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> di
 
 
 async def _resolve_presser(scope: dict[str, Any]) -> Login:
-    """The client that presses, by any credential; raises Refused, Unverifiable, Busy."""
+    """Return the login of the client that presses, by any of its credentials.
+
+    Raises:
+        Refused: If they are missing or unknown.
+        Unverifiable: If the database does not answer.
+        LookupOverload: If this client's share of lookups is used up.
+    """
     found = _credentials(scope)
     login = await credentials.resolve_presser(found, client_key(scope))
     if login is None:
@@ -242,7 +250,12 @@ async def _resolve_presser(scope: dict[str, Any]) -> Login:
 
 
 async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
-    """Kind of credential and login of the client that stops; raises Refused, Busy."""
+    """Return kind of credential and login of the client that stops.
+
+    Raises:
+        Refused: If they are missing, unknown, or cannot be verified.
+        LookupOverload: If this client's share of lookups is used up.
+    """
     found = _credentials(scope)
     try:
         known = await credentials.resolve_stopper(found, client_key(scope))
@@ -261,7 +274,9 @@ def _unknown_credentials(found: list[Credential], scope: dict[str, Any]) -> Refu
 
 
 def _credentials(scope: dict[str, Any]) -> list[Credential]:
-    """Kinds and secrets, tokens first: a proxy's own header, or another program's cookie, hides no session."""
+    """Return (kind, secret) of all credentials, tokens first; a proxy's header or a foreign cookie must not
+    hide a session.
+    """
     found = []
     for header in _headers(scope, b"authorization")[:_MOST_TOKENS]:
         scheme, _, secret = header.strip().partition(" ")
@@ -273,7 +288,7 @@ def _credentials(scope: dict[str, Any]) -> list[Credential]:
 
 
 def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
-    """Of several cookies any is good."""
+    """Check CSRF; of several cookies any valid one is accepted."""
     name = settings.CSRF_COOKIE_NAME
     try:
         for token in cookie_values(_headers(scope, b"cookie"), name)[:MOST] or [""]:
@@ -295,7 +310,7 @@ def _parse_body(body: bytes) -> dict[str, Any]:
 
 
 async def _body(receive: _Receive) -> bytes | None:
-    """The whole of it, which the server has received already; None where the client is gone."""
+    """Return the complete body, which the server has already received; None if the client has disconnected."""
     parts, more = [], True
     while more:
         message = await receive()
@@ -307,7 +322,7 @@ async def _body(receive: _Receive) -> bytes | None:
 
 
 def _replay_body(body: bytes, receive: _Receive) -> _Receive:
-    """Receiver that gives the application the body that was read, and then what comes."""
+    """Return a receiver that repeats the body that was read, then continues with `receive`."""
     first = [{"type": "http.request", "body": body, "more_body": False}]
 
     async def read() -> Any:
@@ -317,9 +332,9 @@ def _replay_body(body: bytes, receive: _Receive) -> _Receive:
 
 
 def _is_known(host: str) -> bool:
-    """Whether the lab is reached by that name: a page of another one, which leads here, is no page of ours.
+    """Return True if `host` is a name of the lab; pages of other names that lead here are not ours.
 
-    A press of the e-stop is refused for no name: whoever may press stops the robot, by whatever way he came.
+    An e-stop is never refused because of the host name.
     """
     return validate_host(split_domain_port(host)[0], settings.ALLOWED_HOSTS)
 

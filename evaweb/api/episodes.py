@@ -1,4 +1,4 @@
-"""Episodes: what the database knows of the recordings."""
+"""Episodes: the database rows of the recordings."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class EpisodeOut(Schema):
 
     @staticmethod
     def of(episode: Episode, sight: Visibility) -> dict[str, Any]:
-        """With the names of its station and its trial."""
+        """Return the episode with the names of its station and its trial."""
         own = [name for name in EpisodeOut.model_fields if name not in ("station", "trial", "result", "tags")]
         trial, hidden = getattr(episode, "trial", None), sight.hides_episode(episode)
         return {
@@ -127,7 +127,7 @@ class EpisodeDetail(EpisodeOut):
 
     @staticmethod
     def of(episode: Episode, sight: Visibility) -> dict[str, Any]:
-        """With all that is known of it."""
+        """Return the episode with all details."""
         hidden = sight.hides_episode(episode)
         return {
             **EpisodeOut.of(episode, sight),

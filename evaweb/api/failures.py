@@ -1,4 +1,4 @@
-"""The lab's words for failures."""
+"""The lab's terms for failures."""
 
 from __future__ import annotations
 

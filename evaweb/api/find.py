@@ -1,4 +1,4 @@
-"""Find anything: what there is, by a few letters."""
+"""Search for anything in the lab by a few letters."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class JobOut(Schema):
 
     @staticmethod
     def of(job: Job, sight: Visibility) -> dict[str, Any]:
-        """As it is, or without what may tell."""
+        """Return the job, without fields that may reveal a hidden checkpoint."""
         own = {name: getattr(job, name) for name in JobOut.model_fields}
         cover = cover_of(job, sight)
         if cover is Cover.NOTHING:

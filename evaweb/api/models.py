@@ -1,4 +1,4 @@
-"""Tokens with which programs use the REST interface."""
+"""Tokens of programs for the REST interface."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from django.db import models
 
 
 class Token(models.Model):
-    """A secret of one user, kept as its SHA-256 alone."""
+    """Secret of one user, stored only as its SHA-256."""
 
     user = models.ForeignKey(settings.AUTH_USER_MODEL, on_delete=models.CASCADE, related_name="api_tokens")
     name = models.CharField(max_length=80, help_text="What uses it.")

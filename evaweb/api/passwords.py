@@ -1,4 +1,4 @@
-"""End of a user's tokens with the password, as Django ends the sessions."""
+"""Revocation of a user's tokens when the password changes, as Django ends sessions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 def _ended(
     sender: Any, instance: User, raw: bool, update_fields: Iterable[str] | None = None, **named: Any
 ) -> None:
-    """Withdraw the tokens of an account whose password changes, or which is switched off."""
+    """Delete the tokens of an account whose password changes, or that is deactivated."""
     fields = {"password", "is_active"} if update_fields is None else set(update_fields)
     if raw or instance.pk is None or not fields & {"password", "is_active"}:
         return
@@ -36,5 +36,5 @@ def _ended(
 
 
 def _hashed_anew(user: User, fields: set[str]) -> bool:
-    """The same password, hashed by Django at a login as it hashes by now."""
+    """Return True if Django only updates the hash of the same password at a login."""
     return fields == {"password"} and user._password is None and user.has_usable_password()

@@ -1,4 +1,4 @@
-"""Plans: what is open, the next trial, the bench before it, and the reveal."""
+"""Plans: open plans, next trial, the bench before a trial, and the reveal."""
 
 from __future__ import annotations
 
@@ -55,9 +55,11 @@ class PlanOut(Schema):
 
     @staticmethod
     def of(plan: Plan, user: Any) -> dict[str, Any]:
-        """As this user may see it."""
+        """Return the plan with this user's visibility."""
         sealed = is_sealed_for(plan, user)
-        before = plan.amends if plan.state == PlanState.DRAFT else None  # it says what its draft says
+        before = (
+            plan.amends if plan.state == PlanState.DRAFT else None
+        )  # a draft has no document that names it yet
         done = plan_progress(plan)
         plain = ("name", "version", "title", "state", "blind", "commitment")
         times = ("frozen_at", "closed_at", "revealed_at")
@@ -172,7 +174,7 @@ class CamerasOut(Schema):
 
     @staticmethod
     def of(check: CameraCheck | None) -> dict[str, Any]:
-        """As it was confirmed."""
+        """Return the confirmation."""
         seen = check.seen if check else {}
         rows = [{"camera": camera, **facts} for camera, facts in seen.items()]
         return {"confirmed": check is not None, "at": check.at if check else None, "cameras": rows}

@@ -1,4 +1,4 @@
-"""Preflights: a checkpoint's server asked without a robot, and what was found."""
+"""Preflights: a checkpoint's server tested without a robot."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PreflightOut(Schema):
 
     @staticmethod
     def of(row: Preflight, user: Any) -> dict[str, Any]:
-        """As this user may see it."""
+        """Return the preflight with this user's visibility."""
         seen = visible_preflight(row, user)
         plain = ("by", "status", "verdict", "asked_at", "ended_at")
         return {

@@ -1,7 +1,7 @@
-"""Validation of the parameters of a question, and of the body of a request.
+"""Validation of query parameters and of request bodies.
 
-An unknown parameter is refused, because a filter that is misspelt filters nothing. A body is measured and read
-when its sender is known, and text that no database and no wire takes is refused before anything is done with it.
+Unknown parameters are refused, because a misspelt filter would have no effect. A body is measured and parsed after its
+sender is known, and texts that database or wire cannot represent are refused first.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ View = Callable[..., Any]
 
 
 class UnknownParameter(EvaError):
-    """The query has a parameter that this address does not have."""
+    """The query has a parameter that the address does not support."""
 
     status = 422
 
 
 def reject_unknown_parameters(view: View) -> View:
-    """Wrap the view of an operation: every parameter of a query has to be known."""
+    """Wrap the view of an operation such that unknown query parameters are refused."""
 
     @wraps(view)
     def asked(request: HttpRequest, *args: Any, **named: Any) -> Any:
@@ -57,7 +57,7 @@ def reject_unknown_parameters(view: View) -> View:
 
 
 def _parameters(view: Any) -> list[str]:
-    """The names of all parameters of the query, in the order of the documentation."""
+    """Return the names of all query parameters in the order of the documentation."""
     models = [model for model in view._ninja_operation.models if model.__ninja_param_source__ == "query"]
     return [name for model in models for name in model.__ninja_flatten_map__]
 
@@ -69,16 +69,23 @@ def _check(given: set[str], known: list[str]) -> None:
 
 
 class TooLong(EvaError):
-    """More than is needed there."""
+    """The body is longer than allowed at this address."""
 
     status = 413
 
 
 class BoundedParser(Parser):
-    """Reads a body when its sender is known; that of a press of the e-stop may be anything."""
+    """Parser that reads a body when its sender is known; the body of an e-stop press may be anything."""
 
     def parse_body(self, request: Any) -> Any:
-        """Value of the JSON body, whose text can be kept; NotAllowed, TooLong, Unreadable, EvaError."""
+        """Return the JSON body, whose texts can be stored.
+
+        Raises:
+            NotAllowed: If the user's role does not allow the request.
+            TooLong: If the body is too long.
+            bounded.UnreadableDocument: If it is not valid JSON, or too complex.
+            EvaError: If a text cannot be stored.
+        """
         pressed = request.path.endswith("/estop")
         if not (request.path.endswith("/commands") and pressing.parse_json_press(request.body, "kind")):
             require_role(request.auth, body_limit_for(request.path).role)
@@ -92,8 +99,8 @@ class BoundedParser(Parser):
 
 
 def _without_unknown(given: Any) -> Any:
-    """The body; of a command that stops the robot without what nobody knows: it is not refused for that."""
-    from evaweb.api.stations import CommandIn  # which is read by this
+    """Return the body; a stop without its unknown fields, because they must not prevent it."""
+    from evaweb.api.stations import CommandIn  # imported here: stations is validated by this module
 
     if not _stops(given):
         return given
@@ -118,7 +125,7 @@ def _read(request: HttpRequest) -> Any:
 
 
 def _iter_strings(given: Any, place: str = "") -> Iterator[tuple[str, str]]:
-    """Every string with where it stands, names of fields as well."""
+    """Yield every string, field names included, with its place."""
     if isinstance(given, str):
         yield place, given
     elif isinstance(given, list):

@@ -1,4 +1,4 @@
-"""Results of plans: every statistic, every attempt, comparisons, second ratings, judgements, preferences."""
+"""Results of plans: statistics, attempts, comparisons, second ratings, judgements, preferences."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class RatingOut(Schema):
 
     @staticmethod
     def of(rating: Rating) -> dict[str, Any]:
-        """Flat."""
+        """Return the rating as a flat row."""
         plain = ("uuid", "success", "score", *FIELDS, "note", "blind", "at")
         return {
             **{name: getattr(rating, name) for name in plain},
@@ -115,7 +115,7 @@ class JudgementOut(Schema):
 
     @staticmethod
     def of(row: Judgement) -> dict[str, Any]:
-        """Flat."""
+        """Return the judgement as a flat row."""
         plain = ("uuid", "judge", "version", "model", "reason", "prompt", "at")
         listed = ("milestones", "pictures")
         return {
@@ -141,7 +141,7 @@ class PreferenceOut(Schema):
 
     @staticmethod
     def of(row: Preference) -> dict[str, Any]:
-        """Flat."""
+        """Return the preference as a flat row."""
         return {
             **{name: getattr(row, name) for name in ("uuid", "outcome", "why", "blind", "at")},
             "first": row.first_id,
@@ -169,7 +169,7 @@ class ScoreRow(Schema):
 
     @staticmethod
     def of(score: Score) -> dict[str, Any]:
-        """Flat."""
+        """Return the score as a flat row."""
         plain = ("uuid", "source", "success", "score", *FIELDS, "note", "reason", "scored_at")
         return {
             **{name: getattr(score, name) for name in plain},
@@ -417,7 +417,7 @@ def planner(request: HttpRequest, asked: Query[PlannerIn]) -> Any:
 
 
 def _seen(request: Any, name: str, version: int, only: TrialFilters) -> tuple[Plan, TrialFilter]:
-    """The plan, of which the user sees results, and which of its trials are meant."""
+    """Return the plan, if the user may see its results, and the filter of its trials."""
     plan = plan_get(name=name, version=version)
     require_visible_results(plan, request.auth)
     given = only.model_dump()

@@ -1,4 +1,4 @@
-"""Quality, verdicts and annotations of episodes, and the next one that waits for a review."""
+"""Quality, verdicts and annotations of episodes, and the next episode to review."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class ReviewOut(Schema):
 
     @staticmethod
     def of(review: Review) -> dict[str, Any]:
-        """With the reviewer's name."""
+        """Return the review with the reviewer's name."""
         plain = ("uuid", "verdict", "note", "frame", "at")
         return {**{name: getattr(review, name) for name in plain}, "reviewer": review.reviewer.get_username()}
 
@@ -86,7 +86,7 @@ class SegmentOut(Schema):
 
     @staticmethod
     def of(segment: Segment) -> dict[str, Any]:
-        """With the annotator's name."""
+        """Return the segment with the annotator's name."""
         plain = ("uuid", "first", "last", "label", "milestone", "at")
         return {
             **{name: getattr(segment, name) for name in plain},

@@ -54,7 +54,7 @@ class SceneOut(Schema):
 
     @staticmethod
     def of(scene: Scene) -> Scene:
-        """As it is."""
+        """Return the row itself, whose fields match."""
         return scene
 
 

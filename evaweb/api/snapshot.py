@@ -1,4 +1,4 @@
-"""The OpenAPI document as text that is the same each time."""
+"""Reproducible text of the OpenAPI document."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ from evaweb.api.api import api
 
 
 def openapi_snapshot() -> str:
-    """Sorted and indented, so that a difference is one that a person can read; of no lab, whose cookie has its name."""
+    """Return the document sorted and indented for readable differences, with a neutral name of the session cookie."""
     said = json.dumps(api.get_openapi_schema(path_prefix="/api/v1/"), indent=1, sort_keys=True) + "\n"
     return said.replace(settings.SESSION_COOKIE_NAME, "eva_session_LAB")

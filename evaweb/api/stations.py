@@ -1,4 +1,4 @@
-"""Stations: their states, lease holders, commands, the e-stop, new trials."""
+"""Stations: states, lease holders, commands, e-stop, new trials."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _REQUEST_MISSING = Pattern(
 
 router = Router(tags=["stations"])
 PageId = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$", description="Made by the page at random")]
-_NAMED = ("trial", "checkpoint", "session", "replay")  # of which each brings its own arguments
+_NAMED = ("trial", "checkpoint", "session", "replay")  # alternatives, each with its own arguments
 HTTP_OF = {
     CommandStatus.ACCEPTED: 200,
     CommandStatus.DONE: 200,
@@ -67,7 +67,7 @@ class RequestOut(Schema):
 
     @staticmethod
     def of(asked: LeaseRequest) -> dict[str, Any]:
-        """With the name of the user."""
+        """Return the request with the user's name."""
         return {"id": asked.pk, "user": asked.user.get_username(), "asked_at": asked.asked_at}
 
 
@@ -82,7 +82,7 @@ class LeaseOut(Schema):
 
     @staticmethod
     def of(station: Station) -> dict[str, Any]:
-        """As the database knows it now."""
+        """Return the lease as the database has it now."""
         lease = selectors.lease_open(station=station)
         return {
             "holder": lease.holder if lease else "",
@@ -106,7 +106,7 @@ class StationOut(Schema):
 
     @staticmethod
     def of(station: Station) -> dict[str, Any]:
-        """With the holder of its lease."""
+        """Return the station with the holder of its lease."""
         plain = ("name", "title", "robot", "simulated", "active", "message")
         return {**{name: getattr(station, name) for name in plain}, "lease": LeaseOut.of(station)}
 
@@ -302,7 +302,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     """Stop the robot now; any logged-in user. To the wire first, without a wait for the row."""
-    # A served lab answers at evaweb.api.door, also where the database does not say who is logged in.
+    # In a served lab evaweb.api.door answers first, even if the database cannot verify the login.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth
     answer = stops.press_estop(

@@ -1,4 +1,4 @@
-"""Rows as a download in the format that was asked for, written as they come."""
+"""Streaming downloads of rows in the requested format."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PARQUET = "application/vnd.apache.parquet"
 def table_response(
     request: HttpRequest, name: str, columns: Mapping[str, Any], pages: Pages, format: Format
 ) -> StreamingHttpResponse:
-    """A download in `format`, csv or parquet; `columns` are the fields with their types."""
+    """Return a download in `format`, csv or parquet; `columns` are the fields with their types."""
     if format == "parquet":
         return download(request, iter_parquet(columns, pages), f"{name}.parquet", PARQUET)
     return csv_response(request, name, list(columns), pages)
@@ -28,5 +28,5 @@ def table_response(
 def csv_response(
     request: HttpRequest, name: str, columns: Sequence[str], pages: Pages
 ) -> StreamingHttpResponse:
-    """A download `name`.csv with a header line, written page by page as they come."""
+    """Return a download `name`.csv with a header line, written page by page."""
     return download(request, iter_csv(columns, pages), f"{name}.csv", CSV)

@@ -1,4 +1,4 @@
-"""Tokens: made and shown once, known afterwards by their SHA-256 alone, and good until a day that is named then."""
+"""Tokens: shown once when created, stored only as SHA-256, with an expiry date."""
 
 from __future__ import annotations
 
@@ -30,14 +30,16 @@ _HAS_TOKEN_NAMED_REVOKE_CHOOSE = Pattern(
     "{user} has a token named {name!r}: revoke it, or choose another name",
 )
 UNKNOWN = "is not known, or its time is over"
-PREFIX = "eva_"  # so that a scanner of secrets knows one when it sees it
+PREFIX = "eva_"  # recognisable by secret scanners
 DAYS, MOST_DAYS = 90, 366
 _LENGTH = len(PREFIX) + 43
-_USED_EVERY = timedelta(minutes=1)  # how exactly `used_at` is kept: not every request is a write
+_USED_EVERY = timedelta(
+    minutes=1
+)  # resolution of `used_at`, so that not every request writes to the database
 
 
 def create_token(*, user: User, name: str, days: int = DAYS) -> str:
-    """A new token of 256 random bits that ends after `days`; the only time that it can be seen."""
+    """Return a new token of 256 random bits that expires after `days`; it cannot be displayed again."""
     name = name.strip()
     if not 0 < len(name) <= 80 or not name.isprintable():
         raise EvaError(_NAME_ALLOWED_1_80_CHARACTERS(name=name))
@@ -54,19 +56,19 @@ def create_token(*, user: User, name: str, days: int = DAYS) -> str:
 
 
 def revoke_tokens(*, user: User, why: str) -> None:
-    """End every token of a user for good."""
+    """Delete every token of a user."""
     for token in Token.objects.filter(user=user):
         token.delete()
         log.info("token %a of %a is withdrawn: %s", token.name, user.get_username(), why)
 
 
 def user_of_token(*, secret: str, ended: bool = False) -> User | None:
-    """The token's user, None where it is unknown, or its user may not log in.
+    """Return the token's user; None if it is unknown or expired, or the user is deactivated.
 
-    One whose time is over is unknown, unless `ended`: a stop of a robot is not asked for the date.
+    With `ended` expired tokens are accepted too: stopping a robot must not fail because of a date.
     """
     if not ended and (len(secret) != _LENGTH or not secret.startswith(PREFIX)):
-        return None  # no question to the database
+        return None  # no database query for other formats
     found = Token.objects.select_related("user").filter(digest=digest(secret), user__is_active=True).first()
     if found is None or (found.ends_at <= timezone.now() and not ended):
         return None
@@ -76,7 +78,7 @@ def user_of_token(*, secret: str, ended: bool = False) -> User | None:
 
 
 def _note_use(token: Token) -> None:
-    """Any caller may want to stop a robot: none is kept waiting while the database is locked."""
+    """Record the use of a token without waiting for a locked database, because the caller may want to stop a robot."""
     now = timezone.now()
     if token.used_at is not None and now - token.used_at <= _USED_EVERY:
         return

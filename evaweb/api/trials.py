@@ -1,4 +1,4 @@
-"""Trials: the list, one, and what is done with one."""
+"""Trials: list, details and operations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Filters(Schema):
     since: Annotated[str, Field(description="Prepared on or after this day or time, ISO 8601")] = ""
 
     def chosen(self) -> TrialFilters:
-        """As the selectors take them."""
+        """Return the filters as the selectors use them."""
         return TrialFilters(**self.model_dump())
 
 
@@ -53,7 +53,7 @@ class TrialOut(_Columns):
 
     @staticmethod
     def of(trial: Trial, sight: Visibility) -> dict[str, Any]:
-        """Flat, the same for JSON and CSV."""
+        """Return the trial as a flat row, the same for JSON and CSV."""
         return visible_columns(trial, sight, _LIST)
 
 
@@ -85,7 +85,7 @@ class ScoreOut(Schema):
 
     @staticmethod
     def of(score: Score) -> dict[str, Any]:
-        """With its milestones."""
+        """Return the score with its milestones."""
         plain = ("uuid", "source", "success", "score", "note", *FIELDS, "reason", "scored_at")
         return {
             **{name: getattr(score, name) for name in plain},
@@ -108,7 +108,7 @@ class VoidRequestOut(Schema):
 
     @staticmethod
     def of(row: VoidRequest) -> dict[str, Any]:
-        """With the names of both."""
+        """Return the request with the names of both users."""
         plain = ("uuid", "reason", "at", "answer", "answer_reason", "answered_at")
         return {
             **{name: getattr(row, name) for name in plain},
@@ -131,7 +131,7 @@ class TrialDetail(_Detail):
 
     @staticmethod
     def of(trial: Trial, sight: Visibility) -> dict[str, Any]:
-        """With all that is known of it."""
+        """Return the trial with all details."""
         scores = [ScoreOut.of(score) for score in trial.scores.all()]
         asked = [VoidRequestOut.of(row) for row in trial.void_requests.all()]
         return {**visible_columns(trial, sight, (*_LIST, *_DETAIL)), "scores": scores, "void_requests": asked}

@@ -1,4 +1,4 @@
-"""Addresses of the REST interface; it judges credentials itself, and never redirects to a login page."""
+"""URL patterns of the REST interface; it checks credentials itself and never redirects to a login page."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from evaweb import refusals
 from evaweb.api.api import api
 
 
-@csrf_exempt  # it changes nothing, and its answer is the truer one
+@csrf_exempt  # it changes nothing, and 404 is the more accurate answer
 def nowhere(request: HttpRequest, rest: str) -> JsonResponse:
-    """Answer at an unknown address of the interface, in the form of all its answers."""
+    """Answer 404 at an unknown address, in the format of all answers."""
     return JsonResponse({"error": refusals.unknown_address_sentence(request.path)}, status=404)
 
 

@@ -1,1 +1,1 @@
-"""The live page: what it shows and what it asks."""
+"""Live page of a station: its contents, its live socket, and the web processes that serve it."""

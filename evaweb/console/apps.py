@@ -1,14 +1,14 @@
-"""Registers the app."""
+"""Django configuration of the app."""
 
 from django.apps import AppConfig
 
 
 class ConsoleConfig(AppConfig):
-    """The live page: what it shows and what it asks."""
+    """Live page of a station, and its live socket."""
 
     name = "evaweb.console"
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        """Register the checks."""
+        """Register the system checks."""
         from evaweb.console import checks  # noqa: F401

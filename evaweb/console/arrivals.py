@@ -1,7 +1,7 @@
-"""Connections that have not sent a whole request yet, or wait for their next: so many, and not for ever.
+"""Limits for connections that have not sent a whole request yet, or wait for their next one.
 
-Where there are too many the oldest are closed, never the newest: a client that sends its request at once gets in,
-whatever else comes from the same address.
+If there are too many, the oldest are closed, never the newest: a client that sends its request at once is served,
+however many idle connections come from the same address.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from evaweb.console.channel import Channel, is_stop
 from evaweb.console.turns import TurnScheduler
 
 events: Any = reactor
-WHOLE_REQUEST_S = 15.0  # in which a connection sends its first request
-NEXT_REQUEST_S = 75.0  # in which it sends another one; Twisted itself closes one that says nothing for 60 s
+WHOLE_REQUEST_S = 15.0  # limit for the first request of a connection
+NEXT_REQUEST_S = 75.0  # limit for each further request; Twisted itself closes an idle connection after 60 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,18 +37,20 @@ class _Waiting:
 
 
 class ConnectionLimiter:
-    """At most `most` that wait, and `most_of_one` of one address; belongs to the event loop."""
+    """Limiter of waiting connections: at most `most` in all, and `most_of_one` per address. For the event loop only."""
 
     def __init__(self, most: int, most_of_one: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._most, self._most_of_one, self._clock = most, most_of_one, clock
-        self._all: OrderedDict[int, _Waiting] = OrderedDict()  # the oldest first
+        self._all: OrderedDict[int, _Waiting] = OrderedDict()  # oldest first
         self._of: dict[str, OrderedDict[int, None]] = {}
 
     def __len__(self) -> int:
         return len(self._all)
 
     def add(self, key: int, peer: str, seconds: float, close: Callable[[], object]) -> None:
-        """It has so long; `close` ends it."""
+        """Add a connection that may wait for `seconds` [s]; `close` ends it. The oldest are closed if a limit
+        is exceeded.
+        """
         self.remove(key)
         self._all[key] = _Waiting(peer, self._clock() + seconds, close)
         of_one = self._of.setdefault(peer, OrderedDict())
@@ -59,7 +61,7 @@ class ConnectionLimiter:
             self._end(next(iter(self._all)))
 
     def remove(self, key: int) -> None:
-        """It has sent a request, or was closed."""
+        """Remove a connection that has sent a request or was closed."""
         found = self._all.pop(key, None)
         if found is None:
             return
@@ -69,7 +71,7 @@ class ConnectionLimiter:
             del self._of[found.peer]
 
     def close_expired(self) -> None:
-        """End those whose time is over."""
+        """Close the connections whose time is up."""
         now = self._clock()
         for key in [key for key, waiting in self._all.items() if waiting.until <= now]:
             self._end(key)
@@ -81,13 +83,13 @@ class ConnectionLimiter:
 
 
 class Request(BoundedRequest):
-    """One that tells its connection when it is whole, or need not be soon, and when it is answered."""
+    """Request that reports to its connection when it is complete, or may take longer, and when it was answered."""
 
     def admitted(self) -> None:
         self.channel.transport.sent()
 
     def process(self) -> None:
-        """It is whole: what stops is done at once, all else in its turn."""
+        """Process the complete request: stops at once, everything else in its turn of the event loop."""
         self.channel.transport.sent()
         if is_stop(self.path):
             super().process()
@@ -105,7 +107,7 @@ class Request(BoundedRequest):
 
 
 class StopRequest(Request):
-    """One to the process for stops: no long body, no websocket."""
+    """Request to the process for stops: without a long body and without websockets."""
 
     bound_of = staticmethod(stop_bound_of)
 
@@ -124,11 +126,11 @@ class _Connection(ProtocolWrapper):
         super().connectionLost(reason)
 
     def sent(self) -> None:
-        """A whole request is here, or one whose sender is known."""
+        """Stop limiting the connection: a whole request has arrived, or its sender is known."""
         self.factory.arrivals.remove(id(self))
 
     def answered(self) -> None:
-        """The next one may come over it."""
+        """Wait for the next request on this connection."""
         self._wait(NEXT_REQUEST_S, self.transport.loseConnection)
 
     def _wait(self, seconds: float, close: Callable[[], object]) -> None:
@@ -136,7 +138,7 @@ class _Connection(ProtocolWrapper):
 
 
 class LimitedFactory(WrappingFactory):
-    """Daphne's connections, looked after by `arrivals`."""
+    """Factory of Daphne's connections that registers each with `arrivals`."""
 
     protocol = _Connection
     noisy = False

@@ -1,4 +1,4 @@
-"""Sight of the users whose pages are open, as the database knows it now."""
+"""Current visibilities of the users with open pages, from the database."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ log = logging.getLogger(__name__)
 
 
 async def current_visibilities(users: Mapping[int, Any]) -> dict[int, Visibility]:
-    """By the user's id; empty where the database does not answer: it takes no trial either that would hide more."""
+    """Return the visibility by user id; {} if the database does not answer.
+
+    The visibilities known before then remain valid, because nothing new can become hidden: that would need a new
+    trial, which the database does not accept either.
+    """
     try:
         return await database_sync_to_async(_found, thread_sensitive=False)(users)
     except Error as error:

@@ -1,7 +1,7 @@
-"""Bounds of a request's body, before a view has looked at the request.
+"""Limits of request bodies, enforced before a view is called.
 
-Twisted hands a request to daphne, and daphne to Django, when its body is here whole: a view can no longer refuse to
-read it. So what is too long is refused by its headers, or when it has become too long, and never kept.
+Twisted passes a request to Daphne, and Daphne to Django, after the whole body has arrived: too late for a view to
+refuse it. So a long body is refused because of its headers, or as soon as it exceeds the limit, and never stored.
 """
 
 from __future__ import annotations
@@ -30,21 +30,24 @@ from evaweb.roles import Role
 from runtime.ipc import estop_requests as pressing
 
 log = logging.getLogger(__name__)
-ANONYMOUS_LIMIT = 64 * 1024  # a login, or a press of the e-stop
-USER_LIMIT = 2 * 1024 * 1024  # a form; what REST takes is in evaweb.posts
-_UPLOADS = {b"/admin/plans/plan/import/": LARGEST + ANONYMOUS_LIMIT}  # files, from administrators
+ANONYMOUS_LIMIT = 64 * 1024  # [bytes] a login, or an e-stop press
+USER_LIMIT = 2 * 1024 * 1024  # [bytes] a form; for REST see `body_limit_for`
+_UPLOADS = {b"/admin/plans/plan/import/": LARGEST + ANONYMOUS_LIMIT}  # files from administrators
 _ESTOP = re.compile(rb"/api/v1/stations/[^/]+/estop")
 _REST = b"/api/"
-_LINGER_S = 5.0  # for which a client that goes on sending is heard, so that it reads the answer
+_LINGER_S = (
+    5.0  # time in which a refused client's further data is read and discarded, so that it reads the answer
+)
 
 
 @dataclass(frozen=True, slots=True)
 class BodyBound:
-    """Largest body [bytes], and the answer to a longer one; status 0: it is left out, the request goes on.
+    """Limit of a request body [bytes], and the refusal of a longer one; with status 0 the body is dropped and the
+    request continues.
 
-    What is longer than `sure` is let in only where the first session of `keys` is an administrator's. Where it
-    `may_press`, the first `largest` bytes of what is longer decide whether it is a press of the e-stop, of which the
-    rest is left out.
+    A body longer than `sure` is accepted only if the first session of `keys` with a user is an administrator's. With
+    `may_press`, the first `largest` bytes of a longer body decide whether it is an e-stop press, whose remaining body
+    is dropped.
     """
 
     largest: int
@@ -56,7 +59,7 @@ class BodyBound:
 
 
 def body_bound(path: bytes, cookies: Iterable[bytes], authorized: bool) -> BodyBound:
-    """For a request with these headers, of known length; whether its session or token is good is not known yet."""
+    """Return the bound for a request with these headers; the validity of its session or token is not checked yet."""
     if _ESTOP.fullmatch(path):
         return BodyBound(ANONYMOUS_LIMIT, 0, "", ANONYMOUS_LIMIT)
     keys = tuple(session_keys(cookie.decode("latin-1") for cookie in cookies))
@@ -70,7 +73,7 @@ def body_bound(path: bytes, cookies: Iterable[bytes], authorized: bool) -> BodyB
 
 
 def stop_bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> BodyBound:
-    """The same in the process for stops, which has no long ones."""
+    """Return the bound for a request to the process for stops, which accepts no long bodies."""
     if is_stop(path):
         return body_bound(path, (), True)
     return BodyBound(
@@ -79,9 +82,10 @@ def stop_bound_of(path: bytes, cookies: Iterable[bytes], authorized: bool) -> Bo
 
 
 class BoundedRequest(WebRequest):
-    """A request of daphne's that takes no more of its body than is allowed.
+    """Daphne's request, with a limit on its body.
 
-    An e-stop whose sender dies before the end of it is pressed: where and by whom was said whole.
+    An e-stop is also executed if the connection is lost before the end of its body: station and credentials are in the
+    headers.
     """
 
     bound_of = staticmethod(body_bound)
@@ -91,11 +95,13 @@ class BoundedRequest(WebRequest):
     _over = False
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        """As daphne makes it; Twisted would refuse forms that it cannot read, which is for the address to say."""
+        """Create the request without Twisted's parsing of forms, which would refuse unreadable forms before
+        the view can.
+        """
         super().__init__(*given, parsePOSTFormSubmission=False, **named)
 
     def gotLength(self, length: int | None) -> None:
-        """The headers are here."""
+        """Check the length after the headers have arrived."""
         self._path = unquote_to_bytes(self.channel._path.partition(b"?")[0])
         headers = self.requestHeaders
         cookies = headers.getRawHeaders(b"cookie", [])
@@ -109,7 +115,7 @@ class BoundedRequest(WebRequest):
             self._look_up_sender(bound.keys)
 
     def handleContentChunk(self, data: bytes) -> None:
-        """Some of the body."""
+        """Receive a part of the body."""
         room = self._bound.largest - self._got
         self._got += len(data)
         if self._over:
@@ -120,19 +126,19 @@ class BoundedRequest(WebRequest):
             self._too_long()
 
     def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:
-        """All of it; to one that was refused there is nothing more to say."""
+        """Process the complete request, unless it was refused already."""
         self._whole = True
         if not (self._over and self._bound.status):
             super().requestReceived(command, path, version)
 
     def basic_error(self, status: int, status_text: bytes, body: str) -> None:
-        """Send daphne's own answers: to odd headers and addresses, and to faults."""
+        """Send Daphne's own answers, to invalid headers and addresses and after faults, in our format."""
         headers, said = refusal(status, body, self.path or b"")
         self.handle_reply({"type": "http.response.start", "status": status, "headers": headers})
         self.handle_reply({"type": "http.response.body", "body": said})
 
     def connectionLost(self, reason: object) -> None:
-        """No more of it comes."""
+        """Handle a lost connection; an e-stop whose headers are complete is still processed."""
         headed = not self._whole and hasattr(self, "_bound")
         presses = headed and (_ESTOP.fullmatch(self._path) or (self._over and not self._bound.status))
         if presses and self.channel._command == b"POST":
@@ -140,7 +146,7 @@ class BoundedRequest(WebRequest):
         super().connectionLost(reason)
 
     def admitted(self) -> None:
-        """A long body of a client that may send it: it takes its time."""
+        """Called when a client was granted a long body, which may take time to arrive."""
 
     def _too_long(self) -> None:
         if self._bound.may_press:
@@ -160,7 +166,7 @@ class BoundedRequest(WebRequest):
             self._refuse(self.channel.transport)
 
     def _look_up_sender(self, keys: tuple[str, ...]) -> None:
-        """Read nothing more until the database has said whose session it is."""
+        """Pause reading until the database has named the user of the session."""
         self.channel.transport.pauseProducing()
         deferToThread(_role, keys).addCallback(self._known).addErrback(self._unknown)
 

@@ -1,7 +1,7 @@
-"""Changes of a station's rows in the database, by whichever process.
+"""Detection of changes in a station's database rows, whichever process made them.
 
-Each web process looks once a second while a viewer watches: the worker and other processes are heard this way
-without anything between them but the database.
+Each web process polls once per second while a page is open. This needs no message channel to workers and other
+processes except the database.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ChangeMarks = dict[str, Any]
 
 
 async def read_marks(station: str) -> ChangeMarks | None:
-    """The marks of the station now; None where the database does not answer: nothing live depends on it."""
+    """Return the station's current marks, or None if the database does not answer: nothing live depends on it."""
     try:
         return await database_sync_to_async(change_marks, thread_sensitive=False)(station)
     except Error as error:
@@ -33,12 +33,12 @@ async def read_marks(station: str) -> ChangeMarks | None:
 
 
 def changed_names(before: ChangeMarks, now: ChangeMarks) -> list[str]:
-    """The names of what has another mark."""
+    """Return the names of entries whose marks differ."""
     return sorted(name for name in now if now[name] != before.get(name))
 
 
 def change_marks(station: str) -> ChangeMarks:
-    """Marks that differ after every change, by what it is about."""
+    """Return one mark per topic that differs after every change of its rows."""
     here = Q(station__name=station)
     return {
         "lease": (

@@ -1,4 +1,4 @@
-"""Refusals before Django hears of a request, in Django's form: JSON, or the page of the lab."""
+"""Refusals of requests before Django is involved, in Django's format: JSON, or an HTML page."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ from evaweb.headers import DEFAULT_HEADERS, PLAIN_PAGE
 
 _REST = b"/api/"
 _STOPS = re.compile(rb"/api/v1/stations/[^/]+/(estop|commands)")
-_HEADERS_OF_A_STOP = 80 * 1024  # bytes: other programs of the host may have a browser send 64 KiB of cookies
+_HEADERS_OF_A_STOP = (
+    80 * 1024
+)  # [bytes] other programs on the same host may make a browser send 64 KiB of cookies
 Headers = list[tuple[bytes, bytes]]
 
 
 def is_stop(path: bytes) -> bool:
-    """True if a request to that address may stop a robot."""
+    """Return True if a request to that address may stop a robot."""
     return _STOPS.fullmatch(path) is not None
 
 
 def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
-    """Headers and body for a request to `path`."""
+    """Return headers and body of a refusal of a request to `path`."""
     if path.startswith(_REST):
         kind, body, policy = "application/json", json.dumps({"error": sentence}), {}
     else:
@@ -45,7 +47,7 @@ def refusal(status: int, sentence: str, path: bytes) -> tuple[Headers, bytes]:
 
 
 def raw_refusal(status: int, sentence: str, path: bytes) -> bytes:
-    """The same as it goes over a connection that ends with it."""
+    """Return the refusal as bytes of an HTTP response that closes its connection."""
     headers, said = refusal(status, sentence, path)
     lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}".encode()]
     lines += [name.title() + b": " + value for name, value in headers]
@@ -53,22 +55,24 @@ def raw_refusal(status: int, sentence: str, path: bytes) -> bytes:
 
 
 class Channel(HTTPChannel):  # type: ignore[misc]
-    """Twisted's, which ends a connection without a word where a line is too long, and says nothing of other faults."""
+    """Twisted's HTTP channel with an answer to every malformed request; Twisted would close without one, or
+    give no reason.
+    """
 
     def lineReceived(self, line: bytes) -> None:
-        """The address, or a header."""
+        """Receive the request line or a header; requests that may stop a robot may have longer headers."""
         is_first = not self._receivedHeaderSize
         super().lineReceived(line)
         if is_first and is_stop(unquote_to_bytes(getattr(self, "_path", b"").partition(b"?")[0])):
             self.MAX_LENGTH = self.totalHeadersSize = _HEADERS_OF_A_STOP
 
     def allContentReceived(self) -> None:
-        """The request is over; the next one has an address of its own."""
+        """Restore the default limits for the next request of the connection."""
         super().allContentReceived()
         self.MAX_LENGTH, self.totalHeadersSize = Channel.MAX_LENGTH, Channel.totalHeadersSize
 
     def lineLengthExceeded(self, line: bytes) -> None:
-        """The address, or one header."""
+        """Refuse a request line or a header that is too long."""
         if self._receivedHeaderSize:
             self._refuse(431, f"a header is too long; allowed: {self.MAX_LENGTH} bytes", self._path)
         else:

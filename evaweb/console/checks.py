@@ -1,4 +1,4 @@
-"""Scripts that the pages need beside Python, looked for when a process starts."""
+"""System check for the third-party scripts of the pages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _WANTED = {"uplot/uPlot.esm.js": "curves", "meshcat/main.min.js": "the 3D scene"
 
 @register()
 def check_third_party_scripts(**options: Any) -> list[CheckMessage]:
-    """The scripts of others are where they are served from."""
+    """Warn if a third-party script is not found among the static files."""
     return [
         Warning(
             f"{script} is absent: pages are shown without {what}",

@@ -1,4 +1,4 @@
-"""A chunk of actions as the scene shows it: dots for every row, whole robots for some of a proposed one."""
+"""Encoding of a chunk for the 3D scene: fingertips of every row, and whole robots for some rows of a proposed chunk."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from evaweb.console import parts
 from evaweb.console.parts import EncodedPart
 from evaweb.stations.robot_geometry import DrawnRobot
 
-GHOSTS = 12  # whole robots at most; the page moves the ghost on between them
+GHOSTS = 12  # greatest number of whole robots; the page animates one between them
 _WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap", "ik")
 
 
 def encode_chunk(content: Mapping[str, Any], looks: DrawnRobot | None, now: float) -> EncodedPart:
-    """Stream `chunk` of the runtime for pages; {"chunk": 0} where there is none any more.
+    """Return stream `chunk` for pages; {"chunk": 0} if there is none.
 
-    Beside the runtime's own words: `targets` [H], the step each row is for (-1: it is not executed), and
-    `ghost_rows` [N], the rows that are drawn as robots. Arrays: `tips` float32 [H, arms, 3], where each row
-    takes the fingertips [m, world]; `ghost` float32 [N, P, 16], of a proposed chunk alone. Neither is there
-    where the robot is not drawn.
+    In addition to the station's own keys: `targets` [H], the step of each row (-1: not executed), and `ghost_rows`
+    [N], the rows drawn as robots. Arrays: `tips` float32 [H, arms, 3], fingertip positions of each row [m, world];
+    `ghost` float32 [N, P, 16], only of a proposed chunk. Both are omitted if the robot is not drawn.
     """
     words: dict[str, Any] = {key: content[key] for key in _WORDS if key in content}
     rows = np.asarray(content.get("rows", np.empty((0, 0))), np.float64)

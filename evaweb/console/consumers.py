@@ -1,9 +1,9 @@
-"""The live socket of a page on a station.
+"""Live socket of a page at a station.
 
-Watching needs the database once, when the socket opens. Renewing a lease and stopping never do: they have
-threads of their own, and go straight to the runtime; what stops is obeyed even before the database has named
-the user. Beside them the login is looked at every few seconds: a user who has logged out, or is no operator any more,
-keeps no lease.
+Watching needs the database once, when the socket opens. Renewing a lease and stopping never need it: they have their
+own threads and go directly to the runtime, and stops are obeyed even before the database has named the user. In
+parallel the login is checked every few seconds: a user who has logged out, or is no longer an operator, loses the
+lease.
 """
 
 from __future__ import annotations
@@ -43,25 +43,27 @@ from runtime.core.sentences import Pattern, identity
 from runtime.ipc.messages import Ack
 
 log = logging.getLogger(__name__)
-# Codes of a closed socket, after those of HTTP. After NEW_ROLE a page may come again at once.
+# Close codes of the socket, modelled on HTTP status codes. After NEW_ROLE a page may reconnect at once.
 BAD_REQUEST, NO_LOGIN, NEW_ROLE, NO_STATION, TOO_MUCH = 4400, 4401, 4403, 4404, 4429
 _MOST_ERRORS = 20
-_MOST_EARLY = 50  # messages that wait until the database has said who is there
-_LOGIN_S = 5.0  # how often the login is looked at
-_AGAIN_S = 1.0  # after which a database that did not answer is asked again
-_renewals: RequestCoalescer[Ack] = RequestCoalescer("renew", most=32)  # of one station, which may hang
+_MOST_EARLY = 50  # messages queued until the database has named the user
+_LOGIN_S = 5.0  # period of checking the login
+_AGAIN_S = 1.0  # retry delay after a failed query
+_renewals: RequestCoalescer[Ack] = RequestCoalescer(
+    "renew", most=32
+)  # limited per station, because a station may hang
 _LOGIN_UNKNOWN = Pattern(
     "console.login_unknown",
     "the database has not said for {seconds:.0f} s whose login this is; stopping works",
 )
 _NOT_SAID = _LOGIN_UNKNOWN(seconds=COUNTS_S)
-_under_way: set[asyncio.Task[None]] = set()  # they go on when the page is closed
+_under_way: set[asyncio.Task[None]] = set()  # tasks that continue after the page is closed
 
 
 class StationConsumer(AsyncWebsocketConsumer):
-    """One page at one station."""
+    """Live socket of one page at one station."""
 
-    # Nothing goes through the channel layer: live pages outlast the loss of Redis.
+    # No channel layer, so that live pages survive the loss of Redis.
     channel_layer_alias = ""
 
     def __init__(self) -> None:
@@ -73,14 +75,14 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._aims: AimQueries | None = None
         self._renewing = self._admitted = False
         self._errors = 0
-        self._sessions: list[str] = []  # of which one may be the login's
-        self._session = ""  # the key of the login; empty where the page has no business here
+        self._sessions: list[str] = []  # session keys of the request's cookies; at most one is the login's
+        self._session = ""  # session key of the login; empty if the page was rejected
         self._cameras: Collection[str] = ()
         self._early: list[str] = []
         self._quota, self._over = MessageQuota(), False
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        """Serve the page until it is gone, however that comes about."""
+        """Serve the page until its socket is closed, then cancel its tasks and leave the room."""
         try:
             await super().__call__(scope, receive, send)
         finally:
@@ -89,15 +91,19 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._leave()
 
     async def dispatch(self, message: dict[str, Any]) -> None:
-        """Channels would first close old connections to the database, in a thread that may be waiting for it."""
+        """Dispatch without Channels' closing of old database connections, whose thread may be waiting for the
+        database.
+        """
         if message["type"] == "websocket.receive":
             await self.websocket_receive(message)
-            await asyncio.sleep(0)  # one that floods lets all others have their turn
+            await asyncio.sleep(0)  # lets other connections run if this one floods
         else:
             await super().dispatch(message)
 
     async def connect(self) -> None:
-        """Accept, and close again with a code where the page has no business here: a browser sees no other."""
+        """Accept the socket, and close it with a code if the page is not allowed: browsers report only codes
+        sent after accepting.
+        """
         await self.accept()
         said = (value.decode("latin-1") for name, value in self.scope["headers"] if name == b"cookie")
         self._sessions = session_keys(said)
@@ -118,7 +124,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._keep(self._admit())
 
     async def _admit(self) -> None:
-        """Ask the database for the user until it answers; what stops is obeyed meanwhile."""
+        """Query the user until the database answers; stops are obeyed meanwhile."""
         admitted = None
         while admitted is None:
             try:
@@ -146,7 +152,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             await self.receive(text)
 
     def _keep(self, work: Coroutine[Any, Any, None]) -> None:
-        """Go on with it as long as the page is there."""
+        """Run a task until the page is closed."""
         self._tasks.append(asyncio.create_task(work))
         self._tasks[-1].add_done_callback(_finished)
 
@@ -155,13 +161,13 @@ class StationConsumer(AsyncWebsocketConsumer):
         await self.close(code, reason)
 
     def _leave(self) -> None:
-        """Show nothing more, and hear nothing."""
+        """Leave the room: no more streams for this page."""
         if self._room is not None and self._mailbox is not None:
             self._room.leave(self._mailbox)
         self._mailbox = None
 
     async def _follow_login(self, role: Role) -> None:
-        """Close the socket when the user is logged out or has another role; a database that is away changes nothing."""
+        """Close the socket when the user is logged out or has another role; database failures are ignored."""
         now: Role | None = role
         while now is role:
             await asyncio.sleep(_LOGIN_S)
@@ -176,7 +182,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             await self.close(NEW_ROLE, f"you are {now.with_article} now")
 
     async def receive(self, text_data: str | None = None, bytes_data: bytes | None = None) -> None:
-        """One message of the page."""
+        """Handle one message of the page."""
         text = text_data or _decode_binary(bytes_data or b"")
         if not self._session or (self._over and not requests.looks_like_stop(text)):
             return
@@ -189,7 +195,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._mailbox.mark_read()
             await self._handle(request)
         elif isinstance(request, Renew) and not self._admitted and self._counted is not None:
-            self._keep_lease(request)  # the page was loaded anew while the database is away
+            self._keep_lease(request)  # the page was reloaded while the database is unavailable
         elif len(self._early) < _MOST_EARLY:
             self._early.append(text)
 
@@ -204,7 +210,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             return error
 
     async def _close_flooded(self) -> None:
-        """Say so once, and close; what stops is obeyed to the last."""
+        """Report the flood once and close the socket; stops are obeyed until it is closed."""
         if not self._over:
             self._over = True
             self._leave()
@@ -235,16 +241,18 @@ class StationConsumer(AsyncWebsocketConsumer):
             _go_on(self._aims.answer())
 
     def _keep_lease(self, request: Renew) -> None:
-        """Renew the lease if the database has named the user within the last minute; it may be away since."""
+        """Renew the lease if the database has confirmed the user within the last minute, even if it is
+        unavailable now.
+        """
         login = self._counted
         if login is None:
             self._send_text({"type": "renewed", "ok": False, "lost": False, **reasoned(_NOT_SAID)})
-        elif not self._renewing:  # else the one before has no answer yet
+        elif not self._renewing:  # else the previous renewal is still unanswered
             self._renewing = True
             _go_on(self._renew(request, login.username))
 
     async def _renew(self, request: Renew, username: str) -> None:
-        """Pass the page's sign of life on; `lost`: the runtime says that the lease has ended."""
+        """Forward the page's heartbeat to the runtime; `lost` in the answer means that the lease has ended."""
         renew = partial(
             leases.renew,
             username=username,
@@ -284,7 +292,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         self._outbox.put_nowait(_as_text(message))
 
     async def _write(self) -> None:
-        """Send what is in the outbox, in order."""
+        """Send the messages of the outbox in order."""
         while True:
             message = await self._outbox.get()
             if isinstance(message, str):
@@ -294,18 +302,18 @@ class StationConsumer(AsyncWebsocketConsumer):
 
 
 class UnknownAddressConsumer(AsyncWebsocketConsumer):
-    """Consumer at unknown addresses of the live sockets."""
+    """Consumer for unknown addresses of live sockets."""
 
     channel_layer_alias = ""
 
     async def connect(self) -> None:
-        """Accept, and close again with a code."""
+        """Accept, and close with a code."""
         await self.accept()
         await self.close(NO_STATION, "there is nothing at this address")
 
 
 def _short(reason: str) -> str:
-    """As much of it as a closed socket may say: 123 bytes."""
+    """Return `reason` truncated to the 123 bytes that a close frame may carry."""
     return reason.encode("utf-8", "replace")[:123].decode("utf-8", "ignore")
 
 
@@ -313,7 +321,13 @@ _Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Visibility]
 
 
 def _admitted(name: str, sessions: list[str]) -> _Admitted:
-    """The session, its user and their sight of the station; an unknown user is shown nothing. NotFound."""
+    """Return session, user, station, role, robot description and visibility of the first session with a user.
+
+    Without a user, the session is "" and nothing may be shown.
+
+    Raises:
+        NotFound: If the station does not exist.
+    """
     for session in sessions:
         user = credentials.look_up(SESSION, session)
         if user is not None:
@@ -330,7 +344,7 @@ def _admitted(name: str, sessions: list[str]) -> _Admitted:
 
 
 def _decode_binary(message: bytes) -> str:
-    """Text of a binary message, which is no page's way and may be a press."""
+    """Return the text of a binary message: our pages send none, but it may be an e-stop press."""
     return message.decode(json.detect_encoding(message), "replace")
 
 
@@ -339,12 +353,12 @@ def _as_text(message: dict[str, Any]) -> str:
 
 
 async def _in_database(work: Any, *arguments: Any, **named: Any) -> Any:
-    """In a thread of its own: one that waits for the database must not keep others from it."""
+    """Run `work` in its own thread, so that a slow query does not block others."""
     return await database_sync_to_async(work, thread_sensitive=False)(*arguments, **named)
 
 
 def _go_on(work: Coroutine[Any, Any, None]) -> None:
-    """Do it beside what the page says next, to its end."""
+    """Run a task to its end in parallel to further messages, also if the page is closed."""
     task = asyncio.create_task(work)
     _under_way.add(task)
     task.add_done_callback(_finished)

@@ -1,4 +1,4 @@
-"""Parts of frames, encoded from what a station publishes: once for all viewers, in the feed's own threads."""
+"""Encoding of a station's messages into parts of frames: once for all viewers, in the feed's threads."""
 
 from __future__ import annotations
 
@@ -19,24 +19,30 @@ from evaweb.stations import redaction as veil
 from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot
 
 log = logging.getLogger(__name__)
-_VECTORS = ("measured", "raw", "planned", "commanded", "simulated")  # of the joints, as the runtime has them
+_VECTORS = (
+    "measured",
+    "raw",
+    "planned",
+    "commanded",
+    "simulated",
+)  # joint vectors of a sample, by the runtime's names
 
 
 class StreamEncoder:
-    """Makes parts of what a feed tells; `looks` is the robot as the station has it, None where it is not drawn.
+    """Encoder of feed messages into parts; `looks` is the robot with the station's groups, None if it is not drawn.
 
-    `veiled`: for users from whom the policy is hidden; snapshots come to it covered already.
+    With `veiled` the parts are for users from whom the policy is hidden; the snapshots must already be redacted.
     """
 
     def __init__(self, robot: str, *, veiled: bool = False) -> None:
         self._robot = robot
         self._veiled = veiled
-        self._groups: tuple[str, ...] | None = None  # None: nobody has said yet
+        self._groups: tuple[str, ...] | None = None  # None: not known yet
         self.looks = _looks(robot, None)
         self._recent = RecentSamples()
 
     def encode(self, stream: str, content: Any) -> list[EncodedPart]:
-        """The parts that `content` of a stream is shown as."""
+        """Return the parts that represent a message of `stream`."""
         now = time.monotonic()
         if stream == "state":
             self._update_robot(content.get("facts"))
@@ -54,7 +60,7 @@ class StreamEncoder:
         return []
 
     def _update_robot(self, facts: Any) -> None:
-        """The robot is drawn with the groups that the station says it has."""
+        """Draw the robot with the groups that the station reports."""
         groups = facts.get("groups") if isinstance(facts, Mapping) else None
         if groups and tuple(groups) != self._groups:
             self._groups = tuple(groups)
@@ -75,9 +81,9 @@ class StreamEncoder:
 
 
 def shown_rows(vectors: Mapping[str, NDArray[Any]], *, engaged: bool) -> NDArray[np.float32]:
-    """The joints of each robot that is drawn: measured; commanded; of a run in simulation the simulated one.
+    """Return the joints of each robot to draw: measured; commanded; and, in a simulated run, simulated.
 
-    float32 [1, 2 or 3, D]. Where nothing is commanded but something is simulated the second row is NaN.
+    float32 [1, 2 or 3, D]. If there is a simulated robot but no command, the second row is NaN.
     """
     measured, commanded = vectors["measured"], vectors["commanded"]
     sent = engaged and bool(np.isfinite(commanded).all())
@@ -92,7 +98,7 @@ def _drawable(joints: NDArray[Any], looks: DrawnRobot) -> bool:
 
 
 def _looks(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot | None:
-    """None: the robot is not drawn, and the log says why."""
+    """Return the robot to draw; None, with a log line, if it cannot be drawn."""
     try:
         return drawn_robot(robot, groups)
     except NotFound as error:

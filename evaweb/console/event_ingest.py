@@ -1,8 +1,8 @@
-"""Writes down what happens at the stations, with viewers or without.
+"""Ingest of stations' events into the database, with or without viewers.
 
-A thread per station hears its feed and hands events to the services, in order, each at least once: the number
-of the last one is in the station's row, services take an event twice without harm, and so any number of web
-processes may do the same. A database that is busy or gone is tried again; nothing live waits for it.
+One thread per station reads its feed and passes events to the services in order, each at least once: the number of the
+last one is stored in the station's row. Services accept repeated events, so any number of web processes may do this in
+parallel. If the database is busy or unavailable, the thread retries; nothing live waits for it.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from evaweb.stations.models import Station
 from evaweb.trials import services as trials
 
 log = logging.getLogger(__name__)
-# The kinds of events that change rows; all others are only shown.
+# Kinds of events that change rows; all others are only displayed.
 NOTED = ("state", "command", "truth", "episode_closed", "labelled")
 _TURN_S = 1.0
-_SWEEP_S = 5.0  # how often what was lost on the way is looked for
+_SWEEP_S = 5.0  # period of searching for lost results
 
 
 class StationEventIngester:
-    """One station's thread."""
+    """Thread that writes one station's events and lease changes to the database, in order and each at least once."""
 
     def __init__(self, station: str, heard: Feeds) -> None:
         self._station = station
         self._feed = heard.get(station)
         self._ended = threading.Event()
         self._news = threading.Event()
-        self._written = ("", 0)  # boot and number of the last event
+        self._written = ("", 0)  # boot and number of the last event written
         self._lease: tuple[Any, ...] = ()
-        self._collects: bool | None = None  # as the row says, None where nobody has looked
+        self._collects: bool | None = None  # value in the station's row; None: not known yet
         self._swept = 0.0
         self._failing = False
         self._thread = threading.Thread(target=self._run, name=f"{station} chronicle", daemon=True)
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Subscribe to the feed and start the thread."""
         self._feed.subscribe(self._on_stream, pictures=False)
         self._thread.start()
 
     def end(self) -> None:
-        """Listen no more; the thread ends after what it is writing."""
+        """Unsubscribe; the thread ends after its current write."""
         self._feed.unsubscribe(self._on_stream)
         self._ended.set()
         self._news.set()
@@ -71,7 +71,7 @@ class StationEventIngester:
                 self._failing = False
             except Error as error:
                 self._log_retry(error)
-            except Exception:  # a station of another version must not silence the thread for good
+            except Exception:  # a station of another version must not end the thread
                 log.exception("what happens at %s cannot be written down", self._station)
                 self._ended.wait(_TURN_S)
             finally:
@@ -85,7 +85,7 @@ class StationEventIngester:
         self._news.set()
 
     def _write(self) -> None:
-        """Lease first, then events, then what was lost; a station without a row is left alone."""
+        """Write the lease first, then events, then lost results; a station without a row is skipped."""
         sweep = time.monotonic() - self._swept > _SWEEP_S
         state, history = self._feed.state, self._feed.history
         lease = self._lease_of(state)
@@ -116,10 +116,10 @@ class StationEventIngester:
 
 
 def ingest_events(*, station: Station, history: History, state: str = "") -> tuple[str, int]:
-    """Hand all events to the services that are not in the database yet; boot and number of the last one.
+    """Pass all new events to the services; return boot and number of the last event.
 
-    A boot that is new begins with an event of ours that says in which state the station is: it may have
-    nothing to say of itself for long.
+    A new boot begins with a synthetic event that carries the station's state, because the station may emit no event of
+    its own for a long time.
     """
     if station.boot != history.boot:
         if station.boot and state:
@@ -155,14 +155,16 @@ def _restarted(history: History, state: str) -> dict[str, Any]:
 
 
 def _advance(station: Station, boot: str, number: int) -> None:
-    """Note how far we are, unless another process is further."""
+    """Record the number of the last event, unless another process is further ahead."""
     if number > station.last_event:
         Station.objects.filter(Q(pk=station.pk, boot=boot, last_event__lt=number)).update(last_event=number)
         station.last_event = number
 
 
 def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
-    """An event that a service cannot take must not keep those after it out of the database."""
+    """Pass one event to the services; a failure is logged and must not block later events. Database errors
+    are raised.
+    """
     unbegun = event["data"].get("unbegun") or {}
     try:
         if event["kind"] == "episode_closed":
@@ -181,7 +183,7 @@ def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
 
 
 class EventIngest:
-    """The scribes of all stations, those that are added later included."""
+    """Ingesters of all stations, including stations that are added later."""
 
     def __init__(self, heard: Feeds = feeds) -> None:
         self._feeds = heard
@@ -190,11 +192,11 @@ class EventIngest:
         self._thread = threading.Thread(target=self._run, name="chronicle", daemon=True)
 
     def start(self) -> None:
-        """Begin; returns at once."""
+        """Start the thread; returns at once."""
         self._thread.start()
 
     def end(self) -> None:
-        """End all scribes."""
+        """Stop all ingesters."""
         self._ended.set()
         for scribe in self._scribes.values():
             scribe.end()

@@ -1,6 +1,6 @@
-"""Reader of what a station publishes, in threads of this process: found anew where its runtime was restarted.
+"""Feed of a station's published messages, read in threads of this process, which reconnect when the runtime restarts.
 
-Knows neither pages nor database. Listeners are told in the feed's own threads and must not wait for anything.
+The feed depends neither on pages nor on the database. Listeners are called in the feed's threads and must not block.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ _UNHEARD = Pattern("console.feed.unheard", "{station} has not been heard yet")
 
 log = logging.getLogger(__name__)
 EVENTS_KEPT = 2000
-_SILENCE_S = 1.5  # ten snapshots come in a second
+_SILENCE_S = 1.5  # ten snapshots are published per second
 _TURN_S = 0.2
 _EVENTS_S = 1.0
-_NEEDED = ("boot", "newest_event", "state", "lease")  # of a snapshot
-Listener = Callable[[str, Any], None]  # told of a stream ("link", "events" among them) and its newest content
+_NEEDED = ("boot", "newest_event", "state", "lease")  # keys that a snapshot must have
+Listener = Callable[[str, Any], None]  # called with the stream (also "link", "events") and its newest content
 
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """State of the link to a station's runtime; `reason` says what is known where it is not `ok`."""
+    """State of the link to a station's runtime; `reason` explains why it is not `ok`."""
 
     ok: bool
     reason: str = ""
@@ -45,7 +45,7 @@ class LinkState:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """The last events of one boot of the runtime, numbered without gaps."""
+    """Last events of one boot of the runtime, numbered without gaps."""
 
     boot: str = ""
     rows: tuple[dict[str, Any], ...] = ()
@@ -55,12 +55,12 @@ class History:
         return int(self.rows[-1]["number"]) if self.rows else 0
 
     def after(self, number: int) -> tuple[dict[str, Any], ...]:
-        """The events after `number`."""
+        """Return the events after `number`."""
         behind = self.newest - number
         return self.rows[-behind:] if behind > 0 else ()
 
     def extended(self, boot: str, rows: list[dict[str, Any]]) -> History:
-        """With what came after; another boot begins anew."""
+        """Return the history with newer events appended; a new boot starts an empty history."""
         known = self.rows if boot == self.boot else ()
         last = known[-1]["number"] if known else 0
         fresh = tuple(row for row in rows if row["number"] > last)
@@ -68,7 +68,7 @@ class History:
 
 
 class _Reader(ABC):
-    """A thread that follows one socket of a station, from runtime to runtime."""
+    """Thread that reads one socket of a station and follows it across restarts of the runtime."""
 
     def __init__(self, wire: StationConnection, process: str, key: str, streams: tuple[str, ...]) -> None:
         self._wire, self._process, self._key, self._streams = wire, process, key, streams
@@ -79,15 +79,15 @@ class _Reader(ABC):
         self._thread.start()
 
     def end(self) -> None:
-        """It ends by itself within a fraction of a second."""
+        """Request the end; the thread ends within a fraction of a second."""
         self._ended.set()
 
     @abstractmethod
     def on_messages(self, found: Mapping[str, Any]) -> None:
-        """The newest of each stream that had something."""
+        """Handle the newest message of each stream that had one."""
 
     def on_silence(self, reason: str) -> None:  # noqa: B027  # who reads pictures leaves it to who reads the state
-        """Nothing has come for a while."""
+        """Handle missing messages; `reason` is the explanation."""
 
     def _run(self) -> None:
         while not self._ended.is_set():
@@ -95,9 +95,11 @@ class _Reader(ABC):
                 self._follow(self._wire.address(self._process, self._key))
             except StationGone as gone:
                 self.on_silence(str(gone))
-            except zmq.ZMQError as error:  # the file names no address
+            except zmq.ZMQError as error:  # the address in the file is invalid
                 self.on_silence(f"the address of {self._wire.name} cannot be used: {error.strerror}")
-            except Exception:  # whatever a runtime of another version publishes: the next one may be better
+            except (
+                Exception
+            ):  # a runtime of another version may publish anything; its successor may be compatible
                 log.exception("%s published what this web cannot use", self._wire.name)
                 self.on_silence(
                     f"{self._wire.name} publishes what this web cannot use: see the log of the web"
@@ -132,7 +134,7 @@ class _Reader(ABC):
 
 
 class _StateReader(_Reader):
-    """State and events, from the coordinator."""
+    """Reader of state and events from the coordinator."""
 
     def __init__(self, feed: StationFeed, wire: StationConnection) -> None:
         super().__init__(wire, "coordinator", "state", ("state", "event"))
@@ -157,7 +159,7 @@ class _StateReader(_Reader):
         return bool(state) and (state["boot"], state["newest_event"]) != (history.boot, history.newest)
 
     def _catch_up(self) -> None:
-        """Fetch the events that there are; what is published is only the doorbell, and may be missed."""
+        """Request the missing events: published events only signal news, and may be lost."""
         history = self._feed.history
         try:
             boot, rows = self._wire.events_since(history.newest, timeout=_EVENTS_S)
@@ -171,7 +173,11 @@ class _StateReader(_Reader):
 
 
 def _check_snapshot(state: Any) -> dict[str, Any]:
-    """A snapshot as JSON may carry it; ValueError where it lacks what this web depends on."""
+    """Return a snapshot as JSON values.
+
+    Raises:
+        ValueError: If it lacks a key that the web needs.
+    """
     missing = [key for key in _NEEDED if not isinstance(state, Mapping) or key not in state]
     if missing:
         raise ValueError(f"a snapshot without {', '.join(missing)}: {state!r:.200}")
@@ -179,7 +185,7 @@ def _check_snapshot(state: Any) -> dict[str, Any]:
 
 
 class _Shown(_Reader):
-    """What is for pages alone, and passed on as it comes."""
+    """Reader of streams that are only displayed, passed on unchanged."""
 
     def __init__(
         self, feed: StationFeed, wire: StationConnection, process: str, key: str, *streams: str
@@ -193,17 +199,17 @@ class _Shown(_Reader):
 
 
 def _motion(feed: StationFeed, wire: StationConnection) -> _Reader:
-    """Joints and chunks, from the coordinator."""
+    """Return a reader of joints and chunks from the coordinator."""
     return _Shown(feed, wire, "coordinator", "state", "joints", "chunk")
 
 
 def _pictures(feed: StationFeed, wire: StationConnection) -> _Reader:
-    """Previews of the cameras, from media."""
+    """Return a reader of camera previews from the media process."""
     return _Shown(feed, wire, "media", "cameras", "camera/")
 
 
 class StationFeed:
-    """One station; `link`, `state` and `history` are the newest that was heard, for any thread to read."""
+    """Feed of one station; `link`, `state` and `history` are the newest values and may be read from any thread."""
 
     def __init__(self, station: str) -> None:
         self.station = station
@@ -211,16 +217,16 @@ class StationFeed:
         self.state: dict[str, Any] = {}
         self.history = History()
         self._wire = connection_to(station)
-        self._listeners: dict[Listener, bool] = {}  # and whether it wants pictures and motion
+        self._listeners: dict[Listener, bool] = {}  # whether each listener needs images and motion
         self._lock = threading.Lock()
         self._numbers: _Reader | None = None
         self._motion: _Reader | None = None
         self._pictures: _Reader | None = None
 
     def subscribe(self, listener: Listener, *, pictures: bool) -> None:
-        """Tell `listener` what is known, then all that comes; the first one starts the threads.
+        """Call `listener` with the known values, then with every message; the first listener starts the threads.
 
-        Pictures, joints and chunks come while anybody wants `pictures`.
+        Images, joints and chunks are read while any listener has requested `pictures`.
         """
         with self._lock:
             self._listeners[listener] = pictures
@@ -231,10 +237,10 @@ class StationFeed:
         self._adjust()
 
     def unsubscribe(self, listener: Listener) -> None:
-        """The last one ends the threads."""
+        """Remove a listener; the threads end with the last one."""
         with self._lock:
             self._listeners.pop(listener, None)
-            if not self._listeners:  # nobody hears what becomes of it now
+            if not self._listeners:  # later changes would be missed, so nothing is known any more
                 self.link, self.state = self._unheard(), {}
         self._adjust()
 
@@ -242,7 +248,7 @@ class StationFeed:
         return LinkState(False, _UNHEARD(station=self.station))
 
     def dispatch(self, stream: str, content: Any) -> None:
-        """Pass on what a reader has heard."""
+        """Store a message, and pass it to the listeners."""
         with self._lock:
             if stream == "link":
                 self.link = content
@@ -273,14 +279,14 @@ class StationFeed:
 
 
 class Feeds:
-    """The feeds of a process, one per station, shared by its pages and its chronicle."""
+    """Feeds of a process, one per station, shared by its pages and its event ingest."""
 
     def __init__(self) -> None:
         self._feeds: dict[str, StationFeed] = {}
         self._lock = threading.Lock()
 
     def get(self, station: str) -> StationFeed:
-        """The station's feed."""
+        """Return the station's feed, created on first use."""
         with self._lock:
             return self._feeds.setdefault(station, StationFeed(station))
 

@@ -1,4 +1,4 @@
-"""How the stations did in the last week: throughput, the policy's latency, missed ticks, faults; a day at a time."""
+"""Statistics of the stations by day over the last week: throughput, policy latency, missed ticks, faults."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WIDTH, _HEIGHT, _LEFT, _TOP, _STEP = 260.0, 120.0, 40.0, 10.0, 30.0
 
 @dataclass(slots=True)
 class Day:
-    """What a station recorded in a day of the lab's time zone."""
+    """Statistics of a station's recordings of one day in the lab's time zone."""
 
     day: date
     runs: int = 0
@@ -45,23 +45,23 @@ class Day:
 
     @property
     def minutes(self) -> float | None:
-        """Minutes of recordings."""
+        """Recorded time [min]; None without a recording."""
         return self.seconds / 60 if self.runs else None
 
     @property
     def latency_ms(self) -> float | None:
-        """The median of the runs' medians; None where no policy was asked."""
+        """Median of the runs' median latencies [ms]; None if no policy was used."""
         return median(self.latencies_ms) if self.latencies_ms else None
 
     @property
     def missed_per_mille(self) -> float | None:
-        """Ticks of the control loop that were missed, of a thousand."""
+        """Missed ticks of the control loop per thousand; None without ticks."""
         return 1000 * self.missed / self.ticks if self.ticks else None
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Of one station; `covered`: recordings of blind trials, which are left out."""
+    """Week of one station; `covered` is the number of recordings of blind trials, which are left out."""
 
     station: Station
     days: Sequence[Day]
@@ -79,7 +79,7 @@ _MEASURES: tuple[tuple[str, str, Callable[[Day], float | None]], ...] = (
 
 
 def histories(sight: Visibility) -> Iterator[History]:
-    """Of every station that is in use, one question for all of them."""
+    """Yield the history of every active station; one query covers all of them."""
     today = timezone.localdate()
     first = today - timedelta(days=DAYS - 1)
     days: dict[int, dict[date, Day]] = defaultdict(
@@ -117,7 +117,7 @@ def _count(
 
 
 def _bars(title: str, unit: str, value: Callable[[Day], float | None], days: Sequence[Day]) -> Drawing:
-    """A bar a day; a day of which nothing is known has none."""
+    """Return a bar chart by day; a day without a value has no bar."""
     values = [value(day) for day in days]
     high = max((one for one in values if one is not None), default=0.0) or 1.0
     axis = ticks(0.0, high, 2)

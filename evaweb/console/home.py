@@ -1,4 +1,4 @@
-"""What matters now: work that waits for one user, what goes on in the lab, and what somebody has to see to."""
+"""Home page: tasks of one user, current activity in the lab, and alarms."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ from evaweb.trials.models import Trial, TrialStatus, VoidRequest
 from evaweb.trials.selectors import UNFINISHED
 from evaweb.trials.voids import can_answer_void
 
-MOST = 5  # of each kind
-FULL = 0.10  # share of the disk that is free, below which it is said
-_OLD_S = 10.0  # a picture, of a camera that is lost
-WAITED = timedelta(minutes=2)  # a job that waits for so long, while none runs
-_VOIDS = 20  # that are looked at, for each is asked whether this user may answer
+MOST = 5  # items per kind
+FULL = 0.10  # share of free disk space below which there is an alarm
+_OLD_S = 10.0  # image age at which a camera counts as lost
+WAITED = timedelta(minutes=2)  # waiting time of a job, while none runs, before there is an alarm
+_VOIDS = 20  # void requests examined; each needs a check whether this user may answer it
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One thing to do or to see to: a sentence, where that is done, and what the link says. `grave`: it is a fault."""
+    """Task or alarm: a sentence, the address where it is handled, and the text of the link. `grave` marks a fault."""
 
     text: str
     address: str
@@ -51,7 +51,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class PlanNow:
-    """A plan that runs; `evidence` is its address where this user may see it, `sealed` why not."""
+    """Running plan; `evidence` is its address if this user may see it, else `sealed` is the reason."""
 
     row: PlanRow
     evidence: str
@@ -60,7 +60,7 @@ class PlanNow:
 
 @dataclass(frozen=True, slots=True)
 class Now:
-    """All of it, for one user."""
+    """All contents of the home page for one user."""
 
     work: list[Item]
     alarms: list[Item]
@@ -69,11 +69,11 @@ class Now:
 
 
 def now(*, user: Any, sight: Visibility) -> Now:
-    """As of now, in a number of questions that does not grow with the lab."""
+    """Return the current contents; the number of queries does not grow with the size of the lab."""
     under_way = Job.objects.filter(status__in=(JobStatus.RUNNING, JobStatus.QUEUED)).select_related(
         "cancelled_by"
     )
-    jobs = under_way.order_by("-status", "created_at")[:MOST]  # running, then queued
+    jobs = under_way.order_by("-status", "created_at")[:MOST]  # running first, then queued
     having = served()
     running = results.plan_rows(results.plan_list(PlanState.FROZEN)[:MOST])
     return Now(
@@ -126,7 +126,7 @@ def _requests(user: Any) -> list[LeaseRequest]:
 
 
 def alarms() -> Iterator[Item]:
-    """What somebody has to see to, of the whole lab."""
+    """Yield the alarms of the whole lab."""
     for station in Station.objects.filter(active=True).order_by("name"):
         feed = feeds.get(station.name)
         stands = feed.state.get("state_is", {}) if feed.link.ok else {}
@@ -134,7 +134,9 @@ def alarms() -> Iterator[Item]:
             yield Item(
                 feed.link.reason, reverse("station-debug", args=[station.name]), "Its page", grave=True
             )
-        elif stands.get("tone") == "danger":  # why may tell what it is set up for: its own page says it
+        elif (
+            stands.get("tone") == "danger"
+        ):  # its cause may reveal the checkpoint: only the station's page shows it
             words = f"{station} is {stands['label']}"
             yield Item(words, reverse("station-eval", args=[station.name]), "Its page", grave=True)
         if lost := _cameras_lost(feed.state) if feed.link.ok else "":
@@ -159,7 +161,7 @@ def alarms() -> Iterator[Item]:
 
 
 def _cameras_lost(state: Mapping[str, Any]) -> str:
-    """The cameras without a picture for a while, of a station whose joints arrive."""
+    """Return the cameras whose newest image is too old, for a station whose joints arrive."""
     ages = dict(state.get("link", {}).get("ages", {}))
     joints = ages.pop("joints", None)
     if joints is None or not joints < _OLD_S:

@@ -1,4 +1,4 @@
-"""The live pages of this process: each station is heard once, encoded once, and shown to all who watch it."""
+"""Live pages of this process: each station is read once and encoded once for all its viewers."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from evaweb.console.parts import EncodedPart
 from evaweb.stations import redaction as veil
 from evaweb.stations.robot_geometry import DrawnRobot
 
-_FLUSH_S = 1 / 40  # frames leave at most so often
-_STATE_S = 1 / 200  # but for the station's state, which comes seldom and waits for no curve
+_FLUSH_S = 1 / 40  # minimum time between frames
+_STATE_S = 1 / 200  # minimum for the station's state, which is published rarely and should appear at once
 _CHANGES_S = 1.0
 
 
 class StationRoom:
-    """The pages that watch one station; all but `hear` belongs to the event loop.
+    """Pages that watch one station. Everything except `on_message` belongs to the event loop.
 
-    A user from whom the station's checkpoint is hidden is shown other parts than the others. What is hidden
-    from whom is looked up each second; a page that has just come is shown nothing before that, and events wait for it,
-    because a trial may have been handed out since.
+    Users from whom the station's checkpoint is hidden receive redacted parts. Visibilities are queried every second.
+    New events are held back until the next answer, because a trial may have been allocated since the last one.
     """
 
     def __init__(self, station: str, robot: str, loop: asyncio.AbstractEventLoop, heard: Feeds) -> None:
@@ -37,10 +36,10 @@ class StationRoom:
         self._feed = heard.get(station)
         self._encoder = StreamEncoder(robot)
         self._covering = StreamEncoder(robot, veiled=True)
-        self._covered: dict[str, EncodedPart] = {}  # the newest, for those who are not to know
-        self._covers = False  # whether anybody is to be shown these
+        self._covered: dict[str, EncodedPart] = {}  # newest redacted parts by stream
+        self._covers = False  # whether any viewer needs redacted parts
         self._state: dict[str, Any] = {}
-        self._unseen = History()  # of which nobody has said yet who may see it
+        self._unseen = History()  # events held back until the visibilities are known
         self._viewers: set[Mailbox] = set()
         self._newest: dict[str, EncodedPart] = {}
         self._link: LinkState | None = None
@@ -54,7 +53,7 @@ class StationRoom:
 
     @property
     def looks(self) -> DrawnRobot | None:
-        """The robot in the groups that the station says it has; None where it is not drawn."""
+        """Robot with the groups that the station reports; None if it is not drawn."""
         return self._encoder.looks
 
     @property
@@ -62,7 +61,7 @@ class StationRoom:
         return not self._viewers
 
     def join(self, deliver: Deliver, user: Any, sight: Visibility) -> Mailbox:
-        """A mailbox for one more page, of `user`, from whom `sight` hides what it hides now."""
+        """Return a mailbox for one more page of `user`, with the visibility that was queried when it connected."""
         first = not self._viewers
         mailbox = Mailbox(deliver, user)
         mailbox.sight = sight
@@ -77,7 +76,7 @@ class StationRoom:
         return mailbox
 
     def leave(self, mailbox: Mailbox) -> None:
-        """The page is gone; with the last one nothing is heard any more."""
+        """Remove a page; the last one ends the subscription to the feed."""
         self._viewers.discard(mailbox)
         self._count_covered()
         if self._viewers:
@@ -89,26 +88,26 @@ class StationRoom:
         self._timer = self._changes = self._looking = None
 
     def watch(self, mailbox: Mailbox, streams: Iterable[str]) -> None:
-        """Show a page these streams, at once with what there is."""
+        """Set the streams of a page, and send their newest parts."""
         mailbox.watch(streams, self._shown_to(mailbox).values())
         self.schedule_flush()
 
     def on_message(self, stream: str, content: Any) -> None:
-        """Encode and pass on a message of the feed, in its thread."""
+        """Encode a message of the feed, in the feed's thread, and pass it to the event loop."""
         encoded = self._encoder.encode(stream, content)
         covered = encoded if stream.startswith("camera/") else self._encode_redacted(stream, content)
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take, stream, content, encoded, covered)
 
     def _encode_redacted(self, stream: str, content: Any) -> list[EncodedPart]:
-        """The same for those who are not to know, as long as there are any."""
+        """Return the redacted parts of a message, [] if no viewer needs them."""
         if not self._covers:
             return []
         said = veil.redact_state(content, FULL_VISIBILITY) if stream == "state" else content
         return self._covering.encode(stream, said)
 
     def schedule_flush(self, after: float = _FLUSH_S) -> None:
-        """Something is waiting: send it `after` the last frame [s], together with what comes until then."""
+        """Schedule a frame at least `after` [s] after the last one, with everything that arrives until then."""
         at = self._flushed + after
         if self._timer is not None and self._timer.when() <= at:
             return
@@ -138,13 +137,13 @@ class StationRoom:
         if self._viewers:
             self.schedule_flush(_STATE_S if stream in ("state", "link") else _FLUSH_S)
 
-    # --- who may see what ------------------------------------------------------------------------------------
+    # --- visibility ---------------------------------------------------------------------------------------------
 
     def _shown_to(self, viewer: Mailbox) -> dict[str, EncodedPart]:
         return self._covered if viewer.veiled else self._newest
 
     def _update_viewer(self, viewer: Mailbox) -> None:
-        """Decide if the page sees the station as it is now; where that changes it is told, and shown anew."""
+        """Update what the page may see of the station now; on a change notify the page and resend its streams."""
         veiled = viewer.sight.redacts_snapshot(self.station, self._state)
         viewer.redacts_events = viewer.sight.redacts_events(self.station)
         if veiled is not viewer.veiled:
@@ -154,13 +153,13 @@ class StationRoom:
             viewer.watch(viewer.watched, self._shown_to(viewer).values())
 
     def _count_covered(self) -> None:
-        """Covered parts are made while a viewer is shown them; what is left of before is old."""
+        """Update whether redacted parts are needed; outdated ones are discarded when they are needed again."""
         before, self._covers = self._covers, any(viewer.veiled for viewer in self._viewers)
         if self._covers and not before:
             self._covered.clear()
 
     def _refresh_visibility(self) -> None:
-        """Ask the database what is hidden from whom; events that came before wait for the answer."""
+        """Query the visibilities; events that arrived before wait for the answer."""
         if self._looking is None and self._viewers:
             self._looking = self._loop.create_task(self._looked())
         else:
@@ -183,7 +182,7 @@ class StationRoom:
             self._looking = None
 
     def _flush(self) -> None:
-        """Send to all; pages that wait for the same are sent the same bytes."""
+        """Send to all pages; pages with the same parts get the same bytes."""
         self._timer, self._flushed = None, self._loop.time()
         self._frames += 1
         now, made = time.monotonic(), {}
@@ -198,7 +197,7 @@ class StationRoom:
             viewer.flush(self._history, make_frame)
 
     async def _follow_changes(self) -> None:
-        """Tell the pages what has changed in the database, by any process."""
+        """Notify the pages of database changes by any process."""
         known = None
         while True:
             self._refresh_visibility()
@@ -213,7 +212,7 @@ class StationRoom:
 
 
 class LiveHub:
-    """The rooms of one event loop."""
+    """Rooms of one event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, heard: Feeds = feeds) -> None:
         self._loop = loop
@@ -221,7 +220,7 @@ class LiveHub:
         self._rooms: dict[str, StationRoom] = {}
 
     def room(self, station: str, robot: str) -> StationRoom:
-        """The station's room, made for its first page: join it at once, or the next one makes another."""
+        """Return the station's room, created for its first page. Join it at once: an empty room is replaced."""
         found = self._rooms.get(station)
         if found is None or found.empty:
             found = self._rooms[station] = StationRoom(station, robot, self._loop, self._feeds)
@@ -232,6 +231,6 @@ _hubs: WeakKeyDictionary[asyncio.AbstractEventLoop, LiveHub] = WeakKeyDictionary
 
 
 def hub() -> LiveHub:
-    """The hub of the running event loop."""
+    """Return the hub of the running event loop."""
     loop = asyncio.get_running_loop()
     return _hubs.setdefault(loop, LiveHub(loop))

@@ -1,4 +1,4 @@
-"""Check that a page's login still holds: its socket outlives the request that opened it."""
+"""Check of a page's login: a socket outlives the request that opened it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from evaweb.roles import Role, role_of
 
 
 def current_role(session_key: str) -> Role | None:
-    """The role of the session's user as the database has it now.
+    """Return the current role of the session's user, read from the database.
 
-    None: they have logged out, were switched off, or their password was changed elsewhere. Reads only.
+    None if they have logged out, were deactivated, or their password was changed elsewhere.
     """
     user = credentials.look_up(SESSION, session_key)
     return None if user is None else role_of(user)

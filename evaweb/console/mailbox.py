@@ -1,7 +1,7 @@
-"""Messages that one page has not been sent yet: the newest of each stream, events, a few words.
+"""Queue of messages for one page: newest part of each stream, events, and short texts.
 
-A page pays for each frame with a credit and gets the credit back when it has drawn; at most two frames are
-ever under way to it. A page that does not answer is sent nothing more, and costs what it has not read.
+A frame costs one credit, which the page returns when it has drawn the frame; at most two frames are in flight. A page
+that does not respond is sent nothing more, so that its memory use is bounded.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from evaweb.stations import redaction as veil
 
 CREDITS = 2
 EVENTS_AT_ONCE = 200
-_TEXTS_UNHEARD = 30  # texts to a page that has said nothing since
+_TEXTS_UNHEARD = 30  # texts without any message from the page, after which no more are sent
 Deliver = Callable[[str | bytes], None]
 MakeFrame = Callable[[Iterable[EncodedPart]], bytes]
 
 
 class Mailbox:
-    """One page at one station; belongs to the event loop, where alone it may be used.
+    """Messages of one page at one station; for the event loop only.
 
-    `user` is whose page it is. `veiled` says that they see the station without what tells which checkpoint it is set
-    up for, `covers` that they see its events so, both by `sight`.
+    `veiled` is True if `user` must not see which checkpoint the station is set up for, `redacts_events` the same for
+    its events; both follow from `sight`.
     """
 
     def __init__(self, deliver: Deliver, user: Any = None) -> None:
@@ -41,24 +41,24 @@ class Mailbox:
         self._unheard = 0
         self._link: LinkState | None = None
         self._changed: set[str] = set()
-        self._events_of = ""  # the boot that the page has events of
-        self._events_after: int | None = None  # None: it has not asked for any
+        self._events_of = ""  # boot whose events the page has
+        self._events_after: int | None = None  # None: events were not requested
         self._covered_up_to = (
             0,
             0,
-        )  # the last event that it was shown, or not, and the number of the last one shown
+        )  # number of the last event processed, and of the last redacted event sent
 
     @property
     def watched(self) -> frozenset[str]:
         return self._watched
 
     def watch(self, streams: Iterable[str], newest: Iterable[EncodedPart]) -> None:
-        """Set the streams that the page shows from now on, with what there is of them already."""
+        """Set the streams of the page, and queue their `newest` parts."""
         self._watched = frozenset(streams)
         self._pending = {part.stream: part for part in newest if part.stream in self._watched}
 
     def put(self, part: EncodedPart) -> None:
-        """A newer one of a stream replaces the one that is still waiting."""
+        """Queue a part; it replaces an older one of the same stream."""
         if part.stream in self._watched:
             self._pending[part.stream] = part
 
@@ -69,19 +69,19 @@ class Mailbox:
         self._changed.update(what)
 
     def want_events(self, after: int, boot: str) -> None:
-        """The page has the events of `boot` up to `after`, and wants what follows."""
+        """Send the events of `boot` after number `after` from now on."""
         self._events_after, self._events_of, self._covered_up_to = after, boot, (0, 0)
 
     def credit(self) -> None:
-        """The page has drawn a frame."""
+        """Add a credit: the page has drawn a frame."""
         self._credits = min(CREDITS, self._credits + 1)
 
     def mark_read(self) -> None:
-        """The page has said something: it reads what it is sent."""
+        """Record that the page is responsive."""
         self._unheard = 0
 
     def flush(self, history: History, make_frame: MakeFrame) -> None:
-        """Send what may be sent now."""
+        """Send everything that may be sent now."""
         link = self._link
         if link is not None and self._say({"type": "link", "ok": link.ok, **reasoned(link.reason)}):
             self._link = None
@@ -99,7 +99,7 @@ class Mailbox:
         self._events_of = self._events_of or history.boot
         beyond = (
             not self.redacts_events and self._events_after > history.newest
-        )  # as numbers of covered ones are
+        )  # redacted events have numbers of their own, which may be higher
         if self._events_of != history.boot or beyond:
             self._events_of, self._events_after, self._covered_up_to = history.boot, 0, (0, 0)
         rows: Sequence[Any] = history.after(self._events_after)
@@ -118,7 +118,7 @@ class Mailbox:
         self._covered_up_to = (history.newest, last) if self.redacts_events else (0, 0)
 
     def _say(self, message: dict[str, object]) -> bool:
-        """Send a text, unless the page has not been heard for many of them."""
+        """Send a text, unless the page has not responded to many; return whether it was sent."""
         if self._unheard >= _TEXTS_UNHEARD:
             return False
         self._unheard += 1

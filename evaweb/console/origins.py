@@ -1,4 +1,4 @@
-"""Websockets only for our own pages."""
+"""Origin check of websockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaweb.origins import is_own_origin, scheme_of
 
 
 class SameOrigin:
-    """Lets a websocket of our own pages through; all others are denied with 403."""
+    """ASGI middleware that accepts websockets of our own pages only; others get 403."""
 
     def __init__(self, application: Callable[..., Awaitable[Any]]) -> None:
         self._application = application

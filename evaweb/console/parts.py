@@ -1,4 +1,4 @@
-"""Live streams encoded once for all viewers: a frame for one of them is nothing but a concatenation.
+"""Parts of frames, each encoded once for all viewers: a viewer's frame is a concatenation of parts.
 
 The layout is that of evaweb.binary_frames, which also reads it.
 """
@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from evaweb.binary_frames import to_json_value
 
 _ALIGNMENT = 8
-_AGE = "age"  # stands where a part's age is to be put in
+_AGE = "age"  # placeholder of a part's age
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EncodedPart:
-    """The newest of one stream.
+    """Encoded newest content of one stream.
 
-    `entry` is its entry in the header in pieces of text; a number between them is an offset into `body`, and
-    _AGE the time since it was `received` (our monotonic clock). `body` is a multiple of 8 bytes long.
+    `entry` is its header entry in pieces: texts, integers (offsets into `body`), and _AGE for the time since
+    `received` (monotonic clock of this process). The length of `body` is a multiple of 8 bytes.
     """
 
     stream: str
@@ -34,7 +34,7 @@ class EncodedPart:
     received: float
 
     def at(self, offset: int, now: float) -> str:
-        """The entry of a part whose body begins at `offset`."""
+        """Return the header entry for a body that begins at `offset` in the frame."""
         return "".join(
             str(offset + piece)
             if isinstance(piece, int)
@@ -46,14 +46,14 @@ class EncodedPart:
 
 
 def encode_facts(stream: str, content: Mapping[str, Any], received: float) -> EncodedPart:
-    """A map, such as the state."""
+    """Return the part of a map such as the state."""
     return EncodedPart(stream, (f'{_key(stream)}:{{"json":{_json(content)}}}',), b"", received)
 
 
 def encode_numbers(
     stream: str, content: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], received: float
 ) -> EncodedPart:
-    """Small facts and float32 arrays beside them, such as the joints."""
+    """Return the part of a map with float32 arrays, such as the joints."""
     entry: list[str | int] = [f'{_key(stream)}:{{"json":{_json(content)},"arrays":{{']
     body = b""
     for count, (name, array) in enumerate(arrays.items()):
@@ -63,20 +63,20 @@ def encode_numbers(
 
 
 def encode_array(stream: str, content: NDArray[Any], received: float) -> EncodedPart:
-    """One float32 array, such as the poses."""
+    """Return the part of one float32 array, such as the poses."""
     return EncodedPart(
         stream, (f'{_key(stream)}:{{"offset":', 0, f",{_shape(content)}}}"), _bytes(content), received
     )
 
 
 def encode_picture(stream: str, jpeg: bytes, received: float) -> EncodedPart:
-    """One picture; its entry says how old it is when the frame leaves."""
+    """Return the part of one JPEG image; its entry carries the image's age when the frame is sent."""
     entry = (f'{_key(stream)}:{{"mime":"image/jpeg","length":{len(jpeg)},"offset":', 0, ',"age":', _AGE, "}")
     return EncodedPart(stream, entry, _padded(jpeg), received)
 
 
 def build_frame(parts: Iterable[EncodedPart], number: int, now: float) -> bytes:
-    """The message with these parts, as it leaves at `now`."""
+    """Return the binary message with these parts, sent at `now`."""
     entries, bodies, offset = [], [], 0
     for part in parts:
         entries.append(part.at(offset, now))

@@ -1,7 +1,7 @@
-"""Targets that a page asks about: where the robot would be, and whether it could go there. Nothing moves.
+"""Queries of a page about a target: the pose of the robot there, and whether it can be reached. Nothing moves.
 
-Asked while an operator drags a slider: the newest question replaces the one that waits, and at most one of a page
-is under way. They have threads and a connection to the station of their own, so that no command waits for them.
+Pages query while an operator drags a slider: the newest query replaces a waiting one, and a page has at most one in
+progress. Queries have their own threads and connection to the station, so that no command waits for them.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ _VIEWER = Pattern(
 _NOT_SENDABLE = Pattern("console.aim.not_sendable", "the target cannot be sent: {error}")
 
 
-_TIMEOUT_S = 3.0  # the first one may have to wait until the station's kinematics are loaded
-_DIGITS = 5  # of a matrix in the answer: a hundredth of a millimetre
+_TIMEOUT_S = 3.0  # the first query may have to wait until the station has loaded its kinematics
+_DIGITS = 5  # digits of matrix entries in the answer: 0.01 mm
 _under_way: RequestCoalescer[dict[str, Any]] = RequestCoalescer(
     "aim", most=8
-)  # of one station, which may hang
+)  # limited per station, because a station may hang
 SendCallback = Callable[[dict[str, Any]], None]
-LinkPosesCallback = Callable[[], DrawnRobot | None]  # the robot as it is drawn now
+LinkPosesCallback = Callable[[], DrawnRobot | None]  # returns the robot as currently drawn
 
 
 class AimQueries:
-    """The questions of one page; belongs to the event loop."""
+    """Target queries of one page; for the event loop only."""
 
     def __init__(
         self, station: Station, username: str, role: Role, say: SendCallback, looks: LinkPosesCallback
@@ -55,7 +55,7 @@ class AimQueries:
         self._under_way = False
 
     def ask(self, request: Aim) -> bool:
-        """Take the question in place of the one that waits; True where `answer` has to be started."""
+        """Queue a query in place of a waiting one; return True if `answer` has to be started."""
         if self._role is Role.VIEWER:
             self._say({"type": "aimed", "id": request.id, **_refused(_VIEWER(user=self._username))})
             return False
@@ -64,7 +64,7 @@ class AimQueries:
         return first
 
     async def answer(self) -> None:
-        """Answer the newest question until none waits any more; one that was replaced has no answer."""
+        """Answer the newest query until none is waiting; a replaced query gets no answer."""
         try:
             while (request := self._waiting) is not None:
                 self._waiting = None
@@ -83,7 +83,7 @@ class AimQueries:
 
 
 def _refused(reason: str) -> dict[str, Any]:
-    """`sentence` has the id and the arguments of the reason: "id" is that of the question."""
+    """Return a refusal; `sentence` holds the reason's pattern id and arguments, because "id" is the query's."""
     known = {"sentence": identity(reason)} if isinstance(reason, Sentence) else {}
     return {"ok": False, "reason": reason, **known}
 
@@ -91,10 +91,10 @@ def _refused(reason: str) -> dict[str, Any]:
 def query_aim(
     station: str, username: str, args: Mapping[str, Any], looks: DrawnRobot | None
 ) -> dict[str, Any]:
-    """The station's answer on a target, and `links`, the poses of its parts there [P * 16]."""
+    """Return the station's answer about a target, with the poses of the links there as `links` [P * 16]."""
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:
-        messages.encode(command)  # what cannot be sent is no fault of the station
+        messages.encode(command)  # an encoding error is the page's fault, not the station's
         ack = _wire_to(station).request(command, timeout=_TIMEOUT_S)
     except CodecError as error:
         return _refused(_NOT_SENDABLE(error=error))
@@ -107,7 +107,7 @@ def query_aim(
 
 
 def _links(looks: DrawnRobot | None, joints: Any) -> list[float]:
-    """World <- part of every part, each matrix column by column; none where the robot is not drawn."""
+    """Return the pose of every link in the world frame, each matrix column by column; [] if the robot is not drawn."""
     target = np.asarray(joints, np.float64)
     if looks is None or target.shape != (looks.robot.dim,):
         return []

@@ -1,6 +1,6 @@
-"""Answers that are made piece by piece are made no faster than the other end reads them.
+"""Back-pressure for streamed answers: pieces are produced no faster than the client reads them.
 
-Daphne hands on whatever it is given: of a download that nobody reads all of it would lie in memory.
+Daphne buffers everything that it is given: an unread download would be held in memory completely.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 from evaweb.console.sockets import unsent
 
-AHEAD = 256 * 1024  # bytes of an answer that may be unread when its next piece is made
-STALLED_S = 30.0  # without a byte read, after which the connection is cut off
+AHEAD = 256 * 1024  # [bytes] unread part of an answer below which the next piece is produced
+STALLED_S = 30.0  # time without a byte read after which the connection is aborted
 _LOOK_S = 0.05
 
 
@@ -22,10 +22,10 @@ async def until_read(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
 ) -> None:
-    """Wait until at most `AHEAD` of what a request of daphne's was answered is unread, or its connection is gone."""
+    """Wait until at most `AHEAD` bytes of the answer are unread, or the connection is closed."""
     least, since = None, clock()
     while (channel := request.channel) is not None:
-        wire = channel.transport.transport  # our wrapper's
+        wire = channel.transport.transport  # the transport below our wrapper
         held = unsent(wire)
         if held <= AHEAD:
             return

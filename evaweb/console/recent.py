@@ -1,4 +1,4 @@
-"""The last samples of the joints: a page that draws fewer frames than samples come is shown all of them."""
+"""Recent joint samples: a page that draws fewer frames than there are samples still gets all of them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ from numpy.typing import NDArray
 from evaweb.console import parts
 from evaweb.console.parts import EncodedPart
 
-SAMPLES = 12  # at the 30 a second that the runtime publishes: no gap down to three frames a second
+SAMPLES = 12  # at 30 samples per second this covers down to three frames per second
 _CURVES = ("measured", "raw", "planned", "executed")
-_SAID = {"step": -1, "chunk": -1, "chunks": 0, "limited": False}  # and what their absence means
+_SAID = {
+    "step": -1,
+    "chunk": -1,
+    "chunks": 0,
+    "limited": False,
+}  # keys of a sample, with the default of a missing one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,13 +31,12 @@ class _Sample:
 
 
 class RecentSamples:
-    """Makes stream `recent`: the newest samples in columns, oldest first, `t` on this process's clock [s].
+    """Builder of stream `recent`: the newest samples in columns, oldest first; `t` is on this process's clock [s].
 
-    Arrays float32 [K, D]: `measured`; `raw`, what the newest chunk wants; `planned`, what was made of all
-    chunks; `executed`, what was sent to the robot, or in simulation to the simulated one. NaN where there is
-    none. Beside them per sample: `step`, the leading `chunk` (-1: none, 0: the held target), how many `chunks`
-    made the step, whether safety `limited` it, whether the robot that executed was `simulated`. The samples of
-    one part overlap with those of the part before.
+    Arrays float32 [K, D]: `measured`; `raw`, the newest chunk; `planned`, the merged plan; `executed`, sent to the
+    robot or, in simulation, to the simulated robot. Missing values are NaN. Columns per sample: `step`, the leading
+    `chunk` (-1: none, 0: hold target), the number of `chunks` that contributed, whether safety `limited` it, and
+    whether the executing robot was `simulated`. Consecutive parts overlap.
     """
 
     def __init__(self) -> None:
@@ -41,7 +45,7 @@ class RecentSamples:
     def add_sample(
         self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
     ) -> EncodedPart:
-        """The stream after the sample of this moment."""
+        """Return the stream after adding the sample of time `now`."""
         sample = _sample(vectors, words, now)
         if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
             self._samples.clear()  # another robot

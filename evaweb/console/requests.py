@@ -1,4 +1,4 @@
-"""Requests of a page over the live socket, checked before anything is done with them."""
+"""Requests of a page over the live socket, validated before use."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ _ALLOWED_WHOLE_NUMBER_FROM_0 = Pattern(
 _ALLOWED_MAP = Pattern("console.requests.allowed_map", "{key} = {value!r:.40}; allowed: a map")
 _ALLOWED_TEXT = Pattern("console.requests.allowed_text", "{key} = {value!r:.40}; allowed: a text")
 
-_LARGEST = 64 * 1024  # characters of what is no press; a page says little
+_LARGEST = 64 * 1024  # [characters] limit of a message other than an e-stop press
 STREAMS = ("state", "joints", "recent", "poses", "chunk")
 PAGE = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_MOST_VALUES = 1000  # of one message
-_LONGEST_STOP = 4096  # characters of a stop or halt, from a page that floods
+_MOST_VALUES = 1000  # values per message
+_LONGEST_STOP = 4096  # [characters] limit of a stop or halt from a page that floods
 
 
 class BadRequest(EvaError):
-    """The page said something that has no meaning; the message says what and what is allowed."""
+    """Invalid message of a page; the text names what was given and what is allowed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """Send these streams."""
+    """Request to send these streams."""
 
     streams: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Credit:
-    """A frame has been drawn."""
+    """Report that a frame has been drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """The page is there, visible or not, and holds the lease of this epoch."""
+    """Heartbeat of the page that holds the lease of this epoch, visible or hidden."""
 
     epoch: int
     hidden: bool = False
@@ -61,7 +61,7 @@ class Renew:
 
 @dataclass(frozen=True, slots=True)
 class EStop:
-    """Press it."""
+    """E-stop press."""
 
     uuid: UUID
     why: str
@@ -78,7 +78,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """Send the events of `boot` after a number; where it is no longer that boot, all; "" is the present one."""
+    """Request for the events of `boot` after a number, or all if the boot has changed; "" is the current boot."""
 
     after: int
     boot: str
@@ -86,7 +86,7 @@ class Events:
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """Question where these arguments of the runtime's `aim` lead; the answer has the page's own `id`."""
+    """Query about a target, with the arguments of the runtime's `aim`; the answer carries the page's own `id`."""
 
     id: int
     args: Mapping[str, Any]
@@ -96,16 +96,20 @@ Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
 def looks_like_stop(text: str) -> bool:
-    """True if a message that there is no time to read may be one that stops a robot."""
+    """Return True if a message that is not parsed completely may stop a robot."""
     if pressing.parse_json_press(text, "type") is not None:
         return True
     return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))
 
 
 def parse(text: str, cameras: Collection[str]) -> Request:
-    """The request in a text message; raises BadRequest."""
+    """Return the request in a text message.
+
+    Raises:
+        BadRequest: If it is not valid.
+    """
     press = pressing.parse_json_press(text, "type")
-    if press is not None:  # no press is lost for what else is said with it
+    if press is not None:  # a press is accepted whatever else the message contains
         return EStop(_uuid(press), pressing.json_reason(press))
     try:
         said = bounded.parse_json(text, "the message", _LARGEST, _MOST_VALUES)
@@ -154,7 +158,7 @@ def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
 
 
 def _uuid(said: Mapping[str, Any]) -> UUID:
-    """The page's own, so that it knows the answer; one of ours where it gave none."""
+    """Return the page's own id, by which it recognises the answer, or a new one."""
     try:
         return UUID(str(said.get("uuid")))
     except ValueError:

@@ -25,7 +25,7 @@ SESSION_KEY = "station"
 
 @dataclass(frozen=True, slots=True)
 class StationRow:
-    """One station as the home page lists it; `lease` and `trial` are what is open there."""
+    """Station in the list of the home page; `lease` and `trial` are the open ones there."""
 
     station: Station
     lease: Lease | None
@@ -34,16 +34,13 @@ class StationRow:
 
 @dataclass(frozen=True, slots=True)
 class EvalPanel:
-    """Contents of the four steps of an evaluation, as one user may see them.
+    """Contents of the four steps of an evaluation, as visible to one user.
 
-    `trial` is the unfinished one, with the `milestones` of its scene; `implied` says whether they decide on
-    success, `failures` what can be said of a failure,
-    `set_up` whether the station was last set up for it. Without one, `scene`, `position` and
-    `checkpoint` are the choice to begin with, after `last`, the newest finished one.
-
-    `plans` are those that are open here, `plan` the one that is worked on, `handout` how the trial was handed out,
-    `cameras` this user's look at the cameras as far as it holds. `views`: of each camera its reference picture, of the
-    trial's position or, without a trial, of the camera.
+    `trial` is the unfinished trial, with the `milestones` of its scene; `failures` are the possible failure levels,
+    `set_up` is whether the station was last set up for it. Without a trial, `scene`, `position` and `checkpoint` are
+    the initial choice, after `last`, the newest finished trial. `plans` are the plans open here, `plan` the selected
+    one, `handout` the trial's allocation, `cameras` this user's camera check while it is valid. `views` are the
+    reference images by camera, of the trial's position or, without a trial, of the camera.
     """
 
     station: Station
@@ -58,8 +55,8 @@ class EvalPanel:
     milestones: tuple[Milestone, ...]
     set_up: bool
     failures: tuple[Level, ...]
-    hidden: bool  # which checkpoint the trial is of
-    fails: str = ""  # why the trial is a failure whatever was reached
+    hidden: bool  # whether the trial's checkpoint is hidden from the user
+    fails: str = ""  # reason for which the trial is a failure whatever was reached
     plans: tuple[Plan, ...] = ()
     plan: Plan | None = None
     handout: Handout | None = None
@@ -69,12 +66,12 @@ class EvalPanel:
 
     @property
     def lacks_references(self) -> bool:
-        """True if a camera has no reference yet."""
+        """True if a camera has no reference image yet."""
         return any(row is None for _, row in self.views)
 
     @property
     def reference_addresses(self) -> dict[str, str]:
-        """Camera -> address of the reference picture of the trial's position."""
+        """Address of the reference image of the trial's position, by camera."""
         return (
             {camera: f"/pictures/{row.picture}.jpg" for camera, row in self.views if row}
             if self.trial
@@ -88,7 +85,7 @@ class EvalPanel:
 
     @property
     def layout(self) -> str:
-        """Layout of the bench, in words."""
+        """Description of the bench layout."""
         scene = self.trial.scene if self.trial else self.scene
         return scene.layout if scene else ""
 
@@ -99,7 +96,7 @@ class EvalPanel:
 
 
 def last_used_station(*, session: SessionBase) -> Station | None:
-    """The station that this browser last looked at, else the only one there is."""
+    """Return the station that this browser last used, else the only station, else None."""
     used = session.get(SESSION_KEY)
     found = Station.objects.filter(name=used).first() if used else None
     if found is not None:
@@ -109,7 +106,7 @@ def last_used_station(*, session: SessionBase) -> Station | None:
 
 
 def station_rows() -> list[StationRow]:
-    """Every station, the active ones first, with its open lease and trial."""
+    """Return every station, active ones first, with its open lease and trial."""
     leases = leases_open()
     unfinished = trial_list().filter(status__in=UNFINISHED).order_by("pk")
     trials = {trial.station_id: trial for trial in unfinished}
@@ -118,9 +115,8 @@ def station_rows() -> list[StationRow]:
 
 
 def robot_facts(*, robot: str) -> dict[str, Any]:
-    """Names and units of the robot's vector, and its cameras; empty where its description cannot be read.
-
-    "error" says why; the page goes on without them.
+    """Return names and units of the robot's vector, and its cameras; empty with "error" if its description is
+    unreadable.
     """
     found = describe_robot(robot)
     return {
@@ -136,9 +132,14 @@ def robot_facts(*, robot: str) -> dict[str, Any]:
 def eval_panel(
     *, station: Station, user: Any, sight: Visibility, scene: str = "", plan: str | None = None
 ) -> EvalPanel:
-    """The evaluation panel of a station; `scene` is the name of the one being chosen, "" for the last one.
+    """Return the evaluation panel of a station.
 
-    `plan`: the name of the one to work on, "" for none; None goes on with that of the last trial.
+    Args:
+        station: The station.
+        user: User who sees the panel.
+        sight: Visibility of that user.
+        scene: Name of the scene being chosen; "" for the last one.
+        plan: Name of the plan to work on; "" for none, None for that of the last trial.
     """
     trial = trial_open(station)
     last = None if trial else trial_list().filter(station=station).first()
@@ -173,7 +174,7 @@ def eval_panel(
 
 
 def _plan(plans: tuple[Plan, ...], name: str | None, last: Trial | None) -> Plan | None:
-    """The one that was asked for; else that of the last trial, as long as it is open."""
+    """Return the plan called `name`; without a name, that of the last trial if it is still open."""
     if name is not None:
         return next((plan for plan in plans if plan.name == name), None)
     handout = handout_of(trial=last) if last else None
@@ -190,7 +191,7 @@ def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:
 
 
 def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Position | None:
-    """The one after the last trial's; the same again where that trial has no score."""
+    """Return the position after the last trial's, or the same if that trial has no score."""
     if not positions:
         return None
     if last is None or last.position not in positions:
@@ -200,6 +201,6 @@ def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Posit
 
 
 def _is_set_up(trial: Trial) -> bool:
-    """True if the last set-up of the station that may have been carried out was for this trial."""
+    """Return True if the last set-up of the station that may have been executed was for this trial."""
     last = last_set_up(station=trial.station)
     return last is not None and last == trial.setup

@@ -1,4 +1,4 @@
-"""A process of the web: daphne in this process, with what it does beside, ended by signal or lifeline."""
+"""Web server process: Daphne and a background service, ended by a signal or by its lifeline."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, Protocol
 
-from daphne.server import Server, twisted_loop  # first: it decides which reactor there is
+from daphne.server import Server, twisted_loop  # must come first: it selects the reactor
 
 # isort: split
 from twisted.internet import reactor, task
@@ -23,23 +23,27 @@ from evaweb.console.reading import until_read
 from evaweb.console.sockets import LimitedWebSocket
 from evaweb.lock_wait import limit_page_waits
 
-_ACCEPTED = 16  # connections that are taken up in one turn of the loop
-_MOST_WAITING = 4096  # connections without a whole request, where a quarter of all files is as many
+_ACCEPTED = 16  # connections accepted per turn of the event loop
+_MOST_WAITING = 4096  # connections without a whole request, unless a quarter of the file limit is less
 _SWEEP_S = 1.0
-_THREADS = 16  # for what live pages ask the database
-_LAST_S = 4.0  # for requests that are under way, before the process ends all the same
-_LARGEST_REQUEST = 2 * 1024 * 1024  # bytes over a websocket, as over REST: a press may say whatever it likes
-_TURN_S = 0.001  # of the interpreter, where others wait for it: an e-stop takes several, and each is 5 ms by default
+_THREADS = 16  # threads for database queries of live pages
+_LAST_S = 4.0  # grace period for requests in progress before the process exits
+_LARGEST_REQUEST = (
+    2 * 1024 * 1024
+)  # [bytes] over a websocket, the same as over REST: a press may carry any reason
+_TURN_S = (
+    0.001  # switch interval of the interpreter: an e-stop needs several switches, of 5 ms each by default
+)
 
 
 class BackgroundService(Protocol):
-    """Service of a process, for as long as the process serves."""
+    """Service that runs while the process serves."""
 
     def start(self) -> None:
-        """It serves."""
+        """Start; called when the process serves."""
 
     def end(self) -> None:
-        """It ends."""
+        """Stop."""
 
 
 def serve(
@@ -51,10 +55,10 @@ def serve(
     request: type[Request] = Request,
     nice: int = 0,
 ) -> None:
-    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; prints where as JSON.
+    """Serve until SIGINT, SIGTERM or, with `lifeline`, the end of standard input; print the address as JSON.
 
-    Not until then it gives way to others by `nice`: a start takes seconds of the processor, and a busy machine gives
-    one that gives way half a minute for them.
+    The priority is lowered by `nice` only when serving has begun: starting takes seconds of processor time, which
+    would become half a minute at low priority on a busy machine.
     """
     sys.setswitchinterval(_TURN_S)
     address = _address(listener)
@@ -65,7 +69,7 @@ def serve(
         partial(LimitedFactory, arrivals=arrivals, request=request),
         arrivals,
         application,
-        endpoints=[f"fd:fileno={listener.detach()}"],  # which is Twisted's from now on
+        endpoints=[f"fd:fileno={listener.detach()}"],  # the descriptor belongs to Twisted from here on
         websocket_max_message_size=_LARGEST_REQUEST,
         websocket_max_frame_size=_LARGEST_REQUEST,
         server_name="eva",
@@ -89,19 +93,19 @@ class _Server(Server):
         self._entrance, self._arrivals = entrance, arrivals
 
     async def handle_reply(self, protocol: Any, message: Any) -> None:
-        """Hand a part of an answer on; done once its next piece may be made."""
+        """Send a part of an answer; returns when the next piece may be produced."""
         await super().handle_reply(protocol, message)
         if message["type"] == "http.response.body" and message.get("more_body"):
             await until_read(protocol)
 
     def listen_success(self, port: Any) -> None:
-        """Daphne makes its own factory and listens with it: ours stands before it from now on."""
+        """Wrap Daphne's factory with ours, after Daphne has started to listen with its own."""
         super().listen_success(port)
         port.factory = self._entrance(port.factory)
         self.ws_factory.protocol = LimitedWebSocket
 
         def few_at_once() -> None:
-            port.numberAccepts = _ACCEPTED  # which Twisted raises as long as there are more
+            port.numberAccepts = _ACCEPTED  # Twisted raises it while more connections wait
             type(port).doRead(port)
 
         port.doRead = few_at_once
@@ -109,14 +113,14 @@ class _Server(Server):
 
 
 def set_nice(nice: int) -> None:
-    """Have all threads of this process that there are, and those that they start, be nicer by so much."""
+    """Raise the niceness of all threads of this process, and of the threads that they start, by `nice`."""
     for thread in map(int, os.listdir("/proc/self/task")):
-        with suppress(ProcessLookupError):  # it has ended
+        with suppress(ProcessLookupError):  # the thread has ended
             os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nice)
 
 
 def raise_file_limit() -> int:
-    """As many open files and connections as the system lets this process have; how many."""
+    """Raise the limit of open files and connections to the hard limit; return it."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     return hard
@@ -134,7 +138,7 @@ def _address(listener: socket.socket) -> dict[str, Any]:
 
 
 def _watch(server: Server) -> None:
-    """The process that started us holds the other end of our standard input."""
+    """Stop the server when standard input ends: the parent process holds its other end."""
     while os.read(0, 4096):
         pass
     events: Any = reactor
@@ -142,7 +146,7 @@ def _watch(server: Server) -> None:
 
 
 def _exit_after_grace() -> None:
-    """A thread that waits for the database or a station cannot be interrupted; it must not keep us."""
+    """Exit after a grace period, because a thread that waits for the database or a station cannot be interrupted."""
     last = threading.Timer(_LAST_S, os._exit, (1,))
     last.daemon = True
     last.start()

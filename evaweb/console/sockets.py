@@ -1,6 +1,6 @@
-"""Websockets beyond what consumers count: pings, messages in endless parts, and clients that do not read.
+"""Websocket limits that consumers cannot enforce: pings, endless fragments, and clients that do not read.
 
-Browsers do none of that of themselves.
+Browsers do none of this on their own.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from django.conf import settings
 
 from evaweb.console.quota import MessageQuota
 
-PING = 20  # messages that a ping counts as: 20 at once, 10 a second
-_MOST_PARTS = 64  # of one message
-_READ = 4096  # bytes of one socket in one turn of the loop; a message is longer seldom
+PING = 20  # cost of a ping in messages: a burst of 20 pings, 10 per second
+_MOST_PARTS = 64  # fragments per message
+_READ = 4096  # [bytes] read per socket and turn of the event loop; few messages are longer
 
 
 class LimitedWebSocket(WebSocketProtocol):  # type: ignore[misc]
-    """A websocket of daphne's that is cut off where it pings or divides without end, or does not read."""
+    """Daphne's websocket, aborted if it floods with pings or fragments, or does not read."""
 
     def onConnect(self, request: object) -> object:
         self._quota, self._parts = MessageQuota(), 0
-        self.transport.transport.bufferSize = _READ  # our wrapper's
+        self.transport.transport.bufferSize = _READ  # of the transport below our wrapper
         return super().onConnect(request)
 
     def onPing(self, payload: bytes) -> None:
@@ -45,7 +45,7 @@ class LimitedWebSocket(WebSocketProtocol):  # type: ignore[misc]
         super().onMessage(payload, isBinary)
 
     def sendData(self, *given: Any, **named: Any) -> None:
-        """Whatever it is sent, which stays here until it is read."""
+        """Send data, which is buffered here until it is read; abort if too much is unread."""
         super().sendData(*given, **named)
         most = settings.EVA_UNREAD_BYTES
         if unsent(self.transport.transport) > most:
@@ -63,6 +63,9 @@ class LimitedWebSocket(WebSocketProtocol):  # type: ignore[misc]
 
 
 def unsent(transport: Any) -> int:
-    """What a transport of Twisted's still holds because the other end does not read [bytes]; it counts for itself."""
+    """Return the bytes that a Twisted transport has buffered because the peer does not read.
+
+    Twisted offers no public count, hence the private attributes.
+    """
     held: int = len(transport.dataBuffer) - transport.offset + transport._tempDataLen
     return held

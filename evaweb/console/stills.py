@@ -1,4 +1,4 @@
-"""The newest picture of a station's first camera, for pages that show many stations: one question for all viewers."""
+"""Newest image of a station's first camera, for pages with many stations: one request serves all viewers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.core.sentences import Pattern
 _HAS_NO_CAMERA = Pattern("console.stills.has_no_camera", "{name} has no camera")
 _SENDS_NO_PICTURE = Pattern("console.stills.sends_no_picture", "{name} sends no picture of {cameras}")
 
-KEPT_S = 4.0  # nobody is shown an older one as new
+KEPT_S = 4.0  # age limit of a cached image
 _PATIENCE_S = 0.8
 
 _stills: dict[str, tuple[float, bytes]] = {}
@@ -24,7 +24,11 @@ _turns: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 
 def still_of(station: Station) -> bytes:
-    """A JPEG, at most KEPT_S old; NotFound where the station does not run or shows nothing."""
+    """Return a JPEG that was requested at most KEPT_S ago.
+
+    Raises:
+        NotFound: If the station does not run, has no camera or sends no image.
+    """
     link = feeds.get(station.name).link
     cameras = cameras_of(station)[:1]
     if not link.ok or not cameras:
@@ -34,13 +38,13 @@ def still_of(station: Station) -> bytes:
         if not at or time.monotonic() - at > KEPT_S:
             jpeg = _asked(station, cameras)
             _stills[station.name] = (time.monotonic(), jpeg)
-    if not jpeg:  # known as well: nobody else waits for it meanwhile
+    if not jpeg:  # a missing image is cached too, so that other viewers need not wait for it
         raise NotFound(_SENDS_NO_PICTURE(name=station.name, cameras=cameras[0]))
     return jpeg
 
 
 def _asked(station: Station, cameras: list[str]) -> bytes:
-    """Empty where none came in time."""
+    """Return the image, b"" if none came in time."""
     try:
         return pictures.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
     except Conflict:

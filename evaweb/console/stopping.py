@@ -1,6 +1,6 @@
-"""Stops by a page: at once where the user is known, and also where the database does not tell the user.
+"""Stops by a page: executed at once if the user is known, and also if the database cannot name the user.
 
-Nothing here waits for the database, and no number of presses is too many.
+Nothing here waits for the database, and the number of presses is not limited.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ from evaweb.stations import commands, stops
 from evaweb.stations.models import CommandStatus, Station
 
 log = logging.getLogger(__name__)
-_MOST_UNANSWERED = 200  # of one page; what it says beyond is done, with no word of its own
+_MOST_UNANSWERED = 200  # per page; stops beyond it are executed, but not acknowledged individually
 SendCallback = Callable[[dict[str, Any]], None]
-BackgroundCallback = Callable[[Coroutine[Any, Any, None]], None]  # to the end, also when the page is closed
+BackgroundCallback = Callable[
+    [Coroutine[Any, Any, None]], None
+]  # runs to its end, also when the page is closed
 
 
 class PageStops:
-    """The stops of one page at a station; belongs to the event loop. `login` is the user's, once that is known.
+    """Stops of one page at a station; for the event loop only. Set `login` when the user is known.
 
-    `found` are the credentials that it came with, and `share` from where.
+    `found` are the page's credentials, and `share` identifies its client for the limit of lookups.
     """
 
     def __init__(
@@ -51,7 +53,7 @@ class PageStops:
         self._unanswered = 0
 
     def handle(self, request: EStop | Stop) -> None:
-        """Do it; what came of it is said when it is known."""
+        """Execute the request; the page is sent the outcome when it is known."""
         at = timezone.now()
         if self.login is None:
             self._go_on(
@@ -65,7 +67,7 @@ class PageStops:
     async def _press_of(self, request: EStop, at: datetime) -> None:
         try:
             login = await credentials.resolve_presser(self._found, self._share)
-        except (Unverifiable, LookupOverload) as fault:  # no crowd refuses an e-stop
+        except (Unverifiable, LookupOverload) as fault:  # overload must not refuse an e-stop
             audit.estop_unverified(self._station, fault)
             self._press(request, None, at, str(fault))
         else:
@@ -91,7 +93,7 @@ class PageStops:
         self._answer("estop", uuid, answer, note)
 
     def _stop(self, request: Stop, login: Login, at: datetime) -> None:
-        """Of a viewer nothing is done, and nothing written down."""
+        """Execute a stop; a viewer's is refused and not recorded."""
         if login.role is Role.VIEWER:
             refused = stops.Answer(CommandStatus.REFUSED, stops.refused_to_a_viewer(login.username))
             self._acknowledge(request.kind, request.uuid, refused)

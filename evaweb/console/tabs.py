@@ -1,4 +1,4 @@
-"""The tab bar: which pages there are, and which one an address belongs to."""
+"""Tab bar: the pages that exist, and the one to which an address belongs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from evaweb.console import selectors
 
 @dataclass(frozen=True, slots=True)
 class Tab:
-    """One tab; `current` where the page that is shown belongs to it."""
+    """One tab; `current` if the displayed page belongs to it."""
 
     title: str
     address: str
@@ -20,12 +20,12 @@ class Tab:
 
 
 _STATION_TABS = (("Debug", "station-debug"), ("Collect", "station-collect"), ("Eval", "station-eval"))
-_COLLECTING = "station-collect"  # there only where the station's deployment says how to collect
+_COLLECTING = "station-collect"  # present only if the station's deployment configures collecting
 _LAB_TABS = (("Replay", "/replay/"), ("Result", "/result/"))
 
 
 def page_tabs(request: HttpRequest) -> list[Tab]:
-    """The tabs in their order; those of a station lead to the one this browser last used."""
+    """Return the tabs in order; station tabs lead to the station that this browser last used."""
     station = selectors.last_used_station(session=request.session)
     match = request.resolver_match
     name = match.url_name if match else ""

@@ -1,17 +1,17 @@
-"""Requests take turns of the event loop: a crowd keeps no connected client from being heard."""
+"""Scheduling of requests over turns of the event loop, so that many requests do not delay connected clients."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
 
-AT_ONCE = 8  # a request, or the handshake of a websocket, is 1 ms or 2
+AT_ONCE = 8  # a request, or a websocket handshake, takes 1 ms or 2
 
 
 class TurnScheduler:
-    """Work of which `most` is begun in one turn of the loop, the rest in those that follow, in order.
+    """Scheduler that starts at most `most` work items per turn of the event loop, in order.
 
-    `soon` has something done in the next turn.
+    `soon` schedules a function for the next turn.
     """
 
     def __init__(self, soon: Callable[[Callable[[], None]], object], most: int = AT_ONCE) -> None:
@@ -20,7 +20,7 @@ class TurnScheduler:
         self._planned = False
 
     def submit(self, work: Callable[[], object]) -> None:
-        """Have it done."""
+        """Queue `work`."""
         self._waiting.append(work)
         self._plan()
 
@@ -32,6 +32,6 @@ class TurnScheduler:
     def _turn(self) -> None:
         taken = [self._waiting.popleft() for _ in range(min(self._most, len(self._waiting)))]
         self._planned = False
-        self._plan()  # first: work that fails keeps no other waiting
+        self._plan()  # first, so that failing work does not block the others
         for work in taken:
             work()

@@ -1,4 +1,4 @@
-"""Addresses of the pages of console."""
+"""URL patterns of the console's pages."""
 
 from __future__ import annotations
 

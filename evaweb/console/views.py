@@ -1,4 +1,4 @@
-"""The pages of the console and the fragments they fetch."""
+"""Pages of the console, and the fragments that they fetch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _REMEMBER_S = 0.5
 
 
 def home(request: HttpRequest) -> HttpResponse:
-    """What matters now; with htmx one of its parts: the stations, the alarms alone, or all but the stations."""
+    """Render the home page; with htmx one part of it: the stations, the alarms, or everything except the stations."""
     htmx: Any = request.htmx  # type: ignore[attr-defined]
     part = (htmx.target if htmx.target in ("now", "alarms") else "stations") if htmx else ""
     context: dict[str, Any] = {}
@@ -47,7 +47,7 @@ def home(request: HttpRequest) -> HttpResponse:
 
 @require_safe
 def history(request: HttpRequest) -> HttpResponse:
-    """How the stations did in the last week."""
+    """Render the stations' last week."""
     return render(
         request, "console/history.html", {"histories": list(histories(visibility_for_request(request)))}
     )
@@ -55,7 +55,9 @@ def history(request: HttpRequest) -> HttpResponse:
 
 @require_safe
 def still(request: HttpRequest, name: str) -> HttpResponse:
-    """The newest picture of a station's first camera; an empty answer where there is none, which is no fault."""
+    """Return the newest image of a station's first camera; an empty answer (204) if there is none, which is
+    not a fault.
+    """
     found = _station(name)
     try:
         return HttpResponse(still_of(found), content_type="image/jpeg")
@@ -64,12 +66,12 @@ def still(request: HttpRequest, name: str) -> HttpResponse:
 
 
 def station(request: HttpRequest, name: str) -> HttpResponse:
-    """A station's address without a page."""
+    """Redirect a station's bare address to its evaluation page."""
     return redirect("station-eval", name=_station(name).name)
 
 
 def debug(request: HttpRequest, name: str) -> HttpResponse:
-    """A station by hand: every command, every figure."""
+    """Render the page for operating a station manually: every command, every value."""
     found, seen = _station(name), visibility_for_request(request)
     if name in seen.busy_stations:
         return _page(request, found, "veiled", {"why": seen.plans})
@@ -78,7 +80,7 @@ def debug(request: HttpRequest, name: str) -> HttpResponse:
 
 
 def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
-    """The episode that ?replay= names, as this station would play it; why not, where it is none."""
+    """Return the episode named by ?replay=, as this station would replay it, or the reason if it cannot."""
     source = request.GET.get("replay", "")
     if not source:
         return {}
@@ -90,37 +92,37 @@ def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
 
 
 def evaluate(request: HttpRequest, name: str) -> HttpResponse:
-    """A station with the trial that is being made there."""
+    """Render a station's evaluation page with its current trial."""
     found = _station(name)
     return _page(request, found, "eval", _panel(request, found))
 
 
 def panel(request: HttpRequest, name: str) -> HttpResponse:
-    """The four steps of a trial, to be put into the page."""
+    """Render the four steps of a trial as a fragment."""
     return render(request, "console/panel.html", _panel(request, _station(name)))
 
 
 def collect(request: HttpRequest, name: str) -> HttpResponse:
-    """A station with the session that is collected there."""
+    """Render a station's collecting page with its current session."""
     found = _station(name)
     shown = {**collecting.session_panel(station=found), **collecting.progress_panel(station=found)}
     return _page(request, found, "collect", shown)
 
 
 def collect_session(request: HttpRequest, name: str) -> HttpResponse:
-    """The session, or how one is opened, to be put into the page."""
+    """Render the session, or the form that opens one, as a fragment."""
     found = _station(name)
     return render(request, "collect/session.html", collecting.session_panel(station=found))
 
 
 def collect_progress(request: HttpRequest, name: str) -> HttpResponse:
-    """Counts, the last episode and the queue, to be put into the page."""
+    """Render counts, last episode and queue as a fragment."""
     found = _station(name)
     return render(request, "collect/progress.html", collecting.progress_panel(station=found))
 
 
 def lease(request: HttpRequest, name: str) -> HttpResponse:
-    """Holder of the lease and those that wait for it, to be put into the page."""
+    """Render the holder of the lease and the waiting requests as a fragment."""
     return render(request, "console/lease.html", _lease(request, _station(name)))
 
 
@@ -148,7 +150,7 @@ def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, An
 
 
 def _remember(request: HttpRequest, station: Station) -> None:
-    """Remember the station that this browser's tabs lead to; a database that refuses changes nothing else."""
+    """Remember the station that this browser's tabs lead to; a database failure is only logged."""
     if request.session.get(selectors.SESSION_KEY) == station.name:
         return
     request.session[selectors.SESSION_KEY] = station.name
@@ -163,7 +165,7 @@ def _remember(request: HttpRequest, station: Station) -> None:
 
 
 def _config(request: HttpRequest, station: Station, page: str, robot: dict[str, Any]) -> dict[str, Any]:
-    """Settings that the page's modules need before the socket is open."""
+    """Return the settings that the page's modules need before the socket is open."""
     api = f"/api/v1/stations/{station.name}"
     return {
         "page": page,

@@ -1,4 +1,4 @@
-"""The page of jobs: what the worker does, has to do, and could not do."""
+"""Page of jobs: running, queued and failed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from evaweb.plans.models import Plan
 from evaweb.roles import Role, require_role, role_of
 
 PER_PAGE = 50
-# What people call the kinds.
+# Display names of the kinds.
 KINDS = {
     "preview": "Preview",
     "quality": "Checks",
@@ -49,7 +49,7 @@ _ACTS = {"cancel": "cancelled", "repeat": "asked for again"}
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A job in words: what it is about, where that is, how far it is, and what may be done with it."""
+    """Job as displayed: its subject with an address, its progress, and the possible actions."""
 
     job: Job
     title: str
@@ -57,12 +57,12 @@ class Row:
     address: str
     pace: Pace
     said: str
-    lacks: str  # why no running worker can take it
-    covered: bool = False  # of a blind trial: not when it was, nor of which
+    lacks: str  # reason for which no running worker can run it
+    covered: bool = False  # job of a blind trial: neither its time nor its subject is shown
 
     @property
     def may_cancel(self) -> bool:
-        """True if it has not ended, and nobody has cancelled it."""
+        """True if it has not ended and was not cancelled."""
         return self.job.cancelled_by_id is None and self.job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
 
     @property
@@ -72,7 +72,7 @@ class Row:
 
     @property
     def minutes_left(self) -> str:
-        """Time that is left, in words."""
+        """Remaining time as text."""
         left = self.pace.left_s
         if left is None:
             return ""
@@ -81,7 +81,7 @@ class Row:
 
 @require_GET
 def jobs(request: HttpRequest) -> HttpResponseBase:
-    """What runs, waits and failed; done ones where they are asked for."""
+    """Render running, queued and failed jobs; finished ones if requested."""
     sight = visibility_for_request(request)
     listing = Listing(request.GET, _columns(sight), _FILTERS)
     found = jobs_listed(**listing.chosen)
@@ -102,7 +102,7 @@ def jobs(request: HttpRequest) -> HttpResponseBase:
 
 @require_POST
 def job_act(request: HttpRequest, what: str) -> HttpResponse:
-    """Cancel a job, or ask for one again that failed; operators."""
+    """Cancel a job, or repeat a failed one; for operators."""
     user: Any = request.user
     try:
         require_role(user, Role.OPERATOR)
@@ -119,7 +119,7 @@ def job_act(request: HttpRequest, what: str) -> HttpResponse:
 
 
 def row_of(job: Job, sight: Visibility, having: Served) -> Row:
-    """In words; of one that may tell which checkpoint it is about no more than that it is there."""
+    """Return a job as displayed; one that may reveal a hidden checkpoint shows only that it exists."""
     title, lacks, said, cover = (
         KINDS.get(job.kind, job.kind),
         having.lacks(job),
@@ -135,7 +135,7 @@ def row_of(job: Job, sight: Visibility, having: Served) -> Row:
 
 
 def _about(job: Job) -> tuple[str, str]:
-    """What it is about, and the address of that."""
+    """Return the job's subject and its address."""
     if "uuid" in job.args:
         uuid = str(job.args["uuid"])
         return f"episode {uuid[:8]}", reverse("replay", args=[uuid])

@@ -1,4 +1,4 @@
-"""Catalogues of the languages that sentences are shown in."""
+"""Catalogues of the languages in which sentences are shown."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _NO_LANGUAGE = Pattern("console.languages.none", "language {code!r:.20} is not t
 
 
 def catalogue(request: HttpRequest, code: str) -> HttpResponse:
-    """The patterns of a language by id, as static/site/sentences.js reads them."""
+    """Return the patterns of a language by id, as static/site/sentences.js reads them."""
     found = language(code)
     if found is None:
         known = ", ".join(one.code for one in offered()) or "none but English"
         raise NotFound(_NO_LANGUAGE(code=code, known=known))
     answer = JsonResponse({"name": found.name, "sentences": dict(found.patterns)})
-    answer["Cache-Control"] = "no-cache"  # asked for by every page, and sent where it has changed
+    answer["Cache-Control"] = "no-cache"  # every page requests it; it is sent only if it has changed
     answer["ETag"] = f'"{hashlib.sha256(answer.content).hexdigest()[:32]}"'
     return get_conditional_response(request, etag=answer["ETag"], response=answer) or answer

@@ -1,1 +1,1 @@
-"""Find anything: what there is in the lab, by a few letters of its name."""
+"""Search of everything in the lab by a few letters of its name."""

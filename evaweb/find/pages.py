@@ -1,4 +1,4 @@
-"""The pages of the lab, as they are found: by their titles and by what people call them."""
+"""Pages of the lab for the search, by title and common synonyms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaweb.roles import Role
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """One page; `more` are other words for it."""
+    """Page; `more` are synonyms for the search."""
 
     title: str
     route: str
@@ -53,7 +53,7 @@ _PAGES = (
 
 
 def pages_of(role: Role) -> list[tuple[Page, str]]:
-    """Those that the role may open, each with its address."""
+    """Return the pages that the role may open, with their addresses."""
     found = [(page, _address(page.route)) for page in _PAGES if role.includes(page.least)]
     return [(page, address) for page, address in found if address]
 

@@ -1,4 +1,4 @@
-"""How well a text fits what was typed: exactly, as its beginning, as the beginning of its words, anywhere in it."""
+"""Rank of a text for a query: exact, prefix, word prefixes, or substring."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _WORD = re.compile(r"[^\W_]+")
 
 
 class Rank(IntEnum):
-    """The smaller, the nearer to the top."""
+    """Rank of a match; smaller is better."""
 
     EXACT = 0
     PREFIX = 1
@@ -18,12 +18,12 @@ class Rank(IntEnum):
 
 
 def words_of(query: str) -> list[str]:
-    """The words of a query, each once, as they are compared."""
+    """Return the distinct words of a query, case-folded."""
     return list(dict.fromkeys(query.casefold().split()))
 
 
 def rank(query: str, name: str, more: str = "") -> Rank | None:
-    """Rank of a thing with that name; `more` is what else it is known by. None where a word is in neither."""
+    """Return the rank of an item; `more` are further searchable words. None if a word is in neither."""
     wanted, called, text = " ".join(query.casefold().split()), name.casefold(), f"{name} {more}".casefold()
     if wanted == called:
         return Rank.EXACT

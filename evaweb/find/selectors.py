@@ -1,4 +1,4 @@
-"""What a few letters find: each kind of thing by its own index, and of checkpoints only those that may be known."""
+"""Search by kind, each by its own index; only checkpoints that the user may know are found."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ _Q_HAS_CHARACTERS_ALLOWED_1 = Pattern(
     "q has {count} characters; allowed: 1 to {longest}",
 )
 
-LONGEST = 200  # characters
-MOST = 8  # of a group
-_LOOKED_AT = 200  # rows of one kind, the best fitting first
-_COMPARED = 3  # words that the database looks for, the longest: the others are looked for in what it finds
-_DIGITS = 9  # of the largest number of a trial
+LONGEST = 200  # [characters] longest query
+MOST = 8  # items per group
+_LOOKED_AT = 200  # rows per kind, best matches first
+_COMPARED = 3  # longest words of the query that the database filters by; the others are matched in the result
+_DIGITS = 9  # digits of the largest trial number
 _CODE = re.compile(r"[A-Za-z0-9]{2,8}")
 _UUID = re.compile(r"[0-9a-f]{4,32}")
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One thing: its name, a few words on it, and where it is."""
+    """Item: name, details and address."""
 
     title: str
     detail: str
@@ -53,18 +53,22 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Things of one kind, the best fitting first; `more` where there are others."""
+    """Items of one kind, best first; `more` if there are others."""
 
     name: str
     items: tuple[Found, ...]
     more: bool
 
 
-Candidate = tuple[Found, str]  # with what else it is known by
+Candidate = tuple[Found, str]  # item with its further searchable words
 
 
 def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
-    """Groups of what fits, without empty ones. EvaError unless the query has 1 to LONGEST characters."""
+    """Return the non-empty groups of matches.
+
+    Raises:
+        EvaError: If the query does not have 1 to LONGEST characters.
+    """
     query = " ".join(query.split())
     if not 0 < len(query) <= LONGEST:
         raise EvaError(_Q_HAS_CHARACTERS_ALLOWED_1(count=len(query), longest=LONGEST))
@@ -89,14 +93,14 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
 
 
 def _ranked(query: str, candidates: Iterable[Candidate]) -> list[Found]:
-    """Those that fit, the best first; of equals in the order in which they came."""
+    """Return the matching items, best first, equal ranks in the given order."""
     fits = [(rank(query, found.title, more), found) for found, more in candidates]
     known = [(fit, found) for fit, found in fits if fit is not None]
     return [found for _, found in sorted(known, key=lambda one: one[0])]
 
 
 def _narrowed(rows: QuerySet[Any], query: str, *fields: str) -> QuerySet[Any]:
-    """Rows with the longest words of the query in some of the fields, those that begin with it first."""
+    """Return the rows with the longest words of the query in some of the fields, prefix matches first."""
     for word in sorted(words_of(query), key=len, reverse=True)[:_COMPARED]:
         rows = rows.filter(_any_of(fields, "icontains", word))
     nearness = Case(
@@ -115,11 +119,11 @@ def _any_of(fields: Iterable[str], lookup: str, value: str) -> Q:
     return found
 
 
-# --- what has few rows ---------------------------------------------------------------------------------------
+# --- kinds with few rows -------------------------------------------------------------------------------------
 
 
 def _stations(query: str) -> Iterator[Candidate]:
-    """Each with its Eval page; its other pages where they are asked for by name."""
+    """Yield each station with its Eval page, and its other pages if the query names them."""
     words = words_of(query)
     for station in Station.objects.order_by("-active", "name"):
         detail = " · ".join((station.name, station.robot, *(() if station.active else ("switched off",))))
@@ -164,14 +168,14 @@ def _scenes(query: str, role: Role) -> Iterator[Candidate]:
 
 
 def _administered(kind: str, key: int, name: str, role: Role) -> str:
-    """Where it is edited by those who may; for all others what was recorded of it."""
+    """Return the address of the editor for administrators, and of the recordings for other users."""
     if role is Role.ADMIN:
         return reverse(f"admin:trials_{kind}_change", args=[key])
     return f"{reverse('replay-list')}?{urlencode({'words': name})}"
 
 
 def _tags(sight: Visibility) -> Iterator[Candidate]:
-    """Each leads to the episodes that have it."""
+    """Yield the tags, each with the address of its episodes."""
     for words, n in tag_counts(sight=sight).items():
         detail = f"{n} episode{'' if n == 1 else 's'}"
         yield Found(words, detail, f"{reverse('replay-list')}?{urlencode({'tag': words})}"), "tag tagged"
@@ -189,16 +193,16 @@ def _pages(role: Role) -> Iterator[Candidate]:
 
 
 def _without(query: str, kind: str) -> str:
-    """The query without the name of the kind, which is in no row."""
+    """Return the query without the name of the kind, which no row contains."""
     left = [word for word in query.split() if word.casefold() not in (kind, f"{kind}s")]
     return " ".join(left)
 
 
-# --- what has many, each by an index -------------------------------------------------------------------------
+# --- kinds with many rows, each by an index ------------------------------------------------------------------
 
 
 def _trials(query: str) -> list[Found]:
-    """By number, then by code, each exactly and then as a beginning."""
+    """Return the trials by number, then by code, each exact matches first, then prefixes."""
     asked = _without(query, "trial").removeprefix("#")
     rows = Trial.objects.select_related("scene", "position", "station", "handout")
     found: dict[int, Trial] = {}
@@ -217,7 +221,7 @@ def _trials(query: str) -> list[Found]:
 
 
 def _numbers(digits: str) -> Iterator[tuple[int, int]]:
-    """The numbers that begin with these digits: a span for each length."""
+    """Yield the ranges of numbers with these leading digits, one per length."""
     for more in range(_DIGITS - len(digits) + 1):
         yield int(digits) * 10**more, (int(digits) + 1) * 10**more - 1
 
@@ -230,7 +234,7 @@ def _trial(trial: Trial) -> Found:
 
 
 def _episodes(query: str) -> list[Found]:
-    """By the beginning of their uuid, of at least four characters."""
+    """Return the episodes by a prefix of their uuid, of at least four characters."""
     asked = _without(query, "episode").casefold().replace("-", "")
     if not _UUID.fullmatch(asked):
         return []

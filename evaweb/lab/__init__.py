@@ -1,1 +1,1 @@
-"""Everything on one machine: web, worker, stations and, for the demo, stand-ins for robot and policies."""
+"""Complete lab on one machine: web, worker, stations and, in the demo, stand-ins for robot and policies."""

@@ -1,9 +1,9 @@
-"""Registers the app."""
+"""Django configuration of the app."""
 
 from django.apps import AppConfig
 
 
 class LabConfig(AppConfig):
-    """Everything on one machine."""
+    """Complete lab on one machine."""
 
     name = "evaweb.lab"

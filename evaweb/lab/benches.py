@@ -1,4 +1,4 @@
-"""Stations of a lab as it starts them: a deployment file, and what is set on top of it."""
+"""Stations that a lab starts: deployment file and overrides."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runtime.config.loader import ConfigurationError, load
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """One station of this lab: its deployment file and what is set on top of it; one that `runs` is started already."""
+    """Station of this lab: its deployment file and overrides; with `runs` it is running already."""
 
     deployment: Path
     assignments: Sequence[str] = ()
@@ -24,7 +24,11 @@ class Bench:
 
 
 def registered(bench: Bench) -> str:
-    """The name of a bench's station, which the database has from now on; LabError says what is wrong with its file."""
+    """Register the station of a bench in the database, and return its name.
+
+    Raises:
+        LabError: If its deployment file is not valid.
+    """
     try:
         deployment = load(bench.deployment, bench.assignments).deployment
     except ConfigurationError as fault:
@@ -39,6 +43,6 @@ def registered(bench: Bench) -> str:
 
 
 def program_of(bench: Bench) -> ProgramSpec:
-    """The runtime of a bench's station."""
+    """Return the program of a bench's runtime."""
     assignments = [f'data_dir="{settings.DATA_DIR}"', *bench.assignments]
     return programs.station(str(bench.deployment), assignments)

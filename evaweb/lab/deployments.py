@@ -1,8 +1,8 @@
-"""Deployment files of the data folder: written from choices on a page, started by the lab where they are simulated.
+"""Deployment files of the data folder: written by the first-steps pages; simulated ones are started by the lab.
 
-A file is DATA/deployments/STATION.toml. One that was made by choosing a simulated station is started with its bench and
-its policies by the lab of that data folder; any other is a draft that a person starts. What the lab is doing
-about a file stands beside it, in STATION.json.
+A file is DATA/deployments/STATION.toml. If it was created as a simulated station, the lab of this data folder starts
+it with its bench and policies; any other is a draft that a person starts. The lab writes the status of a deployment to
+STATION.json in the same folder.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _TABLETOP = settings.BASE_DIR / "deployments" / "tabletop.toml"
 _BASE = settings.BASE_DIR / "deployments" / "base.toml"
 _CHECK_S = 60.0
 _CHOSEN = "A simulated bench: the lab of this data folder starts it, with its policies."
-_ASK_S = 1.0  # how long a station is waited for that is to be removed
-# Keys of a part that no page writes, each with who does: with them this machine would run something.
+_ASK_S = 1.0  # timeout for a station that is to be removed
+# Keys that no page may write, with the reason: they would make this machine run a program.
 BY_HAND = {
     ("transport", "simulated"): "a simulated station is made with a choice of its own",
     ("transport", "python"): "another program is written into the file by hand",
@@ -54,14 +54,14 @@ BY_HAND = {
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """A deployment file of the data folder, by the name of its station."""
+    """Deployment file of the data folder, named after its station."""
 
     name: str
     path: Path
 
     @property
     def changed_ns(self) -> int:
-        """When the file was last changed or touched, 0 for one that is gone."""
+        """Modification time of the file [ns], 0 if it was removed."""
         try:
             return self.path.stat().st_mtime_ns
         except FileNotFoundError:
@@ -69,9 +69,9 @@ class Kept:
 
     @property
     def chosen(self) -> bool:
-        """True if the file was written by the choice of a simulated station: the lab starts no other.
+        """True if the file was created as a simulated station: the lab starts no others.
 
-        It says so among the comments at its head, which nothing that is typed on a page gets into.
+        The mark is in the comments at the head of the file, where input from pages never goes.
         """
         try:
             lines = self.path.read_text("utf-8", "replace").split("\n")
@@ -80,7 +80,11 @@ class Kept:
         return f"# {_CHOSEN}" in takewhile(lambda line: line.startswith("#"), lines)
 
     def resolved(self) -> Resolved:
-        """The deployment; LabError says what is wrong with it."""
+        """Return the resolved deployment.
+
+        Raises:
+            LabError: If it is not valid.
+        """
         try:
             return load(self.path)
         except ConfigurationError as fault:
@@ -89,7 +93,7 @@ class Kept:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What the lab does about a deployment: what it is starting, that it is up, or why it is not."""
+    """Status of a deployment in the lab: what is being started, whether it is up, or why it failed."""
 
     doing: str = ""
     up: bool = False
@@ -97,13 +101,13 @@ class Standing:
 
 
 def is_simulated(resolved: Resolved) -> bool:
-    """True if the deployment's transport is a simulated node: the lab brings it along."""
+    """Return True if the deployment's transport is a simulated node, which the lab starts as well."""
     transport = resolved.deployment.transport
     return transport.kind == "zmq" and bool(getattr(transport, "simulated", False))
 
 
 def kept() -> list[Kept]:
-    """All of them, the oldest first."""
+    """Return all deployment files, oldest first."""
     found = [Kept(path.stem, path) for path in _folder().glob("*.toml")]
     return sorted(
         (one for one in found if re.fullmatch(STATION_NAME, one.name)), key=lambda one: one.changed_ns
@@ -111,13 +115,17 @@ def kept() -> list[Kept]:
 
 
 def kept_of(name: str) -> Kept | None:
-    """That of a station, None where it is none of the data folder's."""
+    """Return the deployment file of a station, or None."""
     path = _folder() / f"{name}.toml"
     return Kept(name, path) if re.fullmatch(STATION_NAME, name) and path.is_file() else None
 
 
 def write_simulated(*, name: str, robot: str) -> Kept:
-    """The deployment of a simulated bench with that robot; the lab starts it."""
+    """Write the deployment of a simulated bench with that robot; the lab then starts it.
+
+    Raises:
+        EvaError: If the name or the robot is not allowed, or the name is taken.
+    """
     if robot not in robots.robot_names():
         raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.robot_names())}")
     tree = {**tree_of(_TABLETOP), "station": name, "robot": robot}
@@ -125,7 +133,17 @@ def write_simulated(*, name: str, robot: str) -> Kept:
 
 
 def write_draft(*, name: str, robot: str, task: str, parts: Mapping[str, Mapping[str, str]]) -> Kept:
-    """A draft for a real robot, which the runtime can load; `parts`: transport, policy, and cameras.KEY, as typed."""
+    """Write a draft for a real robot that the runtime can load.
+
+    Args:
+        name: Name of the station.
+        robot: Name of the robot.
+        task: Task of the deployment.
+        parts: Typed values by table: transport, policy, and cameras.KEY.
+
+    Raises:
+        EvaError: If a value is not allowed, or the name is taken.
+    """
     if robot not in robots.robot_names():
         raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(robots.robot_names())}")
     tree = {**tree_of(_BASE), "station": name, "robot": robot, "task": task}
@@ -144,9 +162,10 @@ def write_draft(*, name: str, robot: str, task: str, parts: Mapping[str, Mapping
 
 
 def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
-    """Give the deployment's cameras the names of what they show; `shown`: name -> whose picture that is.
+    """Rename the deployment's cameras by what they show; `shown` maps each name to the camera whose image it shows.
 
-    EvaError where a picture is named twice, or where the robot's node names one of the cameras that are exchanged.
+    Raises:
+        EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.
     """
     found = kept_of(name)
     tree = tree_of(found.path) if found else {}
@@ -166,12 +185,12 @@ def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
 
 
 def command_of(path: Path) -> str:
-    """The command that starts the station of a deployment file on this machine."""
+    """Return the command that starts the station of a deployment file on this machine."""
     return shlex.join([sys.executable, "-m", "runtime", str(path), "--set", f"data_dir={settings.DATA_DIR}"])
 
 
 def faults_of(path: Path) -> str:
-    """What the runtime's own check says against a deployment, "" where it would start."""
+    """Return the errors that the runtime's own check finds in a deployment, "" if it would start."""
     try:
         done = subprocess.run(
             [
@@ -196,7 +215,7 @@ def faults_of(path: Path) -> str:
 
 
 def lab_runs() -> bool:
-    """True if a lab (manage.py lab, or demo) watches this data folder."""
+    """Return True if a lab (manage.py lab, or demo) runs on this data folder."""
     try:
         with (Path(settings.DATA_DIR) / "lab.lock").open("rb") as lock:
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -208,7 +227,7 @@ def lab_runs() -> bool:
 
 
 def standing_of(name: str) -> Standing:
-    """What the lab last said about a deployment."""
+    """Return the status of a deployment as last written by the lab."""
     try:
         told = json.loads((_folder() / f"{name}.json").read_bytes())
         return Standing(str(told["doing"]), bool(told["up"]), str(told["failed"]))
@@ -217,14 +236,22 @@ def standing_of(name: str) -> Standing:
 
 
 def tell(name: str, standing: Standing) -> None:
-    """Say what is being done about a deployment; the lab does. OSError where that cannot be written."""
+    """Write the status of a deployment; called by the lab.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
     written = _folder() / f".{name}.json"
     written.write_text(json.dumps(asdict(standing)), "utf-8")
     written.replace(_folder() / f"{name}.json")
 
 
 def try_again(*, name: str) -> None:
-    """Have the lab start a deployment anew that it could not start; NotFound."""
+    """Touch a deployment file, so that the lab tries to start it again.
+
+    Raises:
+        NotFound: If there is none.
+    """
     found = kept_of(name)
     if found is None:
         raise NotFound(f"{name!r:.80} has no deployment in the data folder")
@@ -232,9 +259,13 @@ def try_again(*, name: str) -> None:
 
 
 def remove(*, name: str) -> None:
-    """Remove a deployment: the lab ends what it brought with it. NotFound; Conflict while somebody works with it.
+    """Remove a deployment; the lab then ends the programs that it started for it.
 
-    A station that nothing happened at and no plan names goes with it; any other is switched off.
+    A station without any history or plan is deleted too; any other is deactivated.
+
+    Raises:
+        NotFound: If there is none.
+        Conflict: If the station is in use.
     """
     found = kept_of(name)
     if found is None:
@@ -253,7 +284,7 @@ def remove(*, name: str) -> None:
 
 
 def _deleted(station: Station) -> bool:
-    """Delete it where nothing refers to it."""
+    """Delete a station to which nothing refers; return whether it was deleted."""
     if Plan.objects.filter(stations=station).exists():
         return False
     try:
@@ -273,7 +304,7 @@ def _require_no_trial(station: Station) -> None:
 
 
 def _require_no_holder(station: Station) -> None:
-    """Nobody commands it; a lease of a station that does not answer is over, whatever was last heard of it."""
+    """Raise Conflict if a user holds the lease; the lease of a station that does not answer counts as ended."""
     lease = lease_open(station=station)
     if lease is None:
         return
@@ -286,7 +317,12 @@ def _require_no_holder(station: Station) -> None:
 
 
 def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
-    """EvaError where a key of BY_HAND is given anything but its default; ConfigurationError of a kind there is not."""
+    """Check that the keys of BY_HAND have their defaults.
+
+    Raises:
+        EvaError: If one has another value.
+        ConfigurationError: If the kind does not exist.
+    """
     for entry in draft.entries(part, typed.get("kind", "")):
         given = typed.get(entry.key, "").strip()
         who = BY_HAND.get((part, entry.key))
@@ -310,7 +346,7 @@ def _write(name: str, tree: dict[str, Any], about: str) -> Kept:
     try:
         _put(
             path, tree, about, place=os.link
-        )  # which never replaces: another page may write the same name just now
+        )  # link() never replaces a file: another page may write the same name at this moment
     except FileExistsError:
         raise _taken(name) from None
     return Kept(name, path)
@@ -323,7 +359,11 @@ def _taken(name: str) -> Conflict:
 def _put(
     path: Path, tree: Mapping[str, Any], *about: str, place: Callable[[Path, Path], object] = os.replace
 ) -> None:
-    """Write the file and `place` it once the runtime can load it; EvaError says what it could not."""
+    """Write the file, and `place` it if the runtime can load it.
+
+    Raises:
+        EvaError: If it cannot be loaded.
+    """
     written = (
         f"Written by First steps, {timezone.localtime():%Y-%m-%d %H:%M}. Every key: docs/configuration.md."
     )

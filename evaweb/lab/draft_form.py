@@ -1,4 +1,4 @@
-"""The form of a draft: what a deployment of a real robot may be told, with what was typed so far."""
+"""Form of a draft: the settings of a deployment of a real robot, with the values typed so far."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from runtime.config import draft
 from runtime.config.draft import Entry
 from runtime.config.loader import ConfigurationError
 
-FROM_TRANSPORT = ""  # a camera whose pictures the robot's own node sends
+FROM_TRANSPORT = ""  # camera whose images come from the robot's own node
 _USUAL = {"transport": "zmq", "policy": "openpi", "cameras": FROM_TRANSPORT}
 _TITLES = {"transport": "Way to the robot", "policy": "Policy server"}
 
 
 @dataclass(frozen=True, slots=True)
 class Typed:
-    """A key of a table with what is in its field."""
+    """Key of a table with the value in its field."""
 
     name: str
     entry: Entry
@@ -28,9 +28,9 @@ class Typed:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A table of the deployment: its kind, the kinds there are with what each is, and its keys.
+    """Table of the deployment: its kind, the available kinds with descriptions, and its keys.
 
-    `hidden` are keys that have no field, with what was sent for them all the same.
+    `hidden` are keys without a field, with the values that were sent for them anyway.
     """
 
     place: str
@@ -42,7 +42,7 @@ class Part:
 
     @property
     def asked(self) -> list[Typed]:
-        """Keys that say where something is."""
+        """Keys that are addresses."""
         return [one for one in self.keys if one.entry.address]
 
     @property
@@ -53,7 +53,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class DraftForm:
-    """The whole form."""
+    """Complete form."""
 
     name: str
     robot: str
@@ -63,7 +63,7 @@ class DraftForm:
 
     @property
     def tables(self) -> dict[str, dict[str, str]]:
-        """What was typed, by the place of each table that there is to be."""
+        """Typed values by place of each table that is to be written."""
         return {
             part.place: {
                 "kind": part.kind,
@@ -75,14 +75,18 @@ class DraftForm:
 
 
 def form_of(given: Mapping[str, str]) -> DraftForm:
-    """The form with what is in its fields; EvaError names a robot or a kind that there is not, and those there are."""
+    """Return the form with the values in its fields.
+
+    Raises:
+        EvaError: If a robot or a kind does not exist; the message names the valid ones.
+    """
     known = tuple(robots.robot_names())
     robot = given.get("robot", known[0])
     if robot not in known:
         raise EvaError(f"robot = {robot!r:.60}; allowed: {', '.join(known)}")
     try:
         cameras = [f"cameras.{camera.key}" for camera in robots.load_robot(robot).cameras]
-    except robots.RobotError as fault:  # of a folder of the lab's own
+    except robots.RobotError as fault:  # a robot folder of the lab's own may be broken
         raise EvaError(str(fault)) from None
     parts = tuple(_part(place, given) for place in ("transport", "policy", *cameras))
     return DraftForm(given.get("station", ""), robot, known, given.get("task", ""), parts)
@@ -96,7 +100,7 @@ def _part(place: str, given: Mapping[str, str]) -> Part:
         raise EvaError(f"{place}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
     try:
         found = draft.entries(part, kind) if kind else ()
-    except ConfigurationError as fault:  # of a plug-in that cannot be imported here
+    except ConfigurationError as fault:  # a plug-in that cannot be imported here
         raise EvaError(str(fault)) from None
     typed = tuple(
         Typed(f"{place}.{entry.key}", entry, given.get(f"{place}.{entry.key}", entry.default))

@@ -1,7 +1,7 @@
-"""A blind plan carried out without a human, in lockstep: trial by trial as an operator does it, judged by the bench.
+"""Automated blind evaluation in lockstep: trial by trial as by an operator, scored by the bench's ground truth.
 
-The operator's session takes the station, confirms its cameras, asks for the next trial, sets up, runs, scores, all over
-REST and the live socket; it is never told which checkpoint it runs. Then the plan's owner closes and reveals the plan.
+The operator's session takes the station, confirms its cameras, requests trials, sets up, runs and scores, all over
+REST and the live socket; it never learns the checkpoint. Then the plan's owner closes and reveals the plan.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from evaweb.lab.patience import DemoFailed, wait_until
 from evaweb.lab.progress import Progress
 from evaweb.lab.visitor import LivePage, RestClient
 
-_TRIES = 3  # of one trial, whose set-up or run was interrupted
+_TRIES = 3  # attempts of a trial whose set-up or run is interrupted
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class CompletedTrial:
-    """One trial that counts, as the operator knows it; `times`: milestone -> when it was reached [s of the run]."""
+    """Trial that counts, as known to the operator; `times` maps milestones to the time when they were reached
+    [s of the run].
+    """
 
     code: str
     trial: int
@@ -38,9 +40,10 @@ class CompletedTrial:
 def run_plan(
     operator: RestClient, station: str, plan: str, count: int, tell: Tell, progress: Progress
 ) -> list[CompletedTrial]:
-    """The next `count` trials of a plan, or fewer where its design ends it.
+    """Run the next `count` trials of a plan, or fewer if its design ends.
 
-    VisitFailed where one does not come about, or tells what it is of.
+    Raises:
+        DemoFailed: If a trial cannot be completed, or reveals its checkpoint.
     """
     made = []
     with closing(LivePage(operator, station)) as page:
@@ -62,7 +65,7 @@ def run_plan(
 
 
 def close_and_reveal(owner: RestClient, plan: str, made: list[CompletedTrial]) -> dict[str, Any]:
-    """Close and reveal the plan: what was committed to, its key, and the trials with the names of their checkpoints."""
+    """Close and reveal the plan; return commitment, key, and the trials with the names of their checkpoints."""
     if owner.get(f"plans/{plan}")["state"] == "frozen":  # else its design has ended it
         owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
     told = owner.post(f"plans/{plan}/reveal", {})
@@ -105,7 +108,7 @@ def _require_blind(code: str, trial: Mapping[str, Any]) -> None:
 
 
 def _give_up(operator: RestClient, page: LivePage, trial: int, fault: str) -> None:
-    """Leave the station free for the next attempt, whatever was under way."""
+    """Free the station for the next attempt, whatever the trial's status."""
     status = operator.get(f"trials/{trial}")["status"]
     if status in ("running", "paused"):
         page.command("stop")

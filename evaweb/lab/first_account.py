@@ -1,4 +1,4 @@
-"""The first account of a lab: made on a page with a code that the lab shows in its own terminal alone."""
+"""First account of a lab, created on a page with a code that only the lab's terminal shows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def offer() -> str:
-    """A new code, good until an account is made with it or the lab ends."""
+    """Return a new code, valid until an account is created with it or the lab ends."""
     code = fresh_password()
     write_atomic(_path(), code.encode())
     _path().chmod(0o600)
@@ -27,17 +27,17 @@ def offer() -> str:
 
 
 def withdraw() -> None:
-    """No code is good any more."""
+    """Invalidate the code."""
     _path().unlink(missing_ok=True)
 
 
 def is_offered() -> bool:
-    """True if nobody can log in, and this lab has shown a code."""
+    """Return True if there is no account, and this lab has shown a code."""
     return _path().is_file() and is_missing()
 
 
 def is_missing() -> bool:
-    """True if nobody can log in; False also where the database does not say: the login will."""
+    """Return True if there is no account; False if the database does not answer, which the login page then reports."""
     try:
         return has_no_accounts()
     except Error:
@@ -45,7 +45,7 @@ def is_missing() -> bool:
 
 
 def is_code(given: str) -> bool:
-    """True if that is the code."""
+    """Return True if `given` is the code."""
     try:
         code = _path().read_bytes()
     except FileNotFoundError:
@@ -55,7 +55,11 @@ def is_code(given: str) -> bool:
 
 @transaction.atomic
 def administrator_make(*, username: str, password: str) -> User:
-    """The first administrator, once: of two who ask at once, one gets Conflict."""
+    """Create the first administrator.
+
+    Raises:
+        Conflict: If there is an account already; of two simultaneous requests, one gets it.
+    """
     if not has_no_accounts():
         raise Conflict("this lab has an account already: log in, or ask an administrator for one")
     user, _ = User.objects.get_or_create(username=username)

@@ -1,4 +1,4 @@
-"""The way of a new lab to its first scored trial: six steps, each done, now or later by what the lab has."""
+"""First steps of a new lab up to its first scored trial: six steps whose progress follows from the lab's state."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from evaweb.stations.models import CARRIED_OUT, Station
 from evaweb.stations.runtime_client import connection_to
 from evaweb.trials.models import Checkpoint, Scene, Trial, TrialStatus
 
-_ASK_S = 1.0  # how long a page waits for a station
+_ASK_S = 1.0  # timeout of a station's status for a page
 
 
 class Progress(StrEnum):
-    """Where a step stands."""
+    """Progress of a step."""
 
     DONE = "done"
     NOW = "now"
@@ -33,13 +33,13 @@ class Progress(StrEnum):
 
     @property
     def tone(self) -> str:
-        """The tone of its chip."""
+        """Tone of its chip."""
         return {"done": "ok", "now": "active"}.get(self.value, "neutral")
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step: its name, which is also that of its template, a title and where it stands."""
+    """Step with its name, which is also that of its template, its title and progress."""
 
     name: str
     title: str
@@ -47,15 +47,16 @@ class Step:
 
     @property
     def template(self) -> str:
-        """What is shown of it while it is the one to do."""
+        """Template shown while it is the current step."""
         return f"lab/step_{self.name}.html"
 
 
 @dataclass(frozen=True)
 class Walk:
-    """The steps of one station; without one the first is to be done.
+    """Steps of one station; without a station the first step is the current one.
 
-    `snapshot` is its state, {} where it does not answer; `standing` what the lab does about its deployment, `kept`.
+    `snapshot` is the station's state, {} if it does not answer; `standing` is the status of its deployment `kept` in
+    the lab.
     """
 
     station: Station | None
@@ -71,23 +72,23 @@ class Walk:
 
     @property
     def name(self) -> str:
-        """The name of the station, "" before there is one."""
+        """Name of the station, "" if there is none."""
         return self.station.name if self.station else self.kept.name if self.kept else ""
 
     @property
     def now(self) -> Step | None:
-        """The step that is to be done; None where all are."""
+        """Current step; None if all are done."""
         return next((step for step in self.steps if step.progress is Progress.NOW), None)
 
     @property
     def mark(self) -> str:
-        """Another one whenever something went on."""
+        """Fingerprint that changes whenever the displayed status changes."""
         told = (self.name, self.standing, bool(self.snapshot), self.checkpoints, *self.steps)
         return sha256(repr(told).encode()).hexdigest()[:16]
 
     @property
     def waits(self) -> bool:
-        """True if the page has to look again by itself: something is expected of the lab or of another page."""
+        """True if the page has to poll, because the lab or another page is expected to act."""
         return self.now is not None and self.now.name != "deployment"
 
 
@@ -102,7 +103,7 @@ _TITLES = {
 
 
 def walk(*, name: str = "") -> Walk:
-    """The steps of the station of that name, else of the newest; a database row is not needed for it yet."""
+    """Return the steps of the named station, else of the newest; it need not have a database row yet."""
     stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
     kept = kept_of(name) if name else None
     station = next((one for one in stations if one.name == name), None)
@@ -140,12 +141,12 @@ def walk(*, name: str = "") -> Walk:
 
 @transaction.atomic
 def starter_scene() -> Scene:
-    """A scene that the simulated bench can lay out, with positions and milestones; made once."""
+    """Return a scene with positions and milestones that the simulated bench can lay out; created once."""
     return demo_scene()
 
 
 def scenes_address() -> str:
-    """Where scenes are made: the scene editor, else the administration."""
+    """Return the address for creating scenes: the scene editor, else the administration."""
     try:
         return reverse("setup-scenes")
     except NoReverseMatch:
@@ -153,7 +154,7 @@ def scenes_address() -> str:
 
 
 def _newest(stations: tuple[Station, ...]) -> tuple[Station | None, Kept | None]:
-    """The deployment that was written last, as long as it has no station yet; else the newest station."""
+    """Return the newest deployment if it has no station yet, else the newest station with its deployment."""
     written = deployments.kept()
     if written and written[-1].name not in set(Station.objects.values_list("name", flat=True)):
         return None, written[-1]
@@ -187,7 +188,7 @@ def _simulated(station: Station | None, kept: Kept | None) -> bool:
         return station.simulated
     try:
         return kept is not None and kept.chosen and is_simulated(kept.resolved())
-    except LabError:  # the step says what is wrong with it
+    except LabError:  # its step reports the error
         return False
 
 
@@ -196,7 +197,7 @@ def _looked_at(station: Station | None) -> bool:
 
 
 def _homed(station: Station | None) -> bool:
-    """A set-up drives home too."""
+    """Return True if the robot was homed, by a home command or by a set-up."""
     if station is None:
         return False
     return station.commands.filter(kind__in=("home", "setup"), status__in=CARRIED_OUT).exists()

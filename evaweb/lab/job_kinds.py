@@ -1,4 +1,4 @@
-"""The job that makes a diagnostic bundle."""
+"""Job that creates a diagnostic bundle."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from django.contrib.auth.models import User
 from evaweb.jobs.kinds import JobContext, job_kind
 from evaweb.roles import Role
 
-_KEPT = 3  # bundles of a user
+_KEPT = 3  # bundles per user
 
 
 @job_kind("diagnose", least=lambda args: Role.ADMIN)
 def diagnose(work: JobContext) -> Mapping[str, Any]:
-    """A bundle as its user may see it; args: user, name."""
-    from evaweb.lab.diagnosis import bundle  # the web knows this kind too, and never does it
+    """Write a bundle with the user's visibility; args: user, name."""
+    from evaweb.lab.diagnosis import (
+        bundle,
+    )  # imported here: the web knows this kind of job too, but never runs it
 
     user = User.objects.get(pk=work.args["user"])
     path = bundle.folder(user) / work.args["name"]

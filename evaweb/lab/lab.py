@@ -1,4 +1,4 @@
-"""A lab on one machine: its processes brought up in order, watched, and ended together."""
+"""Lab on one machine: its processes started in order, watched, and ended together."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ _WATCH_S = 0.5
 
 
 class Lab:
-    """The processes of one machine; `up` starts them, `watch` stays until it is ended."""
+    """Processes of one machine; `start` starts them, `watch` blocks until the lab is ended."""
 
-    STEPS = 3  # of a start, and one for each station
+    STEPS = 3  # progress steps of a start, plus one per station
 
     def __init__(
         self, processes: ChildProcesses, host: str, port: int, listener: socket.socket, progress: Progress
     ) -> None:
-        """Worker and web begin at once: a machine with a second core starts them beside benches and stations.
+        """Start worker and web at once, so that a second core starts them in parallel with benches and stations.
 
-        `listener` is that of stops: open as long as the lab, so that presses wait in it for a restarted process.
+        `listener` is the socket of the process for stops. It stays open as long as the lab, so that presses wait in it
+        while that process restarts.
         """
         self.processes, self.progress = processes, progress
         self._listener = listener
-        self.stops = ""  # the address of the process for stops, once it is up
+        self.stops = ""  # address of the process for stops, once it is up
         self.processes.start(programs.worker())
         self._web = self.processes.begin(programs.web(host, port))
 
     def start(self, benches: Sequence[Bench]) -> str:
-        """Start the stations and the process for stops; returns the address of the web."""
+        """Start the stations and the process for stops; return the address of the web."""
         names = [registered(bench) for bench in benches]
         for name, bench in zip(names, benches, strict=True):
             with self.progress.step(f"the station {name}"):
@@ -63,7 +64,7 @@ class Lab:
         return str(web["url"])
 
     def watch(self, how: Benches | None = None) -> None:
-        """Restart what dies, and start what is written into the folder of deployments, until a signal comes."""
+        """Restart processes that end, and start new deployments of the data folder, until a signal arrives."""
         pickup = Pickup(self.processes, how or Benches())
         while True:
             self.processes.watch()
@@ -75,9 +76,9 @@ class Lab:
 def open_lab(
     host: str, port: int, stop_port: int | None = None, progress: Progress | None = None
 ) -> Iterator[Lab]:
-    """A lab that is coming up, on a migrated database; everything it started ends with the block.
+    """Yield a lab on a migrated database; everything that it started ends with the block.
 
-    `stop_port` is by itself the one after `port`. Port 0 takes a free one.
+    `stop_port` defaults to the port after `port`. Port 0 is a free port.
     """
     told = progress or silent()
     if stop_port is None:

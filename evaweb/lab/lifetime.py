@@ -1,4 +1,4 @@
-"""Resources of which a lab has one: the lock on its data folder, the port, the signals that end it."""
+"""Unique resources of a lab: lock of its data folder, ports, and the signals that end it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,16 @@ _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequested(BaseException):
-    """The lab was asked to end; nothing that catches errors on the way holds it up."""
+    """The lab was asked to end; a BaseException, so that no handler of errors stops it on the way."""
 
 
 @contextmanager
 def hold_data_folder(data_dir: Path) -> Iterator[None]:
-    """Hold the data folder; LabError names the process that holds it already."""
+    """Hold the lock of the data folder during the block.
+
+    Raises:
+        LabError: If another lab holds it; it names the process.
+    """
     with (data_dir / "lab.lock").open("a+", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -39,7 +43,7 @@ def hold_data_folder(data_dir: Path) -> Iterator[None]:
 
 
 def require_free(host: str, port: int, option: str = "--port") -> None:
-    """LabError where nothing can listen there; whatever holds the port is left alone."""
+    """Raise LabError if the port is in use; the program that uses it is left alone."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -51,9 +55,10 @@ def require_free(host: str, port: int, option: str = "--port") -> None:
 
 
 def end_on_signals() -> None:
-    """SIGINT, SIGTERM and the end of the terminal raise Ended in the main thread, once; a second one changes nothing.
+    """Raise StopRequested once in the main thread on SIGINT, SIGTERM or the end of the terminal; later signals are
+    ignored.
 
-    One that was ignored when we were started, as by nohup, stays so.
+    A signal that was ignored at the start, as with nohup, remains ignored.
     """
     for number in _ENDS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -63,10 +68,10 @@ def end_on_signals() -> None:
 def _end(number: int, frame: FrameType | None) -> None:
     for each in _ENDS:
         signal.signal(each, signal.SIG_IGN)
-    if number == signal.SIGHUP:  # what is still said has no terminal to go to
+    if number == signal.SIGHUP:  # there is no terminal for further output
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for descriptor in (1, 2):
-            if stat.S_ISCHR(os.fstat(descriptor).st_mode):  # of a terminal that is gone isatty says no
+            if stat.S_ISCHR(os.fstat(descriptor).st_mode):  # isatty returns False for a terminal that is gone
                 os.dup2(nowhere, descriptor)
         os.close(nowhere)
     raise StopRequested

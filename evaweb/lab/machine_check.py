@@ -1,4 +1,4 @@
-"""The set-up check of this machine: what a lab needs of it, what was found, and what to do about it."""
+"""Check of this machine: what a lab needs, what was found, and what to do."""
 
 from __future__ import annotations
 
@@ -27,9 +27,13 @@ from evaweb.stop_port import read_stop_port
 _PATIENCE_S = 10.0
 _STATION_S = 1.0
 _GB = 1e9
-_PIECE, _PIECES, _WRITE_S = 1 << 20, 32, 1.0  # of the disk's speed: bytes, how many at most, for how long
-_PORTS = (8000, 8001)  # of web and stops, where the lab is started without options
-_PRIORITY = 20  # control.realtime_priority where a deployment says nothing else
+_PIECE, _PIECES, _WRITE_S = (
+    1 << 20,
+    32,
+    1.0,
+)  # speed test of the disk: block size [bytes], most blocks, most time [s]
+_PORTS = (8000, 8001)  # of web and stops, if the lab is started without options
+_PRIORITY = 20  # default of control.realtime_priority
 _TRY = """
 import json
 from runtime.core.realtime import advice, enter_realtime
@@ -39,22 +43,22 @@ print(json.dumps([got, advice(got, {0})]))
 
 
 class State(StrEnum):
-    """What was found of one thing; `tone` is the colour that goes with it."""
+    """Result of one check; `tone` is its colour."""
 
     GOOD = "good"
-    LACKING = "lacking"  # it works, worse than it could
-    BAD = "bad"  # it will not work
+    LACKING = "lacking"  # works, but worse than it could
+    BAD = "bad"  # does not work
     UNKNOWN = "not known"
 
     @property
     def tone(self) -> str:
-        """The tone of its chip."""
+        """Tone of its chip."""
         return {"good": "ok", "lacking": "warn", "bad": "danger"}.get(self.value, "neutral")
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One thing: its state, what was found, what that means, and what to do, "" where nothing has to be done."""
+    """Result of one check: state, finding, meaning, and advice, "" if nothing has to be done."""
 
     name: str
     state: State
@@ -64,13 +68,13 @@ class Line:
 
 
 def lines() -> list[Line]:
-    """Everything, in the order in which it matters; takes a few seconds at most."""
+    """Return all checks in order of importance; takes a few seconds at most."""
     checks = (realtime, cores, memory, shared_memory, disk_room, disk_speed, clock, gpu, sockets, ports)
     return [*(check() for check in checks), *stations()]
 
 
 def realtime() -> Line:
-    """Whether a station started by this account gets SCHED_FIFO and locked memory: a process of its own asks."""
+    """Check whether a station started by this account gets SCHED_FIFO and locked memory, by trying in a process."""
     means = "Control ticks on time however busy the machine is, where it has the class SCHED_FIFO and locked memory."
     said = _told([sys.executable, "-c", _TRY.format(_PRIORITY)])
     try:
@@ -87,7 +91,7 @@ def realtime() -> Line:
 
 
 def cores() -> Line:
-    """The processor's cores that this account may use."""
+    """Check the processor cores that this account may use."""
     count, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     means = "A station runs five processes, two of them in real time; web, worker and policy servers share the rest."
     found = f"{count} cores, load {load:.1f}"
@@ -102,7 +106,7 @@ def cores() -> Line:
 
 
 def memory() -> Line:
-    """Main memory, as much as is free."""
+    """Check the available main memory."""
     facts = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text("ascii").splitlines())
     total, free = (int(facts[key].split()[0]) * 1024 for key in ("MemTotal", "MemAvailable"))
     found = f"{free / _GB:.1f} of {total / _GB:.1f} GB available"
@@ -119,7 +123,7 @@ def memory() -> Line:
 
 
 def shared_memory() -> Line:
-    """Room in /dev/shm, where a station's processes share pictures."""
+    """Check the space in /dev/shm, which a station's processes use for images."""
     means = "The processes of a station share their pictures and state there."
     return _room(
         "Shared memory", Path("/dev/shm"), 0.064, 0.5, means, "give it more (--shm-size in a container)"
@@ -127,7 +131,7 @@ def shared_memory() -> Line:
 
 
 def disk_room() -> Line:
-    """Room on the disk of the data folder."""
+    """Check the space on the disk of the data folder."""
     means = "Recordings and datasets go there; a run is refused where there is too little room to record it."
     folder = Path(settings.DATA_DIR)
     return _room(
@@ -136,7 +140,7 @@ def disk_room() -> Line:
 
 
 def disk_speed() -> Line:
-    """How fast the disk of the data folder takes what is written and flushed, for a second at most."""
+    """Measure the speed of flushed writes to the disk of the data folder, for about a second."""
     means = "Recordings are flushed as they are written; a disk that is slower than the cameras loses rows."
     path = Path(settings.DATA_DIR) / ".disk_speed"
     piece, written, worst, begun = os.urandom(_PIECE), 0, 0.0, time.monotonic()
@@ -167,7 +171,7 @@ def disk_speed() -> Line:
 
 
 def clock() -> Line:
-    """Whether the machine's clock is kept by a time server, as chrony or systemd says."""
+    """Check whether a time server synchronises the machine's clock, according to chrony or systemd."""
     means = "Times of recordings, of other computers' robots and of logs agree only where clocks are kept by a server."
     advice = (
         "install chrony (apt-get install chrony), and give it a time server that the robot's computer has too"
@@ -193,7 +197,7 @@ def clock() -> Line:
 
 
 def gpu() -> Line:
-    """GPUs for policy servers of this machine, as nvidia-smi says."""
+    """Check for GPUs for policy servers, according to nvidia-smi."""
     means = "Policy servers want one; a lab whose servers are elsewhere, or scripted, needs none."
     asked = ["nvidia-smi", "--query-gpu=name,memory.used,memory.total", "--format=csv,noheader"]
     rows = (_told(asked) or "").strip()
@@ -203,7 +207,7 @@ def gpu() -> Line:
 
 
 def sockets() -> Line:
-    """The folder of the account's sockets, which may end with its last login."""
+    """Check the folder of the account's sockets, which may be removed at its last logout."""
     means = "Web and stations meet in Unix sockets there."
     given = os.environ.get("XDG_RUNTIME_DIR")
     if not given:
@@ -219,7 +223,7 @@ def sockets() -> Line:
 
 
 def ports() -> Line:
-    """The ports of web and stops: those of the lab that runs, else the usual ones."""
+    """Check the ports of web and stops: those of the running lab, else the default ones."""
     means = "Browsers reach the web at one, and its process for stops at the other."
     kept = read_stop_port()
     if lab_runs() and kept:
@@ -237,12 +241,12 @@ def ports() -> Line:
 
 
 def stations() -> list[Line]:
-    """What each station that runs got of the real-time class, as it says itself."""
+    """Return the real-time scheduling that each running station reports."""
     means = "Control sends, and reception sees: each is on time where it runs in SCHED_FIFO."
     found = []
     try:
         names = list(Station.objects.filter(active=True).values_list("name", flat=True))
-    except Error:  # before its first start a lab has no tables
+    except Error:  # a lab has no tables before its first start
         return []
     for name in names:
         try:
@@ -274,7 +278,7 @@ def _room(name: str, folder: Path, least_gb: float, good_gb: float, means: str, 
 
 
 def _told(arguments: Sequence[str]) -> str | None:
-    """What a program says, None where it is not there, fails, or does not end in time."""
+    """Return the output of a program; None if it is missing, fails, or takes too long."""
     try:
         done = subprocess.run(
             arguments, capture_output=True, text=True, timeout=_PATIENCE_S, cwd=settings.BASE_DIR, check=True

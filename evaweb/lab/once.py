@@ -1,4 +1,4 @@
-"""One trial from choosing to dataset, as an operator does it, scored from the bench's own truth."""
+"""Single trial from preparation to dataset, as by an operator, scored by the bench's ground truth."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from evaweb.lab.patience import DemoFailed, wait_until
 from evaweb.lab.visitor import LivePage, RestClient
 
 _RESUMES = 3
-_REST_S = 1.0  # how long success has to last before the operator presses Stop
-_OVER_S = 30.0  # of the station's own time, after which a run should have ended by itself
+_REST_S = 1.0  # time that success must last before Stop is pressed
+_OVER_S = 30.0  # station time after the limit by which a run should have ended by itself
 
 
 @dataclass(frozen=True, slots=True)
 class TrialChoice:
-    """Station, trial and checkpoint of the one run."""
+    """Station, trial and checkpoint of the run."""
 
     station: str
     scene: str
@@ -30,7 +30,7 @@ class TrialChoice:
 
 @dataclass(frozen=True, slots=True)
 class TrialReport:
-    """A complete scored and recorded trial."""
+    """Scored, recorded and published trial."""
 
     trial: int
     success: bool
@@ -47,7 +47,7 @@ class TrialReport:
 
 
 def run_one_trial(visitor: RestClient, choice: TrialChoice) -> TrialReport:
-    """Take the station, set up, run until it succeeds or its time is over, stop, score, wait for the dataset."""
+    """Take the station, set up, run to success or time limit, stop, score, and wait for the dataset."""
     begun = time.monotonic()
     with closing(LivePage(visitor, choice.station)) as page:
         trial = start(visitor, page, choice)
@@ -71,7 +71,7 @@ def run_one_trial(visitor: RestClient, choice: TrialChoice) -> TrialReport:
 
 
 def start(visitor: RestClient, page: LivePage, choice: TrialChoice) -> int:
-    """Take the station, prepare a trial, set up and run; its id."""
+    """Take the station, prepare a trial, set up and run; return the trial's id."""
     take_station(page)
     named = {name: value for name, value in asdict(choice).items() if name != "station"}
     trial: int = visitor.post(f"stations/{choice.station}/trials", named)["id"]
@@ -80,7 +80,7 @@ def start(visitor: RestClient, page: LivePage, choice: TrialChoice) -> int:
 
 
 def take_station(page: LivePage) -> None:
-    """Take the station once it is there."""
+    """Take the station as soon as it is connected."""
     page.wait_with_progress(
         lambda state: state["state_is"]["connected"], "waiting for the station", progress_marker
     )
@@ -91,14 +91,14 @@ def take_station(page: LivePage) -> None:
 
 
 def progress_marker(state: Mapping[str, Any]) -> object:
-    """Facts of a station that change whenever something goes on; the clock alone is no progress."""
+    """Return facts of a station that change with any progress; the clock is not included."""
     stages = [stage["state"] for stage in state.get("stages", ())]
     facts = [state.get(name) for name in ("boot", "sequence", "state", "reason", "phase", "stage")]
     return facts, stages, state.get("lease", {}).get("epoch"), state.get("run", {}).get("number")
 
 
 def _elapsed(state: Mapping[str, Any]) -> float:
-    """Time that the run has gone on, on its own clock [s]."""
+    """Return the run's elapsed time on its own clock [s]."""
     return float(state.get("run", {}).get("elapsed", 0.0))
 
 
@@ -111,22 +111,22 @@ def set_up_and_run(page: LivePage, trial: int, lockstep: bool = False) -> None:
     if not set_up["state_is"]["ready"]:
         raise DemoFailed(f"set-up ended {set_up['state']}: {set_up['reason']}")
     page.command("run", trial)
-    # One that holds at once, because an observation was late, has begun too: it is resumed. In lockstep, as fast as the
-    # machine, one may have begun and ended between two looks.
+    # A run that holds at once, because an observation was late, has begun too and is resumed. In lockstep, which is as
+    # fast as the machine, a run may begin and end between two polls.
     begun = "set_up" if lockstep else "run_open"
     page.wait_with_progress(lambda state: state["state_is"][begun], "starting the run", progress_marker)
 
 
 def report(done: TrialReport) -> dict[str, Any]:
-    """The result as JSON."""
+    """Return the result as JSON."""
     return asdict(done)
 
 
 def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = False) -> int:
-    """Watch until the bench says it is done or the run ends by itself; press Stop.
+    """Watch until the bench reports success or the run ends by itself, then press Stop; return the number of resumes.
 
-    In lockstep it always ends by itself: a Stop of ours would come when the machine has time for it. Where it holds for
-    a reason that passes (an observation that was late), resume a few times as an operator would; returns how often.
+    In lockstep the run always ends by itself, because the time of a Stop would depend on the machine's speed. A run
+    that holds for a transient reason (a late observation) is resumed a few times, as an operator would.
     """
     succeeded = 0.0
 
@@ -153,7 +153,9 @@ def run_to_its_end(page: LivePage, trial: int, limit: float, lockstep: bool = Fa
 
 
 def score_by_truth(visitor: RestClient, trial: int) -> Mapping[str, Any]:
-    """Tick what the bench says was reached, and when, once truth and recording of the trial are there."""
+    """Score the milestones, with times, by the bench's ground truth, when truth and recording of the trial
+    are available.
+    """
     facts = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda found: found["status"] in ("ended", "interrupted") and found["truth"] is not None,
@@ -177,7 +179,7 @@ def score_by_truth(visitor: RestClient, trial: int) -> Mapping[str, Any]:
 
 
 def wait_for_recorded(visitor: RestClient, trial: int) -> Mapping[str, Any]:
-    """The trial once it is as long as its recording, whatever becomes of that later."""
+    """Return the trial when its duration is that of its recording."""
     uuid = visitor.get(f"trials/{trial}")["episode"]
     episode = _worked_on(visitor, uuid, ("duration_s",), "waiting for the recording")
     return wait_for_recording(visitor, trial, episode)
@@ -188,7 +190,7 @@ def _published(visitor: RestClient, episode: str) -> Mapping[str, Any]:
 
 
 def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) -> Mapping[str, Any]:
-    """The episode once these facts are known of it; what the worker does meanwhile is progress."""
+    """Return the episode when these facts are known; activity of the worker counts as progress."""
 
     def ask() -> tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]:
         return visitor.get(f"episodes/{uuid}"), visitor.get("jobs?limit=50")["items"]
@@ -203,7 +205,7 @@ def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) 
 
 
 def wait_for_recording(visitor: RestClient, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The trial once it is as long as its recording: until then its duration is that of the commands."""
+    """Return the trial when its duration is that of its recording; before, it is that of the commands."""
     found: Mapping[str, Any] = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda facts: facts["duration_s"] == episode["duration_s"],

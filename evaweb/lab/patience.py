@@ -1,4 +1,4 @@
-"""Waiting for as long as something goes on: a slow machine is waited for, one that stands still is not."""
+"""Waiting with progress: a slow machine is waited for, a stalled one is not."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Any, TypeVar
 
 from evaweb.errors import EvaError
 
-STILL_S = 180.0  # without any progress
+STILL_S = 180.0  # longest time without progress
 _AGAIN_S = 0.25
 Found = TypeVar("Found")
 
 
 class DemoFailed(EvaError):
-    """The lab answered something else than was asked for; the message has its words."""
+    """The lab answered something unexpected; the message quotes it."""
 
 
 class NoReply(DemoFailed):
-    """Nothing came in time; whether it was done is not known."""
+    """No reply in time; whether the request was executed is unknown."""
 
 
 class ProgressTimeout:
-    """Ends where what is waited for makes no progress any more."""
+    """Timeout since the last progress."""
 
     def __init__(self, what: str, seconds: float = STILL_S) -> None:
         self._what = what
@@ -31,7 +31,11 @@ class ProgressTimeout:
         self._since = time.monotonic()
 
     def update(self, mark: object, stands: object) -> None:
-        """`mark` is another one whenever something went on; VisitFailed says how it `stands` once nothing has."""
+        """Record `mark`, which changes with any progress.
+
+        Raises:
+            DemoFailed: If it has not changed for too long; the message has `stands`, the current status.
+        """
         now = time.monotonic()
         if mark != self._mark:
             self._mark, self._since = mark, now
@@ -45,7 +49,11 @@ def wait_until(
     what: str,
     mark: Callable[[Found], Any] = lambda found: found,
 ) -> Found:
-    """Result of `ask` once it is `reached`; without a reply it asks again. VisitFailed without progress."""
+    """Poll `ask` until the result is `reached`, and return it; missing replies are retried.
+
+    Raises:
+        DemoFailed: If there is no progress.
+    """
     patience = ProgressTimeout(what)
     while True:
         try:

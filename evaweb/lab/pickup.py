@@ -1,4 +1,4 @@
-"""Starts what is written into the folder of deployments while the lab runs, and holds up the watch of nothing."""
+"""Starting of deployments that are written to the data folder while the lab runs, without blocking its watch loop."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from evaweb.lab.deployments import Kept, Standing, is_simulated
 from evaweb.lab.processes import ChildProcesses, LabError
 
 log = logging.getLogger(__name__)
-Coming = Generator[
-    str, None, bool
-]  # yields what is being started; returns whether there was anything to start
+Coming = Generator[str, None, bool]  # yields what is being started; returns whether anything was started
 
 
 class Pickup:
-    """The simulated stations of the data folder, one after the other; `look` is called every now and then."""
+    """Starter of the data folder's simulated stations, one after the other; call `look` regularly."""
 
     def __init__(self, processes: ChildProcesses, how: simulated.Benches) -> None:
         self._processes, self._how = processes, how
-        self._tried: dict[str, int] = {}  # by name, when the file that was last tried had been changed
+        self._tried: dict[str, int] = {}  # by name: modification time of the file that was last tried
         self._up: set[str] = set()
-        self._brought: set[str] = set()  # stations whose programs are of our making: no others are ended
-        self._fault = ""  # of the last look
+        self._brought: set[str] = (
+            set()
+        )  # stations whose programs were started here: only these are ended here
+        self._fault = ""  # last error, to log it once
         self._coming: tuple[str, Coming] | None = None
         self._told: dict[str, Standing] = {}
 
     def look(self) -> None:
-        """One look: at what is getting ready, else for the next file that is new, or was touched to be tried again.
+        """Continue the current start, else begin that of the next file that is new or was touched.
 
-        Whatever is wrong with it, the lab and its other stations go on.
+        Errors never end the lab or its other stations.
         """
         try:
             self._look()
-        except Exception as fault:  # of the folder itself: the next look is near, and it is said once
+        except Exception as fault:  # an error of the folder itself: logged once, retried at the next call
             if self._fault != repr(fault):
                 log.exception("the folder of deployments cannot be looked at")
             self._fault = repr(fault)
@@ -61,7 +61,7 @@ class Pickup:
                 self._tell(name, Standing(up=True))
         except (EvaError, Error, OSError) as fault:
             self._give_up(name, str(fault))
-        except Exception as fault:  # a file and the rows that it leads to may hold anything
+        except Exception as fault:  # the file, and the rows to which it refers, may contain anything
             log.exception("%s cannot be started", name)
             self._give_up(name, f"{type(fault).__name__}: {fault} (see the terminal of the lab)")
 
@@ -71,7 +71,7 @@ class Pickup:
         self._tell(name, Standing(failed=why))
 
     def _end(self, name: str) -> None:
-        """End what we brought for a station."""
+        """End the programs that were started for a station."""
         if name in self._brought:
             self._brought.discard(name)
             for program in _programs_of(name):
@@ -90,7 +90,7 @@ class Pickup:
         ending = self._processes.ending()
         for one in deployments.kept():
             if ending.intersection(_programs_of(one.name)):
-                continue  # of an earlier file of this name
+                continue  # programs of an earlier file with this name
             if one.name not in self._up and self._tried.get(one.name) != one.changed_ns:
                 self._tried[one.name] = one.changed_ns
                 return one.name, self._starting(one)
@@ -118,7 +118,7 @@ class Pickup:
         )
         yield "the station"
         bench = Bench(one.path, assignments)
-        registered(bench)  # LabError for a file that was removed meanwhile
+        registered(bench)  # raises LabError if the file was removed meanwhile
         self._processes.start(program_of(bench))
         return True
 
@@ -134,10 +134,10 @@ class Pickup:
             return
         try:
             deployments.tell(name, standing)
-        except OSError as error:  # the page does not hear of it; the lab goes on
+        except OSError as error:  # the page shows an old status; the lab continues
             log.error("what becomes of %s cannot be written down: %s", name, error)
 
 
 def _programs_of(name: str) -> tuple[str, str]:
-    """Names of the programs that a simulated station has to itself."""
+    """Return the names of the programs that belong to one simulated station."""
     return f"station-{name}", f"bench-{name}"

@@ -1,7 +1,7 @@
-"""The processes of a lab: started with a lifeline, restarted when they die, ended in order.
+"""Processes of a lab: started with a lifeline, restarted when they end, and ended in order.
 
-A child's standard input is a pipe whose other end only we hold. It closes when we end, however we end, and
-every program of ours ends by itself then: nothing is ever looked for and killed.
+The standard input of a child is a pipe whose other end only this process holds. The pipe closes when this process
+ends, for whatever reason, and all our programs end by themselves then: no process ever has to be searched and killed.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from runtime.core.environment import without_web_secrets
 log = logging.getLogger(__name__)
 _MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
 _REST_S = 30.0
-_MOST_PROCESSOR_S = 300.0  # of a program that gets ready
-_LONGEST_LOG = 20_000_000  # bytes, beyond which a log starts anew and the old one is kept beside it
+_MOST_PROCESSOR_S = 300.0  # processor time for getting ready
+_LONGEST_LOG = 20_000_000  # [bytes] size at which a log is rotated; one old log is kept
 
 
-Starting = Generator[None, None, Mapping[str, Any]]  # it returns the addresses that the program announced
+Starting = Generator[None, None, Mapping[str, Any]]  # returns the addresses that the program announced
 
 
 class LabError(EvaError):
-    """The lab cannot start or go on; the message says which part and why."""
+    """The lab cannot start or continue; the message names part and reason."""
 
 
 @dataclass(frozen=True)
 class ProgramSpec:
-    """One process: `python ARGUMENTS --lifeline`.
+    """Process `python ARGUMENTS --lifeline`.
 
-    One that `announces` prints its addresses as a line of JSON when it is ready; started again after a death
-    it gets the arguments that `again` makes of them, so that it is found where it was.
+    A program that `announces` prints its addresses as a line of JSON when it is ready. For a restart, `again` converts
+    them to arguments, so that it has the same addresses again.
     """
 
     name: str
     arguments: tuple[str, ...]
     announces: bool = False
     again: Callable[[Mapping[str, Any]], tuple[str, ...]] | None = None
-    patience_s: float = 5.0  # to end by itself
-    nice: int = 0  # above 0: told to give way to the stations of this machine once it is ready (--nice)
-    descriptors: tuple[int, ...] = ()  # of our files that it has too, under the same numbers
-    of_web: bool = False  # gets the web's secrets; no other program has them in its environment
+    patience_s: float = 5.0  # time to end by itself
+    nice: int = 0  # above 0: lower priority than the stations of this machine, set when it is ready (--nice)
+    descriptors: tuple[int, ...] = ()  # file descriptors that it inherits, with the same numbers
+    of_web: bool = False  # gets the web's secrets; other programs do not have them in their environment
 
 
 @dataclass
@@ -64,30 +64,34 @@ class _Child:
     addresses: Mapping[str, Any] = field(default_factory=dict)
     restarts: deque[float] = field(default_factory=deque)
     rests_until: float = 0.0
-    coming: bool = False  # it gets ready, and has not announced itself
-    killed_at: float = 0.0  # when one that is dropped is killed, unless it has ended
+    coming: bool = False  # getting ready, not announced yet
+    killed_at: float = 0.0  # time at which a dropped process is killed if it has not ended
 
 
 class ChildProcesses:
-    """All children; `start` in order, `watch` now and then, `end` in reverse order."""
+    """Child processes; `start` in order, `watch` regularly, `end` in reverse order."""
 
     def __init__(self, folder: Path, logs: Path, environment: Mapping[str, str]) -> None:
         self._folder = folder
         self._logs = logs
         self._environment = dict(environment)
         self._children: dict[str, _Child] = {}
-        self._ending: list[_Child] = []  # dropped, and not seen to have ended
+        self._ending: list[_Child] = []  # dropped, but not ended yet
         logs.mkdir(parents=True, exist_ok=True)
 
     def start(self, program: ProgramSpec, ready_s: float = 60.0) -> Mapping[str, Any]:
-        """Start it; returns the addresses that it announces, {} where it announces none.
+        """Start a program and wait until it is ready; return the addresses that it announces, {} if none.
 
-        It may be slow, as its machine is: LabError where it does nothing for `ready_s`, or far too much.
+        Raises:
+            LabError: If it makes no progress for `ready_s` [s], uses too much processor time, or fails. Slow
+                machines are waited for.
         """
         return self.begin(program, ready_s)()
 
     def begin(self, program: ProgramSpec, ready_s: float = 60.0) -> Callable[[], Mapping[str, Any]]:
-        """Start it, while others are being started; what is returned waits until it is ready, as `start` does."""
+        """Start a program in parallel with others; call the returned function to wait until it is ready, as
+        `start` does.
+        """
         begun = self.starting(program, ready_s, wait_s=0.2)
         found: list[Mapping[str, Any]] = []
 
@@ -106,9 +110,9 @@ class ChildProcesses:
         return wait
 
     def starting(self, program: ProgramSpec, ready_s: float = 60.0, wait_s: float = 0.0) -> Starting:
-        """The same, a look at a time of at most `wait_s`: what else there is to watch is watched between two looks.
+        """Start a program as a generator, whose steps take at most `wait_s` [s], so that the caller can do other work.
 
-        One that does not start is ended, and is none of ours any more.
+        A program that does not get ready is ended and removed.
         """
         if program.name in self._children:
             raise LabError(f"{program.name} is a program of this lab already: give it another name")
@@ -126,7 +130,7 @@ class ChildProcesses:
         return child.addresses
 
     def drop(self, name: str) -> None:
-        """End one of them for good, waiting for nothing: `watch` sees it end. One that there is not is none."""
+        """End a child for good without waiting; `watch` detects its end. Unknown names are ignored."""
         child = self._children.pop(name, None)
         if child is not None:
             self._cut(child)
@@ -134,17 +138,17 @@ class ChildProcesses:
             self._ending.append(child)
 
     def ending(self) -> set[str]:
-        """Names of those that are dropped and have not ended yet."""
+        """Return the names of the children that are dropped but have not ended."""
         return {child.program.name for child in self._ending}
 
     def pids(self) -> dict[str, int]:
-        """The processes that there are now."""
+        """Return the current process ids by name."""
         return {name: child.process.pid for name, child in self._children.items()}
 
     def watch(self) -> None:
-        """Restart what has died, without waiting for it.
+        """Restart children that ended, without waiting for them.
 
-        What dies too often rests a while between two starts: it must not take a station with it that runs.
+        A child that ends too often is restarted after a pause, so that it does not affect running stations.
         """
         now = time.monotonic()
         self._ending = [child for child in self._ending if not self._ended(child, now)]
@@ -154,7 +158,7 @@ class ChildProcesses:
                 self._restart(child, code, now)
 
     def end(self) -> None:
-        """Cut the lifelines in reverse order, wait for each; one that does not end in its time is killed."""
+        """Close the lifelines in reverse order and wait; children that do not end in time are killed."""
         for child in reversed(self._children.values()):
             self._cut(child)
         for child in (*self._ending, *reversed(self._children.values())):
@@ -167,7 +171,7 @@ class ChildProcesses:
         child.process.stdin.close()
 
     def _ended(self, child: _Child, now: float) -> bool:
-        """True once it has ended; one whose time is over is killed."""
+        """Return True if the child has ended; kill it if its time is over."""
         if child.process.poll() is not None:
             child.log.close()
             return True
@@ -202,7 +206,7 @@ class ChildProcesses:
             env=self._environment if program.of_web else without_web_secrets(self._environment),
             cwd=self._folder,
             pass_fds=program.descriptors,
-            start_new_session=True,  # Ctrl-C reaches us alone; we end them in order
+            start_new_session=True,  # Ctrl-C reaches only this process, which ends them in order
         )
         return process, output
 
@@ -210,7 +214,7 @@ class ChildProcesses:
         output = child.process.stdout
         assert output is not None
         used, since = 0.0, time.monotonic()
-        yield  # it has begun
+        yield  # it has been started
         with selectors.DefaultSelector() as selector:
             selector.register(output, selectors.EVENT_READ)
             while not selector.select(wait_s):
@@ -237,7 +241,7 @@ class ChildProcesses:
         return f"{lines[-1] if lines else 'it said nothing'} (see {path})"
 
     def _restart(self, child: _Child, code: int, now: float) -> None:
-        """Start it again where it was; what it announces is known and goes to its log."""
+        """Restart it with the same addresses; its announcement is known and goes to its log."""
         program = child.program
         while child.restarts and child.restarts[0] < now - _RESTART_WINDOW_S:
             child.restarts.popleft()
@@ -261,7 +265,7 @@ class ChildProcesses:
 
 
 def processor_s(pid: int) -> float:
-    """Processor time of that process, and of those it has waited for [s]; 0 of one that has ended."""
+    """Return the processor time of a process and of the children it has waited for [s]; 0 if it has ended."""
     try:
         told = Path(f"/proc/{pid}/stat").read_text("ascii", "replace")
     except OSError:

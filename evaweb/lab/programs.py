@@ -1,4 +1,4 @@
-"""Programs of a lab, each as the command line that starts it."""
+"""Programs of a lab as command lines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MANAGE = str(settings.BASE_DIR / "manage.py")
 
 
 def web(host: str, port: int) -> ProgramSpec:
-    """Pages, REST and websockets."""
+    """Return the web process: pages, REST and websockets."""
 
     def arguments(where: object) -> tuple[str, ...]:
         return (_MANAGE, "serve", "--host", host, "--port", str(where))
@@ -24,26 +24,26 @@ def web(host: str, port: int) -> ProgramSpec:
         arguments(port),
         announces=True,
         again=lambda found: arguments(port_of(found)),
-        patience_s=10.0,  # it gives requests that are under way 4 s, once it has heard
+        patience_s=10.0,  # requests in progress get 4 s after it is asked to end
         nice=5,
         of_web=True,
     )
 
 
 def stops(descriptor: int, web_port: str) -> ProgramSpec:
-    """E-stop, stop and halt of the web's pages, on a socket that listens; the web gives way to it."""
+    """Return the process for stops of the web's pages, on an inherited socket; it has priority over the web."""
     return ProgramSpec(
         "stops",
         (_MANAGE, "stops", "--descriptor", str(descriptor), "--web-port", web_port),
         announces=True,
-        patience_s=10.0,  # as the web's
+        patience_s=10.0,  # like the web
         descriptors=(descriptor,),
         of_web=True,
     )
 
 
 def gate(host: str, port: int) -> ProgramSpec:
-    """Where stations on other computers connect: at this port, with their pictures at the next."""
+    """Return the gate for stations on other computers: at this port, images at the next port."""
     return ProgramSpec(
         "gate",
         (_MANAGE, "gate", "--host", host, "--port", str(port)),
@@ -54,23 +54,23 @@ def gate(host: str, port: int) -> ProgramSpec:
 
 
 def worker() -> ProgramSpec:
-    """Worker of every queue; what it was about to do is done at the next start."""
+    """Return the worker of every queue; interrupted work is repeated at the next start."""
     return ProgramSpec("worker", (_MANAGE, "worker"), patience_s=20.0, of_web=True)
 
 
 def station(deployment: str, assignments: Sequence[str]) -> ProgramSpec:
-    """A runtime: a family of processes with a supervisor of its own."""
+    """Return the runtime of a station, which supervises its own processes."""
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     return ProgramSpec(f"station-{_stem(deployment)}", ("-m", "runtime", deployment, *sets), patience_s=15.0)
 
 
 def bench(seed: int, width: int, height: int) -> tuple[str, ...]:
-    """Options of a simulated bench: first layout, and pixels of its pictures."""
+    """Return the options of a simulated bench: seed of the first layout, and image size [pixels]."""
     return ("--seed", str(seed), "--width", str(width), "--height", str(height))
 
 
 def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> ProgramSpec:
-    """The simulated bench with these options, on free ports that it keeps."""
+    """Return the simulated bench with these options, on free ports that it keeps after restarts."""
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
         ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
@@ -86,7 +86,7 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
 
 
 def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
-    """A demonstrator of the simulated bench's task with a leader arm, on a free port that it keeps."""
+    """Return the simulated leader, which demonstrates the bench's task, on a free port that it keeps."""
 
     def arguments(endpoint: str) -> tuple[str, ...]:
         watching = ("-m", "runtime.sim.leader", "--robot", robot, "--obs-endpoint", observations)
@@ -101,13 +101,13 @@ def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
 
 
 def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tuple[str, ...]:
-    """A scripted policy that looks at the pictures, as runtime.sim.serve is asked for it."""
+    """Return the arguments of runtime.sim.serve for a scripted policy that uses the images."""
     what = ("openpi", "--robot", robot, "--behaviour", "pick_place")
     return (*what, "--name", name, "--port", str(port), *options)
 
 
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
-    """A scripted policy on that port, or on a free one that it keeps."""
+    """Return a scripted policy on that port, or on a free port that it keeps."""
 
     def arguments(port: object) -> tuple[str, ...]:
         return ("-m", "runtime.sim.serve", *_serving(name, robot, options, port))
@@ -124,10 +124,10 @@ def lockstep(
     policies: Mapping[str, tuple[Sequence[str], int]],
     options: Sequence[str],
 ) -> ProgramSpec:
-    """A station, its simulated bench and its policy servers in one process on a virtual clock.
+    """Return a station, its simulated bench and its policy servers in one process on a virtual clock.
 
-    `policies`: by name, the options of each and its port, 0 for a free one; it announces their addresses. `options`:
-    those of the bench, and --paced.
+    `policies` maps names to options and port (0: free); the addresses are announced. `options` are those of the bench,
+    and --paced.
     """
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     served = [
@@ -140,7 +140,7 @@ def lockstep(
 
 
 def port_of(found: Mapping[str, Any]) -> str:
-    """The port in what a program announced."""
+    """Return the port of the URL that a program announced."""
     return str(found["url"]).rstrip("/").rpartition(":")[2]
 
 

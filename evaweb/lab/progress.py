@@ -1,4 +1,4 @@
-"""The steps of a start as lines on the terminal: what is being done, and a line every few seconds while it lasts."""
+"""Progress of a start on the terminal: one line per step, and one every few seconds while it lasts."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ _EVERY_S = 10.0
 
 
 class Progress:
-    """Steps that are told as "2 of 6 the simulated bench ...": nothing is silent for long."""
+    """Progress as "2 of 6 the simulated bench ...", never silent for long."""
 
     def __init__(self, write: Callable[[str], object], steps: int) -> None:
-        """`write` takes a line, and shows it at once."""
+        """Initialise; `write` prints a line and flushes it."""
         self._write, self._steps, self._at = write, steps, 0
 
     def step(self, what: str) -> AbstractContextManager[None]:
-        """The next step, for as long as the block lasts."""
+        """Report the next step for the duration of the block."""
         self._at += 1
         return self.during(f"{self._at} of {self._steps} {what}")
 
     @contextmanager
     def during(self, what: str) -> Iterator[None]:
-        """A line of its own, for as long as the block lasts."""
+        """Report an unnumbered activity for the duration of the block."""
         self._say(f"{what}\n")
         done = threading.Event()
         ticking = threading.Thread(target=self._tick, args=(done,), daemon=True)
@@ -42,17 +42,15 @@ class Progress:
             self._say(f"  ... still at it, {took:.0f} s\n")
 
     def _say(self, line: str) -> None:
-        with suppress(
-            OSError
-        ):  # of a terminal that is gone: what is being done goes on, and is ended in order
+        with suppress(OSError):  # the terminal is gone: continue, and end in order
             self._write(line)
 
 
 def on_terminal(steps: int) -> Progress:
-    """One that tells standard error: standard output is for what a command finds."""
+    """Return progress on standard error; standard output is for a command's results."""
     return Progress(lambda line: print(line, end="", file=sys.stderr, flush=True), steps)
 
 
 def silent() -> Progress:
-    """One that tells nobody."""
+    """Return progress without output."""
     return Progress(lambda line: None, 0)

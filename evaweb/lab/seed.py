@@ -1,4 +1,4 @@
-"""Rows of a lab's database when it starts, and those that the demo has besides."""
+"""Initial database rows of a lab, and of the demo."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from evaweb.roles import Role, set_role
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 
-_ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # nothing that looks like something else on a screen
+_ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without characters that look alike
 
 
 @dataclass(frozen=True, slots=True)
 class DemoLogin:
-    """An account and its fresh password."""
+    """Account with its new password."""
 
     username: str
     password: str
 
 
 def fresh_password() -> str:
-    """Fifteen characters in three groups, 74 bits."""
+    """Return a password of fifteen characters in three groups, 74 bits."""
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(5)) for _ in range(3))
 
 
 @transaction.atomic
 def demo_login(*, username: str, role: Role) -> DemoLogin:
-    """The account of that name with its role and a password that was never used before."""
+    """Create or update the account with a role and a new password."""
     user, _ = User.objects.get_or_create(username=username)
     password = fresh_password()
     user.set_password(password)
@@ -45,12 +45,12 @@ def demo_login(*, username: str, role: Role) -> DemoLogin:
 
 
 def has_no_accounts() -> bool:
-    """True if there is no account yet, or none that is switched on."""
+    """Return True if there is no active account."""
     return not User.objects.filter(is_active=True).exists()
 
 
 def station_registered(*, name: str, robot: str, deployment: str, simulated: bool) -> Station:
-    """The station of a deployment that this lab starts; its title and message are an administrator's."""
+    """Create or update the station of a deployment; its title and message are left to the administrator."""
     facts = {"robot": robot, "deployment": deployment, "simulated": simulated}
     station, _ = Station.objects.update_or_create(name=name, defaults=facts, create_defaults=facts)
     return station
@@ -80,7 +80,7 @@ _POSITIONS = (
 
 @transaction.atomic
 def demo_scene() -> Scene:
-    """The tabletop scene, made once; what an administrator changed in it stays changed."""
+    """Return the tabletop scene, created once; changes by an administrator are kept."""
     scene, made = Scene.objects.get_or_create(
         name="block-on-plate",
         defaults={
@@ -121,8 +121,11 @@ def demo_plan(
     design: str = StoppingRule.EVIDENCE,
     order: str = Allocation.PAIRED,
 ) -> Plan:
-    """A blind plan that compares two checkpoints at all positions of a scene, frozen; one that is there is brought up
-    to date. Conflict where it cannot be, because trials of it are not finished."""
+    """Return a frozen blind plan that compares two checkpoints at all positions of a scene, created or amended.
+
+    Raises:
+        Conflict: If it cannot be amended, because trials are not finished.
+    """
     user = User.objects.get(username=owner)
     plan = Plan.objects.filter(name=name).order_by("-version").first()
     if plan is None:
@@ -149,7 +152,7 @@ def demo_plan(
 
 
 def demo_checkpoint(*, name: str, description: str, policy: Mapping[str, object]) -> Checkpoint:
-    """A checkpoint of the demo, led to where its policy server listens this time."""
+    """Create or update a checkpoint of the demo with the current address of its policy server."""
     facts = {"policy": dict(policy)}
     checkpoint, _ = Checkpoint.objects.update_or_create(
         name=name, defaults=facts, create_defaults={"description": description, **facts}

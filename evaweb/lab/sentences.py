@@ -1,7 +1,7 @@
-"""The catalogue of all words that a language can say, for who writes one, and what such a language lacks.
+"""Catalogue of all translatable sentences, for translators, and comparison of a language with it.
 
-Sentences of Python are declared as patterns; scripts write `t("an.id", "English with {name}", { name })`, templates
-`{% t "an.id" name=value %}English{% endt %}`.
+Python declares sentences as patterns; scripts write `t("an.id", "English with {name}", { name })`, templates `{% t
+"an.id" name=value %}English{% endt %}`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SCRIPT = re.compile(r'(?<![\w.])t\(\s*"([^"]+)",\s*("(?:[^"\\]|\\.)*")')
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What a language is to say: id, English, and the names of what can stand in it."""
+    """Sentence to translate: id, English text, and names of its arguments."""
 
     id: str
     english: str
@@ -40,7 +40,7 @@ class Entry:
 
 
 def modules() -> Iterator[str]:
-    """Names of the modules that declare sentences, or only use them."""
+    """Yield the names of the modules that declare or use sentences."""
     for package in ("runtime", "evaweb"):
         for path in sorted((_ROOT / package).rglob("*.py")):
             if _IMPORT in path.read_text("utf-8"):
@@ -48,14 +48,18 @@ def modules() -> Iterator[str]:
 
 
 def of_python() -> list[Entry]:
-    """Every pattern that there is, in the order of the ids."""
+    """Return every pattern of Python, ordered by id."""
     for module in modules():
         import_module(module)
     return [_entry(pattern) for pattern in known()]
 
 
 def of_scripts() -> list[Entry]:
-    """What scripts say; ValueError for an id with two texts, and for what is not written as it is read here."""
+    """Return the sentences of scripts.
+
+    Raises:
+        ValueError: If an id has two texts, or a call cannot be parsed.
+    """
     found: list[Entry] = []
     for path, source in _sources("static", "*.js"):
         read = [(id, json.loads(english)) for id, english in _SCRIPT.findall(source)]
@@ -65,7 +69,11 @@ def of_scripts() -> list[Entry]:
 
 
 def of_templates() -> list[Entry]:
-    """What templates say; ValueError for an id with two texts, and for what is not written as it is read here."""
+    """Return the sentences of templates.
+
+    Raises:
+        ValueError: If an id has two texts, or a tag cannot be parsed.
+    """
     found: list[Entry] = []
     for path, source in _sources("templates", "*.html"):
         read = _TEMPLATE.findall(source)
@@ -78,7 +86,7 @@ def of_templates() -> list[Entry]:
 
 
 def of_labels() -> list[Entry]:
-    """Heads of columns, names of filters, tabs and roles, and words of choices: what `{% label %}` says."""
+    """Return the labels of `{% label %}`: columns, filters, tabs, roles and choices."""
     found = {
         text for path, source in _sources("evaweb", "*.py") for text in _labels(ast.parse(source, str(path)))
     }
@@ -95,14 +103,14 @@ def of_labels() -> list[Entry]:
 
 
 def catalogue(entries: Iterable[Entry]) -> list[dict[str, Any]]:
-    """Id, English and names of the arguments of each."""
+    """Return id, English text and argument names of each entry."""
     return [{"id": one.id, "english": one.english, "arguments": sorted(one.names)} for one in entries]
 
 
 def compared(entries: Sequence[Entry], translated: Mapping[str, str]) -> dict[str, list[str]]:
-    """Ids that a language lacks ("missing"), that there are none of ("unknown"), and whose words do not fit.
+    """Return the ids that a language lacks ("missing"), that do not exist ("unknown"), or that do not fit.
 
-    "other_arguments": words that name what there is not, or cannot be read.
+    "other_arguments" are texts with unknown arguments, or texts that cannot be parsed.
     """
     english = {one.id: one for one in entries}
     return {
@@ -115,7 +123,11 @@ def compared(entries: Sequence[Entry], translated: Mapping[str, str]) -> dict[st
 
 
 def once(entries: Iterable[Entry]) -> list[Entry]:
-    """In the order of the ids; ValueError for an id with two texts."""
+    """Return the entries without duplicates, ordered by id.
+
+    Raises:
+        ValueError: If an id has two texts.
+    """
     found: dict[str, Entry] = {}
     for one in entries:
         if found.setdefault(one.id, one) != one:
@@ -124,7 +136,7 @@ def once(entries: Iterable[Entry]) -> list[Entry]:
 
 
 def _labels(tree: ast.AST) -> Iterator[str]:
-    """What lists call their columns and filters, and what tabs are called."""
+    """Yield the titles of columns, filters and tabs."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith("_TABS"):
             yield from (title for title, _ in ast.literal_eval(node.value))

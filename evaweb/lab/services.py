@@ -1,4 +1,4 @@
-"""Bundles: asked for, and given to the administrator who asked."""
+"""Diagnostic bundles: requested by an administrator, and downloadable by the same one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NAME = re.compile(r"eva-diagnosis-\d{8}-\d{6}\.zip")
 
 
 def bundle_ask(*, user: User) -> Job:
-    """Have a bundle made, as this administrator may see the lab."""
+    """Enqueue a bundle with this administrator's visibility."""
     require_role(user, Role.ADMIN)
     name = f"eva-diagnosis-{timezone.now():%Y%m%d-%H%M%S}.zip"
     log.info("%a asks for the diagnostic bundle %s", user.get_username(), name)
@@ -29,17 +29,21 @@ def bundle_ask(*, user: User) -> Job:
 
 
 def bundle_job(*, user: User) -> Job | None:
-    """The newest job of this user's bundles."""
+    """Return the newest bundle job of this user, or None."""
     return job_newest(key=_key(user))
 
 
 def bundles(*, user: User) -> list[Path]:
-    """Those that are there, the newest first."""
+    """Return this user's bundles, newest first."""
     return sorted((path for path in folder(user).iterdir() if _NAME.fullmatch(path.name)), reverse=True)
 
 
 def bundle_get(*, user: User, name: str) -> Path:
-    """One of this user's; NotFound."""
+    """Return a bundle of this user.
+
+    Raises:
+        NotFound: If there is none of that name.
+    """
     found = next((path for path in bundles(user=user) if path.name == name), None)
     if found is None:
         raise NotFound(f"{name!r:.80} is no bundle of yours; it may have been replaced by newer ones")

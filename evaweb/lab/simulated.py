@@ -1,4 +1,4 @@
-"""A simulated bench with its policies of different skill: what the demo has, and what First steps brings."""
+"""Simulated bench with policies of different skill, for the demo and for the first steps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ POLICIES = {
 
 @dataclass(frozen=True)
 class Benches:
-    """How this lab's simulated benches are: first layout, pixels of their pictures, and settings of their stations."""
+    """Settings of this lab's simulated benches: seed of the first layout, image size [pixels], overrides of
+    their stations.
+    """
 
     seed: int = 1
     pictures: tuple[int, int] = (640, 480)
@@ -42,12 +44,12 @@ class Benches:
         return programs.bench(self.seed, *self.pictures)
 
     def skill(self, policy: str) -> tuple[str, ...]:
-        """Options of a policy's server."""
+        """Return the options of a policy's server."""
         return (*POLICIES[policy][1], "--seed", str(self.seed))
 
 
 def simulated_options(parser: ArgumentParser) -> None:
-    """Options of a command that starts simulated benches."""
+    """Add the options of a command that starts simulated benches."""
     parser.add_argument(
         "--pictures",
         type=_pixels,
@@ -65,17 +67,17 @@ def simulated_options(parser: ArgumentParser) -> None:
 
 
 def benches_of(options: Mapping[str, Any]) -> Benches:
-    """What was said with these options, and with --seed where there is one."""
+    """Return the settings from these options, with --seed if there is one."""
     return Benches(options.get("seed", Benches.seed), options["pictures"], options["set"])
 
 
 def bring(
     processes: ChildProcesses, station: str, robot: str, how: Benches
 ) -> Generator[str, None, list[str]]:
-    """Start the bench and the policies of a station, a look at a time; yields what is being started.
+    """Start bench and policies of a station step by step; yield what is being started.
 
-    Returns what its deployment is to be given besides. A policy serves all stations with this robot; its checkpoint is
-    led to where it listens.
+    Returns the overrides of its deployment. A policy server is shared by all stations with this robot; its checkpoint
+    is updated with its address.
     """
     program = programs.tabletop(robot, how.options, f"bench-{station}")
     node = yield from _starting(processes, program, "the simulated bench")
@@ -108,12 +110,18 @@ def _starting(
 
 
 def known_port(name: str) -> int:
-    """Port of the checkpoint's earlier policy server, if it is free: a plan that is frozen names it."""
+    """Return the port of the checkpoint's previous policy server if it is free, else 0: a frozen plan
+    contains the address.
+    """
     return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
 
 
 def _url_of(name: str) -> str:
-    """Where the policy of a checkpoint listens; LabError."""
+    """Return the address of a checkpoint's policy.
+
+    Raises:
+        LabError: If it has none.
+    """
     checkpoint = Checkpoint.objects.filter(name=name).first()
     if checkpoint is None:
         raise LabError(
@@ -129,7 +137,9 @@ def _url_of(name: str) -> str:
 
 
 def _pixels(text: str) -> tuple[int, int]:
-    """Width and height of "400x300", the least in which the scripted policies see the block everywhere."""
+    """Return width and height of "400x300", the smallest size at which the scripted policies always detect
+    the block.
+    """
     found = re.fullmatch(r"(\d{3,4})x(\d{3,4})", text)
     width, height = (int(found[1]), int(found[2])) if found else (0, 0)
     if not (400 <= width <= 4096 and 300 <= height <= 4096):
@@ -138,10 +148,10 @@ def _pixels(text: str) -> tuple[int, int]:
 
 
 def free_port_of(url: str | None) -> int:
-    """The port of that address if it is one and free now, else 0."""
+    """Return the port of that URL if it has one that is free, else 0."""
     try:
         port = urlsplit(url).port if isinstance(url, str) else None
-    except ValueError:  # a person may have written anything
+    except ValueError:  # a person may have entered anything
         return 0
     if not port:
         return 0

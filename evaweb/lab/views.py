@@ -1,4 +1,4 @@
-"""Pages of a lab that is being set up: the first account, first steps, the check of the machine, the bundle."""
+"""Pages for setting up a lab: first account, first steps, machine check, diagnostic bundle."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BACKEND = "django.contrib.auth.backends.ModelBackend"
 
 
 class FirstAccountForm(forms.Form):
-    """The code of the terminal, and who the administrator is to be."""
+    """Form with the code of the terminal, and the administrator's name and password."""
 
     code = forms.CharField(max_length=40, help_text="The terminal in which the lab was started shows it.")
     username = forms.CharField(max_length=150, label="Name", validators=[User.username_validator])
@@ -48,16 +48,16 @@ class FirstAccountForm(forms.Form):
     )
 
     def clean_code(self) -> str:
-        """The right one."""
+        """Check the code."""
         given: str = self.cleaned_data["code"]
         if not first_account.is_code(given):
             raise ValidationError("this is not the code that the lab shows in its terminal")
         return given
 
     def clean(self) -> dict[str, Any]:
-        """The password is as good as any of this lab's."""
+        """Check the password by the lab's rules."""
         cleaned: dict[str, Any] = super().clean() or {}
-        if "code" in cleaned and "password" in cleaned:  # no work for whoever has no code
+        if "code" in cleaned and "password" in cleaned:  # no expensive check without the code
             user = User(username=cleaned.get("username", ""))
             try:
                 validate_password(cleaned["password"], user)
@@ -69,7 +69,7 @@ class FirstAccountForm(forms.Form):
 @login_not_required
 @require_http_methods(["GET", "HEAD", "POST"])
 def make_first_account(request: HttpRequest) -> HttpResponse:
-    """The first administrator of a lab, with the code that its terminal shows."""
+    """Create the first administrator of a lab, with the code that its terminal shows."""
     if not first_account.is_offered():
         return redirect("login")
     form = FirstAccountForm(request.POST or None)
@@ -85,14 +85,14 @@ def make_first_account(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def steps(request: HttpRequest) -> HttpResponse:
-    """The way to the first scored trial."""
+    """Render the steps to the first scored trial."""
     require_role(request.user, Role.ADMIN)
     return _steps(request)
 
 
 @require_GET
 def news(request: HttpRequest) -> HttpResponse:
-    """Nothing as long as the steps stand as the page shows them; else the page is told to load again."""
+    """Answer 204, with a header that reloads the page if the steps have changed since it was rendered."""
     require_role(request.user, Role.ADMIN)
     answer = HttpResponse(status=204)
     if _walk(request).mark != request.GET.get("mark", ""):
@@ -114,7 +114,7 @@ def simulated(request: HttpRequest) -> HttpResponse:
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def draft(request: HttpRequest) -> HttpResponse:
-    """The form of a draft as its choices stand, to be put into the page; posted, the draft is written."""
+    """Render the draft form as a fragment, or write the posted draft."""
     require_role(request.user, Role.ADMIN)
     if request.method != "POST":
         return render(request, "lab/draft_form.html", {"draft": form_of(request.GET.dict())})
@@ -131,14 +131,14 @@ def draft(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def check_draft(request: HttpRequest, name: str) -> HttpResponse:
-    """What the runtime's own check says of a deployment, to be put into the page."""
+    """Render the errors that the runtime's check finds in a deployment as a fragment."""
     require_role(request.user, Role.ADMIN)
     return render(request, "lab/checked.html", {"faults": deployments.faults_of(_kept(name).path)})
 
 
 @require_GET
 def deployment(request: HttpRequest, name: str) -> HttpResponse:
-    """The deployment file, to be kept."""
+    """Return the deployment file as a download."""
     require_role(request.user, Role.ADMIN)
     found = _kept(name)
     return FileResponse(found.path.open("rb"), as_attachment=True, filename=found.path.name)
@@ -146,7 +146,7 @@ def deployment(request: HttpRequest, name: str) -> HttpResponse:
 
 @require_POST
 def again(request: HttpRequest, name: str) -> HttpResponse:
-    """Have the lab start a station anew that it could not start."""
+    """Make the lab try again to start a station."""
     require_role(request.user, Role.ADMIN)
     deployments.try_again(name=name)
     return _to(name)
@@ -163,7 +163,7 @@ def remove(request: HttpRequest, name: str) -> HttpResponse:
 
 @require_GET
 def camera(request: HttpRequest, name: str, camera: str) -> HttpResponse:
-    """What a camera shows now."""
+    """Return the current image of a camera."""
     require_role(request.user, Role.ADMIN)
     station = station_get(name=name)
     if camera not in cameras_of(station):
@@ -177,7 +177,7 @@ def camera(request: HttpRequest, name: str, camera: str) -> HttpResponse:
 
 @require_POST
 def cameras(request: HttpRequest, name: str) -> HttpResponse:
-    """Confirm that each camera has its right name; where names were exchanged, exchange them in the deployment."""
+    """Confirm that each camera has its right name, or rename exchanged cameras in the deployment."""
     require_role(request.user, Role.ADMIN)
     station = station_get(name=name)
     shown = {key: request.POST.get(f"shows.{key}", key) for key in cameras_of(station)}
@@ -194,7 +194,7 @@ def cameras(request: HttpRequest, name: str) -> HttpResponse:
 
 @require_POST
 def scene(request: HttpRequest) -> HttpResponse:
-    """Make the starter scene."""
+    """Create the starter scene."""
     require_role(request.user, Role.ADMIN)
     first_steps.starter_scene()
     return _to(request.POST.get("station", ""))
@@ -235,7 +235,7 @@ def _kept(name: str) -> deployments.Kept:
 
 @require_GET
 def machine(request: HttpRequest) -> HttpResponse:
-    """What a lab needs of this machine, and what was found."""
+    """Render the machine check."""
     require_role(request.user, Role.ADMIN)
     return render(request, "lab/machine.html", {"lines": machine_check.lines()})
 
@@ -245,7 +245,7 @@ def machine(request: HttpRequest) -> HttpResponse:
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def diagnosis(request: HttpRequest) -> HttpResponse:
-    """The bundles that this administrator had made; posted, another one is asked for."""
+    """Render this administrator's bundles, or request a new one."""
     require_role(request.user, Role.ADMIN)
     if request.method == "POST":
         services.bundle_ask(user=request.user)
@@ -256,13 +256,13 @@ def diagnosis(request: HttpRequest) -> HttpResponse:
     fragment = request.headers.get("HX-Request")
     answer = render(request, f"lab/{'bundles' if fragment else 'diagnosis'}.html", context)
     if fragment and not passing:
-        answer["HX-Refresh"] = "true"  # another one can be asked for
+        answer["HX-Refresh"] = "true"  # another one can be requested
     return answer
 
 
 @require_GET
 def diagnosis_file(request: HttpRequest, file: str) -> HttpResponse:
-    """One of them."""
+    """Return one bundle as a download."""
     require_role(request.user, Role.ADMIN)
     path = services.bundle_get(user=request.user, name=file)
     return FileResponse(path.open("rb"), as_attachment=True, filename=path.name)

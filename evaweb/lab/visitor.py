@@ -1,4 +1,4 @@
-"""A visitor in Python: logs in, asks over REST and watches over the websocket, exactly as a browser does."""
+"""Client in Python that logs in, uses REST and watches over the websocket, exactly like a browser."""
 
 from __future__ import annotations
 
@@ -30,37 +30,41 @@ from evaweb.errors import EvaError
 from evaweb.lab.patience import DemoFailed, NoReply, ProgressTimeout
 
 _RENEW_S = 1.0
-_LOOK_S = 1.0  # between two looks at whether something goes on
+_LOOK_S = 1.0  # period of progress checks
 _TIMEOUT_S = 30.0
 _LARGEST_FRAME = 16 * 1024 * 1024
 _TOKEN = re.compile(r'name="csrfmiddlewaretoken" value="([^"]+)"')
 
 
 class StateTimeout(DemoFailed):
-    """No state came in time that is as it was wanted."""
+    """No state in time satisfied the condition."""
 
 
 class _NoRedirect(HTTPRedirectHandler):
-    """A login that worked answers with a redirect; one that did not, with the form."""
+    """Redirect handler that stops: a successful login answers with a redirect, a failed one with the form."""
 
     def redirect_request(self, *args: Any, **kwargs: Any) -> None:
         return None
 
 
 class RestClient:
-    """One logged-in session over HTTP."""
+    """Logged-in session over HTTP."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
         self._cookies = CookieJar()
         self._opener: OpenerDirector = build_opener(
-            ProxyHandler({}),  # the lab is here or in the same house
+            ProxyHandler({}),  # the lab is on this machine or in the local network
             HTTPCookieProcessor(self._cookies),
             _NoRedirect(),
         )
 
     def login(self, username: str, password: str) -> None:
-        """Fill in the form; VisitFailed where it comes back."""
+        """Log in with the form.
+
+        Raises:
+            DemoFailed: If name or password is wrong.
+        """
         page = self._open(Request(f"{self.url}/login/")).decode()
         found = _TOKEN.search(page)
         if not found:
@@ -77,11 +81,15 @@ class RestClient:
         raise DemoFailed(f"login as {username}: name or password is wrong")
 
     def get(self, path: str) -> Any:
-        """The JSON of `path` under /api/v1."""
+        """Return the JSON of `path` under /api/v1."""
         return json.loads(self._open(Request(f"{self.url}/api/v1/{path}")))
 
     def post(self, path: str, content: Mapping[str, Any]) -> Any:
-        """Send JSON to `path` under /api/v1; VisitFailed with the sentence of the answer where it refuses."""
+        """Send JSON to `path` under /api/v1, and return the answer.
+
+        Raises:
+            DemoFailed: If it is refused; with the sentence of the answer.
+        """
         headers = {
             "Content-Type": "application/json",
             "X-CSRFToken": self.csrf_token,
@@ -92,19 +100,19 @@ class RestClient:
 
     @property
     def csrf_token(self) -> str:
-        """Token that goes with whatever changes something, "" where there is none."""
+        """CSRF token for requests with changes, "" if there is none."""
         found = (cookie.value for cookie in self._cookies if cookie.name.startswith("eva_csrf_"))
         return next(found, None) or ""
 
     @property
     def session_name(self) -> str:
-        """The name of the cookie with the session, whose end is the lab's own, "" where there is none."""
+        """Name of the session cookie, whose suffix differs by lab; "" if there is none."""
         found = (cookie.name for cookie in self._cookies if cookie.name.startswith("eva_session_"))
         return next(found, "")
 
     @property
     def cookies(self) -> str:
-        """The header `Cookie`, as a browser sends it."""
+        """Header `Cookie`, as a browser sends it."""
         return "; ".join(f"{cookie.name}={cookie.value}" for cookie in self._cookies)
 
     def _open(self, request: Request) -> bytes:
@@ -117,13 +125,17 @@ class RestClient:
             raise DemoFailed(
                 f"{request.get_method()} {request.selector}: HTTP {refusal.code}: {_sentence(body)}"
             ) from None
-        except (URLError, TimeoutError, ConnectionError) as error:  # the latter while the body is read
+        except (
+            URLError,
+            TimeoutError,
+            ConnectionError,
+        ) as error:  # ConnectionError occurs while the body is read
             reason = error.reason if isinstance(error, URLError) else error
             raise NoReply(f"{self.url} does not answer: {reason}") from None
 
 
 def _sentence(body: str) -> str:
-    """Sentence of an error's body for a person."""
+    """Return the sentence in the body of an error."""
     try:
         found = json.loads(body)
     except ValueError:
@@ -138,19 +150,19 @@ def _words(state: Mapping[str, Any]) -> str:
 
 
 class LivePage:
-    """A page that is open on a station: newest state, the lease renewed while it is held, credits paid.
+    """Open page at a station: newest state, renewal of a held lease, and credits for frames.
 
-    `page` is the id of a page that was open before, under which it goes on; "" makes another one.
+    `page` is the id of an earlier page that is continued; "" creates a new one.
     """
 
     def __init__(self, visitor: RestClient, station: str, page: str = "") -> None:
         self.page = page or uuid.uuid4().hex
         self.station = station
-        self.epoch = 0  # of our lease; 0: none
+        self.epoch = 0  # epoch of our lease; 0: none
         self.frames = 0
         self._visitor = visitor
         self._state: Mapping[str, Any] = {}
-        self._decided = ("", 0)  # boot and sequence that our last command was decided by
+        self._decided = ("", 0)  # boot and sequence of the state on which our last command was based
         self._failure = ""
         self._changed = threading.Condition()
         self._open = ExitStack()
@@ -176,9 +188,13 @@ class LivePage:
     def wait(
         self, reached: Callable[[Mapping[str, Any]], bool], seconds: float, what: str
     ) -> Mapping[str, Any]:
-        """The first state that satisfies `reached`; VisitFailed with the state where none comes in time.
+        """Return the first state that satisfies `reached`.
 
-        After a command only states count that came about since: an old `ready` is no answer to `setup`.
+        After a command only newer states count: an old `ready` is not an answer to `setup`.
+
+        Raises:
+            StateTimeout: If there is none within `seconds` [s].
+            DemoFailed: If the connection or the lease was lost.
         """
         deadline = time.monotonic() + seconds
         with self._changed:
@@ -197,7 +213,7 @@ class LivePage:
         what: str,
         mark: Callable[[Mapping[str, Any]], object],
     ) -> Mapping[str, Any]:
-        """As `wait`, while there is progress: `mark` of the state is another one whenever something went on."""
+        """Wait like `wait`, as long as there is progress: `mark` of the state changes with any progress."""
         patience = ProgressTimeout(what)
         while True:
             try:
@@ -207,13 +223,17 @@ class LivePage:
                 patience.update(mark(state) if state else None, _words(state))
 
     def claim(self) -> None:
-        """Take the station; renewed from then on."""
+        """Claim the station; the lease is renewed from then on."""
         path = f"stations/{self.station}/lease"
-        self.epoch = 0  # what an earlier lease is still answered says nothing of this one
+        self.epoch = 0  # answers to renewals of an earlier lease do not concern this one
         self.epoch = int(self._visitor.post(path, {"action": "claim", "page": self.page})["epoch"])
 
     def command(self, kind: str, trial: int | None = None) -> Mapping[str, Any]:
-        """Give one command, decided by the newest state; VisitFailed with the reason where it is refused."""
+        """Send one command, based on the newest state.
+
+        Raises:
+            DemoFailed: If it is refused; with the reason.
+        """
         state = self._state
         content = {
             "uuid": str(uuid.uuid4()),
@@ -235,7 +255,7 @@ class LivePage:
         return self._state["boot"] != boot or self._state["sequence"] > sequence
 
     def close(self) -> None:
-        """Close the page; the lease ends by itself."""
+        """Close the page; the lease then expires."""
         self.epoch = 0
         self._open.close()
 

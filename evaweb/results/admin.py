@@ -1,4 +1,4 @@
-"""Automatic judges in the administration; what they said is on the pages of results, where the blind is kept."""
+"""Administration of automatic judges; their judgements are on the result pages, which respect blinding."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from evaweb.results.ratings.automatic import judge_allow, judge_forbid
 
 @admin.register(AutomaticJudge)
 class AutomaticJudgeAdmin(admin.ModelAdmin):
-    """Judges that can be asked; one with a server only once its address is allowed."""
+    """Administration of the judges; a judge with a server is usable only after its address was allowed."""
 
     list_display = ("name", "kind", "address", "model", "allowed")
     readonly_fields = ("allowed",)
     actions = ("allow", "forbid")
 
     def get_readonly_fields(self, request: HttpRequest, obj: AutomaticJudge | None = None) -> tuple[str, ...]:
-        return ("name", *self.readonly_fields) if obj else self.readonly_fields  # judgements have this name
+        return ("name", *self.readonly_fields) if obj else self.readonly_fields  # judgements refer to it
 
     @admin.display(description="allowed")
     def allowed(self, judge: AutomaticJudge) -> str:
-        """Who has allowed its address, and when."""
+        """Return who allowed the judge's address and when, or why nothing is sent."""
         if not judge.address:
             return "it has no address"
         if judge.allowed_address != judge.address or judge.allowed_at is None:
@@ -36,12 +36,12 @@ class AutomaticJudgeAdmin(admin.ModelAdmin):
 
     @admin.action(description="Allow the address: pictures are sent there")
     def allow(self, request: HttpRequest, rows: QuerySet[AutomaticJudge]) -> None:
-        """With who allowed it, here and in the history of the judge."""
+        """Allow the addresses; the judge's history records by whom."""
         self._each(request, rows, judge_allow, "allowed its address")
 
     @admin.action(description="Allow the address no longer")
     def forbid(self, request: HttpRequest, rows: QuerySet[AutomaticJudge]) -> None:
-        """Nothing more is sent there."""
+        """Withdraw the permission: nothing more is sent to these addresses."""
         self._each(request, rows, judge_forbid, "allowed its address no longer")
 
     def _each(

@@ -1,4 +1,4 @@
-"""The job of automatic judges."""
+"""Job of automatic judges."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from evaweb.plans.models import Plan
 from evaweb.results.ratings import automatic
 from evaweb.roles import Role
 
-_TURN_S = 20.0  # then what else waits has its turn
-_NAMED = 50  # codes of trials without pictures
+_TURN_S = 20.0  # time slice, so that other jobs get their turn
+_NAMED = 50  # codes of trials without images in the result
 
 
-# Others ask on the page of a plan of theirs.
+# Other users start it on the page of their own plan.
 @job_kind(automatic.KIND, least=lambda args: Role.ADMIN, queue=Queue.GPU)
 def judge(work: JobContext) -> Mapping[str, Any]:
-    """Show trials of a plan to a judge, and ask for the rest; args: plan, judge."""
+    """Show a plan's trials to a judge, and enqueue a job for the remaining ones; args: plan, judge."""
     plan, name = Plan.objects.get(pk=work.args["plan"]), work.args["judge"]
     until, shown = time.monotonic() + _TURN_S, 0
     while automatic.judge_next_trial(plan=plan, name=name):

@@ -1,4 +1,4 @@
-"""What second raters and automatic judges say of trials, and which of two people prefer: never a trial's own score."""
+"""Second ratings, preferences and automatic judgements of trials; none of them is a trial's own score."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from evaweb.trials.models import Trial
 
 
 class Rating(models.Model):
-    """A trial scored again from its video by somebody who did not run it; for the agreement of raters, no more."""
+    """Second rating of a trial, from its video by a person who did not run it; used only for the agreement of
+    raters.
+    """
 
     uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)
     trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="ratings")
@@ -46,7 +48,7 @@ class Rating(models.Model):
 
 
 class Preference(models.Model):
-    """Which of two trials that were run one after the other at the same initial condition was the better one."""
+    """Preference between two trials that were run consecutively from the same initial condition."""
 
     class Outcome(models.TextChoices):
         FIRST = "first", "the first was better"
@@ -83,12 +85,12 @@ class Preference(models.Model):
 
 
 def kinds() -> list[tuple[str, str]]:
-    """The kinds of judges that can be set up."""
+    """Return the kinds of judges that can be set up."""
     return [(kind, kind) for kind in KINDS]
 
 
 class AutomaticJudge(models.Model):
-    """A judge that an administrator has set up; one with a server is asked at the address that was allowed."""
+    """Judge set up by an administrator; a judge with a server is used only at the address that was allowed."""
 
     name = models.SlugField(max_length=60, unique=True)
     kind = models.CharField(max_length=20, choices=kinds)
@@ -131,11 +133,11 @@ class AutomaticJudge(models.Model):
 
     @property
     def setup(self) -> Setup:
-        """What its module is built of."""
+        """Set-up from which its module builds the judge."""
         return Setup(self.address, self.model, self.key_variable, self.plain, self.patience_s)
 
     def clean(self) -> None:
-        """A set-up of which its module can build a judge."""
+        """Check that its module can build a judge from this set-up."""
         try:
             build_judge(self.name, self.kind, self.setup)
         except EvaError as fault:
@@ -143,9 +145,10 @@ class AutomaticJudge(models.Model):
 
 
 class Judgement(models.Model):
-    """What an automatic judge said of a trial; for its agreement with people, no more: it is no score and no rating.
+    """Judgement of a trial by an automatic judge; used only for its agreement with people, neither a score nor a
+    rating.
 
-    `judge` and `version` are words: the row outlives the judge's set-up.
+    `judge` and `version` are texts, because the row outlives the judge's set-up.
     """
 
     uuid = models.UUIDField(unique=True, default=uuid.uuid4, editable=False)

@@ -1,4 +1,4 @@
-"""Lists of the result pages: plans with their progress, trials of a plan, what goes on in the lab."""
+"""Lists of the result pages: plans with their progress, trials of a plan, current activity in the lab."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _ORDER = Case(
 
 @dataclass(frozen=True, slots=True)
 class PlanRow:
-    """A plan and how far it is: trials that it foresees, trials that count, attempts, and when those were made."""
+    """Plan with its progress: planned trials, trials that count, attempts, and the period of the attempts."""
 
     plan: Plan
     foreseen: int
@@ -58,12 +58,12 @@ class PlanRow:
 
     @property
     def share(self) -> int:
-        """Whole percent of the trials foreseen that count."""
+        """Share of the planned trials that count [%], rounded."""
         return round(100 * self.counted / self.foreseen) if self.foreseen else 0
 
     @property
     def hours_left(self) -> float | None:
-        """At the pace from the first trial to the newest; None where nothing is left, or before there is a pace."""
+        """Remaining time at the pace so far [h]; None if nothing is left or the pace is unknown."""
         left = self.foreseen - self.counted
         if (
             self.counted < 2
@@ -72,13 +72,13 @@ class PlanRow:
             or self.until is None
             or self.until <= self.since
         ):
-            return None  # clocks of stations differ: a pace backwards is none
+            return None  # station clocks may differ: a negative pace is invalid
         return float((self.until - self.since).total_seconds() / _HOUR / self.counted * left)
 
 
 @dataclass(frozen=True, slots=True)
 class StationActivity:
-    """A station and the trial that is not finished there."""
+    """Station with its unfinished trial, if any."""
 
     station: Station
     trial: Trial | None
@@ -86,10 +86,10 @@ class StationActivity:
 
 @dataclass(frozen=True, slots=True)
 class TrialQuery:
-    """Which trials of a plan are meant; "" where it does not matter.
+    """Query for trials of a plan; "" matches all.
 
-    `success` is yes or no, `failure` and `failure_phase` may be "not specified",
-    `missed` and `reached` are the words of a milestone. Without a `status` those that count.
+    `success` is yes or no, `failure` and `failure_phase` may be "not specified", `missed` and `reached` are texts of
+    milestones. `status` defaults to trials that count.
     """
 
     checkpoint: str = ""
@@ -106,12 +106,16 @@ class TrialQuery:
 
     @property
     def query(self) -> str:
-        """As it stands in an address."""
+        """Query string of the filters."""
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
 
 def plan_at_reveal(digest: str) -> Plan:
-    """The plan whose reveal has this digest; NotFound where none has."""
+    """Return the plan whose reveal has this digest.
+
+    Raises:
+        NotFound: If there is none.
+    """
     found = Plan.objects.filter(at_reveal__digest=digest).first()
     if found is None:
         raise NotFound(_NO_REVEAL_HAS_DIGEST_STANDS(digest=digest))
@@ -119,7 +123,11 @@ def plan_at_reveal(digest: str) -> Plan:
 
 
 def plan_get(*, name: str, version: int | None = None) -> Plan:
-    """That version of the plan, or its newest; NotFound says which versions there are."""
+    """Return that version of the plan, or its newest.
+
+    Raises:
+        NotFound: If it does not exist; the message names the versions.
+    """
     rows = Plan.objects.select_related("owner", "first", "second", "evaluation", "revealed_by", "amends")
     versions = list(rows.filter(name=name).order_by("-version"))
     found = [row for row in versions if version in (None, row.version)]
@@ -134,7 +142,7 @@ def plan_get(*, name: str, version: int | None = None) -> Plan:
 
 
 def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
-    """Plans: those that run, then those that have run, then drafts, the newest of each first."""
+    """Return running plans, then ended ones, then drafts, newest first."""
     rows = Plan.objects.select_related("owner").defer("document", "key").order_by(_ORDER, "-frozen_at", "-pk")
     if state and state not in PlanState.values:
         raise EvaError(_STATE_ALLOWED(state=state, values=", ".join(PlanState.values)))
@@ -143,7 +151,7 @@ def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
 
 
 def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
-    """Each with its progress, in two queries for all; it tells nothing of any checkpoint."""
+    """Return the plans with their progress, in two queries; independent of checkpoints, so that it reveals nothing."""
     given = list(plans)
     slots = Slot.objects.filter(plan__in=given).order_by().values_list("plan").annotate(n=Count("pk"))
     foreseen: dict[int, int] = dict(slots)
@@ -166,7 +174,11 @@ def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
 
 
 def trials_of_plan(plan: Plan, question: TrialQuery) -> QuerySet[Trial]:
-    """Those that fit, in the order in which they were handed out; EvaError says what is allowed."""
+    """Return the trials that match, in order of allocation.
+
+    Raises:
+        EvaError: If a value is not allowed.
+    """
     named = ("checkpoint", "scene", "position", "station", "operator", "verdict", "episode", "handout")
     rows = (
         Trial.objects.filter(evaluation=plan.evaluation_id).select_related(*named).order_by("handout__number")
@@ -210,7 +222,7 @@ def _whole(name: str, value: str) -> int:
 
 
 def station_activity() -> list[StationActivity]:
-    """Every active station with what goes on there."""
+    """Return every active station with its unfinished trial."""
     stations = list(Station.objects.filter(active=True).order_by("name"))
     open_ones = Trial.objects.filter(station__in=stations, status__in=UNFINISHED).select_related(
         "scene", "position", "checkpoint", "evaluation", "operator", "handout__plan"
@@ -220,7 +232,7 @@ def station_activity() -> list[StationActivity]:
 
 
 def recent_trials(limit: int = 12) -> QuerySet[Trial]:
-    """The newest that were run."""
+    """Return the trials that were started most recently."""
     named = (
         "scene",
         "position",

@@ -1,4 +1,4 @@
-"""Addresses of the pages of results."""
+"""URL patterns of the result pages."""
 
 from __future__ import annotations
 

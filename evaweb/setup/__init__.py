@@ -1,1 +1,1 @@
-"""Setting up a lab by sight: what is there and what is missing next, and the scene editor."""
+"""Setting up a lab: overview of what exists and what is missing, and the scene editor."""

@@ -1,9 +1,9 @@
-"""Registers the app."""
+"""Django configuration of the app."""
 
 from django.apps import AppConfig
 
 
 class SetupConfig(AppConfig):
-    """Setting up a lab by sight."""
+    """Setting up a lab."""
 
     name = "evaweb.setup"

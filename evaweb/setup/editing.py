@@ -1,4 +1,4 @@
-"""What the scene editor is given: the scene in plain values, its bench, and how the operator will see it."""
+"""Context of the scene editor: the scene as plain values, its bench, and the operator's view."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from evaweb.trials.scene_reading import (
 )
 from evaweb.trials.scene_writing import APART_M, table_of
 
-# Sizes of the simulated bench [m], where its arms stand and how far they reach; a test compares.
+# Sizes of the simulated bench [m], position and reach of its arms; a test compares them with the simulation.
 SIZES = {
     "area": list(AREA),
     "apart": APART_M,
@@ -38,13 +38,13 @@ SIZES = {
     "first": {"block": [-0.12, 0.28, 0], "plate": [0.1, 0.32]},
 }
 
-# Corners of the area in pictures of 4:3 of the simulated bench's camera from above, as shares of width and height: left
-# and right near, right and left far. A test compares.
+# Corners of the area in 4:3 images of the simulated overhead camera, as shares of width and height: near left, near
+# right, far right, far left. A test compares them with the simulation.
 OVERHEAD = [[0.2454, 0.6381], [0.7546, 0.6381], [0.7616, 0.2951], [0.2384, 0.2951]]
 
 
 def shown(scene: Scene) -> dict[str, Any]:
-    """What drawings of its positions are made of; one in words alone has a reference picture, if there is one."""
+    """Return the data for drawings of the positions; a position without a layout has its reference image, if any."""
     pictures = _references(scene)
     positions = [
         {
@@ -59,12 +59,12 @@ def shown(scene: Scene) -> dict[str, Any]:
 
 
 def state_of(scene: Scene) -> dict[str, Any]:
-    """The scene as it is saved, and which of its positions stay as they are, by id, and why."""
+    """Return the saved scene, its version, and the positions that cannot be changed, by id, with the reason."""
     return {"scene": scene_table(scene), "seen": seen_of(scene), "kept": kept_positions(scene)}
 
 
 def existing(scene: Scene) -> dict[str, Any]:
-    """Context of the editor of a scene that there is."""
+    """Return the context of the editor for an existing scene."""
     state = {**state_of(scene), "references": _references(scene), **_around()}
     return {
         "scene": scene,
@@ -75,7 +75,7 @@ def existing(scene: Scene) -> dict[str, Any]:
 
 
 def new(source: Scene | None) -> dict[str, Any]:
-    """Context of the editor of a scene that is not there yet, a copy of `source` where there is one."""
+    """Return the context of the editor for a new scene, as a copy of `source` if given."""
     table = scene_table(source) if source else SceneTable().model_dump()
     table["name"] = ""
     table["title"] = f"{source.title} (copy)" if source else ""
@@ -101,13 +101,13 @@ def _around() -> dict[str, Any]:
 
 
 def _corners(station: Station) -> dict[str, Any]:
-    """Of each camera that is known to look from above."""
+    """Return the corners of the area for each camera that is known to look from above."""
     above = [camera for camera in cameras_of(station) if station.simulated and "wrist" not in camera]
     return dict.fromkeys(above, OVERHEAD)
 
 
 def _references(scene: Scene) -> dict[int, list[dict[str, str]]]:
-    """Of each position, by id, the newest picture of each camera of each station."""
+    """Return by position id the newest reference image of each camera of each station."""
     newest = {
         (row.position_id, row.station.name, row.camera): row
         for row in Reference.objects.filter(position__scene=scene).select_related("station").order_by("pk")
@@ -123,7 +123,7 @@ def _references(scene: Scene) -> dict[int, list[dict[str, str]]]:
 
 
 def operators_view(request: HttpRequest, given: Any, position: Any) -> str:
-    """The cards of set-up and score, of the position in that place, by the Eval page's own templates."""
+    """Return the set-up and score cards of the position at that index, rendered by the Eval page's templates."""
     wanted = table_of(given)
     scene = Scene(**wanted.model_dump(exclude={"positions", "milestones"}))
     milestones = [

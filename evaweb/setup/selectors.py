@@ -1,4 +1,4 @@
-"""What a lab has, and what is missing in it next: a card for each kind of thing."""
+"""Overview of a lab's contents and of what is missing: a card for each kind."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from evaweb.trials.selectors import checkpoint_list, scene_list
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Something that is missing: a sentence, and the address of the form that mends it, an administrator's or not."""
+    """Missing thing: a sentence, and the address of the form that adds it, for administrators or for operators too."""
 
     text: str
     address: str
@@ -32,7 +32,7 @@ class Missing:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A kind of thing: what it is, how many there are, the newest, its list, the form for another, what is missing."""
+    """Kind of thing: description, count, newest item, addresses of list and form, and what is missing."""
 
     title: str
     what: str
@@ -44,7 +44,7 @@ class Card:
 
 
 def cards(*, user: Any, sight: Visibility) -> list[Card]:
-    """Scenes, checkpoints, plans, people and stations; without drafts and checkpoints that are hidden from the user."""
+    """Return the cards of scenes, checkpoints, plans, people and stations, without items hidden from the user."""
     return [_scenes(), _checkpoints(sight), _plans(user), _people(), _stations()]
 
 
@@ -149,6 +149,6 @@ def _card(title: str, what: str, rows: QuerySet[Any], address: str, add: str, mi
 
 
 def scene_rows() -> QuerySet[Scene]:
-    """All scenes, those that are offered first, with the number of trials of each as `n_trials`."""
+    """Return all scenes, offered ones first, annotated with the number of trials as `n_trials`."""
     rows = scene_list(all_of_them=True).annotate(n_trials=Count("trials", distinct=True))
     return rows.order_by("-active", "title")

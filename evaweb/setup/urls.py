@@ -1,4 +1,4 @@
-"""Addresses of the pages on which a lab is set up."""
+"""URL patterns of the pages for setting up a lab."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pages on which a lab is set up by sight: the hub, scenes, and the editor of one scene."""
+"""Pages for setting up a lab: overview, scenes, and the scene editor."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _SENT_ALLOWED_TABLE_WITH_SCENE = Pattern(
     "{given!r:.60} was sent; allowed: a table with the scene",
 )
 
-LONGEST_SCENE = 512 * 1024  # characters
-_PATIENCE_S = 1.5  # for a picture of a camera
+LONGEST_SCENE = 512 * 1024  # [characters]
+_PATIENCE_S = 1.5  # timeout of a camera image
 
 
 @require_GET
 def hub(request: HttpRequest) -> HttpResponse:
-    """What is there, and what is missing next."""
+    """Render the overview of what exists and what is missing."""
     require_role(request.user, Role.OPERATOR)
     cards = selectors.cards(user=request.user, sight=visibility_for_request(request))
     return render(request, "setup/hub.html", {"cards": cards, "may_write": _may_write(request)})
@@ -43,14 +43,14 @@ def hub(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def scenes(request: HttpRequest) -> HttpResponse:
-    """All scenes with their positions."""
+    """Render all scenes with their positions."""
     rows = [(scene, editing.shown(scene)) for scene in selectors.scene_rows()]
     return render(request, "setup/scenes.html", {"rows": rows, "may_write": _may_write(request)})
 
 
 @require_http_methods(["GET", "POST"])
 def new_scene(request: HttpRequest) -> HttpResponse:
-    """The editor with a scene that is not there yet, or with a copy of the one that ?from= names."""
+    """Render the editor for a new scene, or for a copy of the scene in ?from=; write a posted scene."""
     require_role(request.user, Role.ADMIN)
     if request.method == "POST":
         return _written(request, None)
@@ -60,32 +60,32 @@ def new_scene(request: HttpRequest) -> HttpResponse:
 
 @require_http_methods(["GET", "POST"])
 def scene(request: HttpRequest, name: str) -> HttpResponse:
-    """The editor of a scene; everybody may read it there."""
+    """Render the editor of a scene, read-only for users who may not write; write a posted scene."""
     if request.method == "POST":
         return _written(request, name)
     found = _scene(name)
-    if found.name != name:  # asked for by its id: its page saves under its name
+    if found.name != name:  # requested by id: the page saves under the name
         return redirect("setup-scene", name=found.name)
     return _editor(request, editing.existing(found))
 
 
 @require_GET
 def sheet(request: HttpRequest, name: str) -> HttpResponse:
-    """Its positions on paper, in true millimetres."""
+    """Render the positions for printing in true size."""
     found = _scene(name)
     return render(request, "setup/sheet.html", {"scene": found, "drawn": editing.shown(found)})
 
 
 @require_POST
 def preview(request: HttpRequest) -> JsonResponse:
-    """The cards of set-up and score as the operator of a scene will see them that need not be saved."""
+    """Return the operator's set-up and score cards of a scene that need not be saved."""
     given = _posted(request)
     return JsonResponse({"html": editing.operators_view(request, given.get("scene"), given.get("position"))})
 
 
 @require_GET
 def live(request: HttpRequest, name: str, camera: str) -> HttpResponse:
-    """What a camera of a station shows now."""
+    """Return the current image of a station's camera."""
     found = pictures.current_images(station_get(name=name), [camera], _PATIENCE_S)
     return HttpResponse(found[camera], content_type="image/jpeg")
 
@@ -118,7 +118,7 @@ def _posted(request: HttpRequest) -> dict[str, Any]:
 
 
 def _written(request: HttpRequest, name: str | None) -> JsonResponse:
-    """Where it stands now and what has to be said of it; else each place that is wrong."""
+    """Write the scene; answer with its address, remarks and state, or with each faulty place."""
     given = _posted(request)
     wanted = given.get("scene")
     try:

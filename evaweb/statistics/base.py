@@ -1,4 +1,4 @@
-"""Common parts of all methods: an interval, the allowed counts, and the error that says so."""
+"""Shared parts of all methods: the interval, checks of counts and levels, and the exception."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ LEVEL = 0.95
 
 
 class StatisticsError(ValueError):
-    """Data that cannot be, or from which a method says nothing."""
+    """Invalid data, or data from which a method cannot estimate anything."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """From `low` to `high`, both included, at a confidence of `level`."""
+    """Closed interval from `low` to `high` with confidence `level`."""
 
     low: float
     high: float
     level: float = LEVEL
 
     def holds(self, value: float) -> bool:
-        """True if `value` lies in it."""
+        """Return True if `value` lies in the interval, ends included."""
         return self.low <= value <= self.high
 
 
 def z_of(level: float) -> float:
-    """Number of standard deviations to each side that hold `level` of a normal distribution."""
+    """Return the half-width [standard deviations] of the central interval with probability `level` of a normal law."""
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 

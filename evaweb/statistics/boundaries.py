@@ -1,11 +1,13 @@
-"""Exact boundaries for success rates of two arms that are looked at several times (group sequential designs).
+"""Exact boundaries for comparing two success rates at several interim looks (group sequential designs).
 
-After so many trials of each arm, every order of the outcomes that leads to the same numbers of successes is equally
-likely, whatever the arms' rates are. The ways to each table that pass no earlier stop are therefore counted once, and
-the probability of a wrong stop follows for every common rate: no simulation, no approximation. At each look tables are
-taken into the stop from the most extreme one down, as long as the error so far is at most what may be spent by then at
-every common rate. Spending by a power of the share of trials made: Kim and DeMets (1987); growing a region under the
-largest error over the nuisance parameter: Barnard (1945).
+Given the numbers of successes at a look, every order of the outcomes is equally likely, whatever the common rate is.
+So the paths to each table that avoid all earlier stopping regions are counted once, and the probability of a false
+stop follows for every common rate, without simulation or approximation. At each look, tables join the stopping region
+from the most extreme downwards, as long as the cumulative error does not exceed the alpha that may be spent by then,
+at any common rate.
+
+Sources: Kim and DeMets (1987) for spending by a power of the share of trials; Barnard (1945) for growing a region
+under the largest error over the nuisance parameter.
 """
 
 from __future__ import annotations
@@ -23,22 +25,22 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-SHAPES = {"late": 6.0, "early": 1.5}  # power of the share of trials made: how late alpha may be spent
-MOST = 250  # trials of an arm
-_RATES = 400  # common rates at which an error is taken, evenly spread over the angles of which they are squared sines
-_FINE = 40_000  # the same for a bound of the error between them
-_END = 1e-7  # of the angles, nearer to whose ends no rate is taken
-_HALVED = 20  # times that the space between two rates is halved
-_SAFETY = 0.996  # of alpha, for what lies between two of the rates
-_CELLS = 512  # tables that are weighed at once, the most extreme first
-_TIE = 1e-9  # relative: what differs by less is compared in whole numbers
+SHAPES = {"late": 6.0, "early": 1.5}  # alpha spending: exponent of the share of trials
+MOST = 250  # greatest number of trials per arm
+_RATES = 400  # grid of common rates for the error, uniform in the angle (rate = sin(angle)^2)
+_FINE = 40_000  # finer grid of the same kind, for `Boundary.error`
+_END = 1e-7  # [rad] distance of the finer grid from 0 and pi/2
+_HALVED = 20  # greatest number of bisections of a grid interval
+_SAFETY = 0.996  # share of alpha that the grid search may spend; the margin covers rates between grid points
+_CELLS = 512  # number of tables evaluated at once, most extreme first
+_TIE = 1e-9  # relative; closer values are compared exactly, as integers
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Trials of each arm at a look, and the least extreme table (successes of each) that stops there.
+    """Number of trials of each arm at a look, and the least extreme table that stops there.
 
-    `least` is None where no table stops.
+    `least` is (successes of the first arm, successes of the second arm), None if no table stops at this look.
     """
 
     first: int
@@ -48,10 +50,11 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class OperatingCharacteristics:
-    """How a design ends at given success rates: probabilities of stopping for each arm, and after how many trials.
+    """Operating characteristics of a design at given success rates.
 
-    `median` is of the trials of both arms, over all runs, those that never stop counted with all their trials; `mean`
-    likewise. `stops` [looks] is the probability of stopping at each look.
+    `first_better` and `second_better` are the probabilities of stopping for each arm. `median` and `mean` count the
+    trials of both arms over all runs; runs that never stop count with all their trials. `stops` [looks] is the
+    probability of stopping at each look.
     """
 
     first_better: float
@@ -62,16 +65,16 @@ class OperatingCharacteristics:
 
     @property
     def power(self) -> float:
-        """Probability of stopping, for either arm."""
+        """Probability of stopping for either arm."""
         return self.first_better + self.second_better
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """The looks of a design with what stops it.
+    """Looks of a design and the tables that stop it.
 
-    Two questions: without a `margin`, whether the rates differ, in either direction together at `alpha`; with one,
-    whether the second arm's rate is not lower than the first's by `margin` or more, at `alpha` in that direction.
+    Without a `margin` the design tests whether the rates differ, two-sided at `alpha`. With a margin it tests whether
+    the second arm's rate is not lower than the first's by `margin` or more, one-sided at `alpha`.
     """
 
     looks: tuple[Look, ...]
@@ -79,8 +82,15 @@ class Boundary:
     margin: float | None = None
 
     def winner(self, look: int, first: int, second: int) -> str | None:
-        """The arm ("first" or "second") for which the design stops at that look (0 is the first) with so many
-        successes of each; None where it goes on. With a margin it stops for the second alone."""
+        """Return the arm ("first" or "second") for which the design stops at a look, or None if it continues.
+
+        With a margin it can stop for the second arm only.
+
+        Args:
+            look: Index of the look, from 0.
+            first: Successes of the first arm so far.
+            second: Successes of the second arm so far.
+        """
         at = self.looks[look]
         if at.least is None or not _at_least(first, second, at, self.margin):
             return None
@@ -88,7 +98,7 @@ class Boundary:
         return "first" if ahead else "second"
 
     def operating_characteristics(self, p_first: float, p_second: float) -> OperatingCharacteristics:
-        """How it ends where the arms succeed at these rates."""
+        """Return the operating characteristics at success rates `p_first` and `p_second`."""
         import numpy as np
 
         check_share("p_first", p_first)
@@ -114,11 +124,11 @@ class Boundary:
         return OperatingCharacteristics(math.fsum(better), math.fsum(worse), median, mean, tuple(stops))
 
     def error(self) -> tuple[float, float]:
-        """The largest probability of a wrong stop over all rates of the null hypothesis, and a bound of it.
+        """Return the largest probability of a false stop over the null hypothesis, and an upper bound of it.
 
-        The first is taken at 40,000 rates; the second holds between them too: along the angle of which the rate is the
-        squared sine, the angle of a probability turns by at most the square root of the trials (Cauchy and Schwarz).
-        Where that does not keep it below alpha, rates between are taken too.
+        The first value is the maximum over a grid of 40,000 rates. The bound holds between grid points too: with rate
+        = sin(angle)^2, the arcsine of the square root of a probability changes by at most the square root of the
+        number of trials per radian (Cauchy and Schwarz). If that bound exceeds alpha, grid intervals are bisected.
         """
         import numpy as np
 
@@ -147,9 +157,10 @@ class Boundary:
         return math.sin(highest) ** 2, math.sin(min(bound, math.pi / 2)) ** 2
 
     def _false_stop_mass(self) -> list[tuple[tuple[NDArray[Any], ...], NDArray[np.float64], tuple[int, int]]]:
-        """The tables at which it stops, by their successes, with their probabilities at rates of a half, and trials.
+        """Return stopping tables as (successes by arm, their probabilities at rates of 0.5, trials by arm).
 
-        While both rates are equal, only the successes of both arms together count.
+        Without a margin both rates are equal under the null hypothesis, and only the total number of successes
+        matters.
         """
         import numpy as np
 
@@ -169,7 +180,7 @@ class Boundary:
         return [((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))]
 
     def _stopping_mass(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
-        """Each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
+        """Yield each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
         import numpy as np
 
         alive, before = np.ones((1, 1)), (0, 0)
@@ -181,7 +192,7 @@ class Boundary:
 
     @cached_property
     def regions(self) -> list[NDArray[np.bool_]]:
-        """The tables at which each look stops: bool [first + 1, second + 1]."""
+        """Stopping region of each look: bool [first + 1, second + 1]."""
         return [_region(look, self.margin) for look in self.looks]
 
 
@@ -192,10 +203,13 @@ def boundary(
     shape: str = "late",
     margin: float | None = None,
 ) -> Boundary:
-    """The boundary of a design that looks after so many trials of each arm, the last look being its end.
+    """Return the boundary of a design with looks at these numbers of trials (first, second); the last look is the end.
 
-    The newest ones are known. StatisticsError where looks do not grow, an arm has more than 250 trials, or alpha,
-    shape or margin cannot be.
+    The 32 most recent boundaries are cached.
+
+    Raises:
+        StatisticsError: If the looks do not grow, an arm has more than 250 trials, or `alpha`, `shape` or `margin`
+            is invalid.
     """
     return _boundary(tuple(_checked(looks)), alpha, shape, margin)
 
@@ -226,17 +240,17 @@ def _boundary(
 
 
 def pair_counts(pairs: int, at: Sequence[int] | None = None) -> list[tuple[int, int]]:
-    """The looks of a design in pairs: after each one, or after those of `at` and the last."""
+    """Return the looks of a paired design: after every pair, or after the pairs in `at` and the last."""
     chosen = range(1, pairs + 1) if at is None else sorted({*at, pairs})
     return [(pair, pair) for pair in chosen]
 
 
 def extremeness_of(first: int, n: int, second: int, m: int, margin: float | None) -> tuple[int, int]:
-    """How extreme a table is, as a fraction (numerator, denominator > 0) in whole numbers.
+    """Return how extreme a table is, as an exact fraction (numerator, denominator > 0).
 
-    Without a margin: the squared pooled statistic, less what is the same for all tables of a look. With one: the
-    statistic of the difference plus margin over its standard error, one success and one failure added to each arm
-    (Agresti and Caffo 2000), squared with its sign.
+    Without a margin: the squared pooled statistic, without the factor that all tables of a look share. With a margin:
+    the signed square of (difference + margin) / standard error, after adding one success and one failure to each arm
+    (Agresti and Caffo 2000).
     """
     if margin is None:
         successes, trials = first + second, n + m
@@ -245,13 +259,13 @@ def extremeness_of(first: int, n: int, second: int, m: int, margin: float | None
         return (first * m - second * n) ** 2, successes * (trials - successes)
     scale = 10**9
     a, b, n, m = first + 1, second + 1, n + 2, m + 2
-    lead = (b * n - a * m) * scale + round(margin * scale) * n * m  # over scale * n * m
-    variance = a * (n - a) * m**3 + b * (m - b) * n**3  # over n**3 * m**3
+    lead = (b * n - a * m) * scale + round(margin * scale) * n * m  # multiplied by scale * n * m
+    variance = a * (n - a) * m**3 + b * (m - b) * n**3  # multiplied by n**3 * m**3
     return lead * abs(lead) * n * m, variance * scale * scale
 
 
 class _Null:
-    """Pairs of rates at which an error is one: equal ones, or those that differ by just the margin."""
+    """Pairs of rates on the border of the null hypothesis: equal rates, or rates that differ by exactly the margin."""
 
     def __init__(self, margin: float | None, angles: NDArray[np.float64]) -> None:
         import numpy as np
@@ -266,12 +280,13 @@ class _Null:
     def mass(
         self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
     ) -> NDArray[np.float64]:
-        """Probabilities of tables whose probability at rates of a half is `even` [cells]: float64 [cells, rates]."""
+        """Return the probabilities of tables at all rates of the null hypothesis: float64 [cells, rates].
+
+        `cells` are the successes of each arm, `even` [cells] the probabilities of the tables at rates of 0.5.
+        """
         import numpy as np
 
-        if (
-            self.margin is None
-        ):  # only the successes of both arms together count: one exponential of each number
+        if self.margin is None:  # only total successes matter: one exponential per distinct total
             numbers, where = np.unique(cells[0] + cells[1], return_inverse=True)
             return np.asarray(even[:, None] * self.powers(numbers, sum(trials))[where])
         one, not_one, other, not_other = self._logs
@@ -281,7 +296,9 @@ class _Null:
         return np.asarray(np.exp(weights + a * one + (n - a) * not_one + b * other + (m - b) * not_other))
 
     def powers(self, successes: NDArray[Any], trials: int) -> NDArray[np.float64]:
-        """Of equal rates: how much likelier than at a half outcomes with so many successes are: float64 [., rates]."""
+        """Return the likelihood of these total successes at each common rate, relative to a rate of 0.5: float64 [.,
+        rates].
+        """
         import numpy as np
 
         one, not_one = self._logs[:2]
@@ -291,7 +308,7 @@ class _Null:
     def total(
         self, cells: tuple[NDArray[Any], ...], even: NDArray[np.float64], trials: tuple[int, int]
     ) -> NDArray[np.float64]:
-        """Their sum: float64 [rates]."""
+        """Return the total probability of the tables at each rate: float64 [rates]."""
         import numpy as np
 
         total = np.zeros(len(self._logs[0]))
@@ -319,7 +336,7 @@ def _checked(looks: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 def _add_trials(
     alive: NDArray[np.float64], first: int, second: int, rates: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Probabilities after so many more trials of each arm."""
+    """Return the probabilities of tables after `first` and `second` more trials of each arm."""
     import numpy as np
 
     for axis, (more, rate) in enumerate(zip((first, second), rates, strict=True)):
@@ -340,7 +357,7 @@ def _least_extreme(
     spent: NDArray[np.float64],
     most: float,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-    """The least extreme table that may stop, and the error at each rate with all that are as extreme."""
+    """Return the least extreme table that may stop (None if none may), and the error at each rate including it."""
     import numpy as np
 
     degree = _degrees(*look, null.margin)
@@ -349,7 +366,7 @@ def _least_extreme(
     levels = degree.ravel()[order]
     ends = np.append(
         levels[1:] < levels[:-1] * (1 - _TIE), True
-    )  # at the last one of those that are as extreme
+    )  # at the last table of each group of equally extreme ones
     if null.margin is None:
         numbers = np.add(*np.unravel_index(order, alive.shape))
         taken, spent = _within(
@@ -383,10 +400,10 @@ def _within(
     spent: NDArray[np.float64],
     most: float,
 ) -> tuple[int, NDArray[np.float64]]:
-    """Of equal rates: how many tables may stop, up to one of `ends`, and the error at each rate with them.
+    """Return how many tables may stop, ending at one of `ends`, and the error at each rate with them (equal rates).
 
-    `numbers` and `even` are their successes, of both arms together, and probabilities at rates of a half. The more
-    tables, the larger is the error at every rate: the number is found by halving.
+    `numbers` are the total successes of the tables, `even` their probabilities at rates of 0.5. The error grows with
+    the number of tables at every rate, so the number is found by bisection.
     """
     import numpy as np
 
@@ -410,7 +427,7 @@ def _least(
     look: tuple[int, int],
     margin: float | None,
 ) -> tuple[int, int]:
-    """Of those in `order` that are as extreme as the last one but for rounding, the least extreme table."""
+    """Return the exactly least extreme of the tables in `order` that equal the last one up to rounding."""
     import numpy as np
 
     alike = order[levels[: len(order)] <= levels[len(order) - 1] * (1 + _TIE)]
@@ -431,9 +448,9 @@ def _at_least(first: int, second: int, look: Look, margin: float | None) -> bool
 
 
 def _region(look: Look, margin: float | None) -> NDArray[np.bool_]:
-    """Tables that stop at a look: bool [first + 1, second + 1].
+    """Return the stopping region of a look: bool [first + 1, second + 1].
 
-    Those that rounding could misplace are compared in whole numbers.
+    Tables that rounding could misclassify are compared exactly, as integers.
     """
     import numpy as np
 
@@ -448,7 +465,7 @@ def _region(look: Look, margin: float | None) -> NDArray[np.bool_]:
 
 
 def _degrees(n: int, m: int, margin: float | None) -> NDArray[np.float64]:
-    """`extremeness_of` of all tables of a look: float64 [n + 1, m + 1]."""
+    """Return `extremeness_of` all tables of a look: float64 [n + 1, m + 1]."""
     import numpy as np
 
     a: NDArray[np.float64] = np.arange(n + 1.0)[:, None]

@@ -1,8 +1,8 @@
-"""Means of outcomes that have a least and a largest value, with intervals that hold for few trials of any shape.
+"""Means of bounded outcomes, with intervals that are valid for small samples of any distribution.
 
-Formula: Gaffke (2005), both sides: the weights of the outcomes are drawn as gaps between uniform numbers, with one gap
-more that goes to the least value for the lower end and to the largest for the upper. For outcomes of 0 and 1 these are
-Clopper and Pearson's ends.
+Formula: Gaffke (2005), two-sided. The weights of the outcomes are drawn as gaps between uniform numbers; one extra gap
+is given to the least possible value for the lower end, and to the largest for the upper end. For outcomes of 0 and 1
+the ends are those of Clopper and Pearson.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DRAWS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class BoundedMean:
-    """A mean with its interval."""
+    """Mean with its interval."""
 
     value: float
     interval: Interval
@@ -31,9 +31,10 @@ def bounded_mean(
     level: float = LEVEL,
     draws: int = DRAWS,
 ) -> BoundedMean:
-    """The mean over strata, each equally heavy, of each one's mean outcome, which lies within `bounds`.
+    """Return the mean of the strata's mean outcomes, each stratum with equal weight.
 
-    StatisticsError where there is no stratum, one without an outcome, or an outcome outside.
+    Raises:
+        StatisticsError: If there is no stratum, a stratum is empty, or an outcome lies outside `bounds`.
     """
     check_level(level)
     import numpy as np

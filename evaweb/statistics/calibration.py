@@ -1,7 +1,7 @@
-"""Probabilities that were given of something, beside how often it was so.
+"""Calibration of predicted probabilities against observed frequencies.
 
-Brier score: Brier (1950). Reliability table: Murphy and Winkler (1977). Expected calibration error, which is biased
-upwards where bins hold few: Naeini, Cooper and Hauskrecht (2015).
+Brier score: Brier (1950). Reliability table: Murphy and Winkler (1977). Expected calibration error: Naeini, Cooper and
+Hauskrecht (2015); it is biased upwards if bins hold few predictions.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ _EDGES = [k / BINS for k in range(1, BINS)]
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Probabilities from `low` up to, but for the last, `high`: how many, their mean, and of how many it was so."""
+    """Predictions from `low` to below `high` (the last bin includes it): their number, mean, and number of true
+    outcomes.
+    """
 
     low: float
     high: float
@@ -29,7 +31,7 @@ class Bin:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Of `n` probabilities: mean squared error, expected calibration error, and the bins that hold any."""
+    """Brier score, expected calibration error and non-empty bins of `n` predictions."""
 
     n: int
     brier: float
@@ -38,7 +40,11 @@ class Calibration:
 
 
 def calibration(pairs: Sequence[tuple[float, bool]]) -> Calibration:
-    """Of (probability, whether it was so), in ten bins of equal width; StatisticsError for none."""
+    """Return the calibration of (probability, outcome) pairs in ten bins of equal width.
+
+    Raises:
+        StatisticsError: If there are none, or a probability lies outside 0 to 1.
+    """
     if not pairs:
         raise StatisticsError("no probability was given")
     for probability, _ in pairs:

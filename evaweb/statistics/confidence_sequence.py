@@ -1,9 +1,9 @@
-"""How much two arms differ, as an interval that may be looked at after every pair.
+"""Confidence sequence of the difference of two arms: an interval that is valid after every pair.
 
-A mean difference m is left out once a bet against it has reached 2/alpha: that the mean is above m, or that it is
-below, by the gamblers of `sequential.score_evidence`, whose question is m = 0. By Ville's inequality the true mean is
-ever left out with probability at most alpha, for any distribution of differences. Source: Waudby-Smith and Ramdas
-(2023), section 4, with stakes that are fixed beforehand.
+A mean difference m is excluded once a bet against it has reached 2/alpha, either that the mean is above m or that it
+is below. The bets are those of `sequential.score_evidence`, which tests m = 0. By Ville's inequality the true mean is
+ever excluded with probability at most alpha, for any distribution of differences. Source: Waudby-Smith and Ramdas
+(2023), section 4, with stakes fixed beforehand.
 """
 
 from __future__ import annotations
@@ -19,14 +19,21 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_ENOUGH = 1e-12  # of a difference: closer an end is not looked for
+_ENOUGH = 1e-12  # tolerance of an interval end, as a difference
 
 
 def confidence_sequence(differences: Sequence[float], alpha: float = ALPHA) -> Interval | None:
-    """What the mean of `differences` (-1 to 1, the first arm's outcome less the second's, pair by pair) can be.
+    """Return the interval of the mean of `differences`, or None if the pairs exclude every mean.
 
-    It holds at `1 - alpha` after all pairs together, and only narrows with each; the order matters, and must be the
-    true one. None where the pairs leave no mean that all of them could have. StatisticsError names what lies outside.
+    It is valid at `1 - alpha` after all pairs simultaneously and can only narrow. The pairs must be in their true
+    order.
+
+    Args:
+        differences: First arm's outcome minus the second's, pair by pair (-1 to 1).
+        alpha: Probability of ever excluding the true mean.
+
+    Raises:
+        StatisticsError: If a difference lies outside -1 to 1.
     """
     check_alpha(alpha)
     wrong = [d for d in differences if not abs(d) <= 1]
@@ -37,7 +44,7 @@ def confidence_sequence(differences: Sequence[float], alpha: float = ALPHA) -> I
 
 
 def _lower_bound(differences: Sequence[float], alpha: float) -> float:
-    """The largest mean that a bet on more than it has refuted, -1 where there is none."""
+    """Return the largest mean that the bet on a higher one has refuted, -1 if there is none."""
     import numpy as np
     from scipy.optimize import brentq
 
@@ -50,14 +57,16 @@ def _lower_bound(differences: Sequence[float], alpha: float) -> float:
     def beyond(mean: float) -> float:
         return _max_log_wealth(levels / (1 + mean), seen) - wanted
 
-    # Each worth falls as the mean rises, and is at most 1 at a mean of 1.
+    # The log wealth falls as the mean rises, and is at most 0 at a mean of 1: there is at most one root.
     nearest = -1 + _ENOUGH
     return float(brentq(beyond, nearest, 1.0, xtol=_ENOUGH)) if beyond(nearest) > 0 else -1.0
 
 
 def _max_log_wealth(shares: NDArray[np.float64], seen: NDArray[np.float64]) -> float:
-    """The largest log worth that the gamblers together ever had: each level's outcome is `shares` [levels] of the
-    mean, both counted from -1, and had been `seen` [pairs, levels] so often.
+    """Return the largest log wealth that the gamblers together had after any pair.
+
+    `shares` [levels] are the outcome levels divided by the mean, both counted from -1; `seen` [pairs, levels] is the
+    cumulative count of each level.
     """
     import numpy as np
 

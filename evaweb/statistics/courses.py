@@ -1,4 +1,4 @@
-"""How a design ends at rates that are assumed: power, and after how many pairs; and how many pairs a power needs."""
+"""Operating characteristics of designs at assumed rates (power, number of pairs), and pairs needed for a power."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_RUNS = 4000  # of the e-process, whose course depends on the order of outcomes: it is simulated
+_RUNS = (
+    4000  # number of simulated runs; the e-process depends on the order of outcomes, so it cannot be counted
+)
 _SEED = 20_260
 
 
 @dataclass(frozen=True, slots=True)
 class DesignPower:
-    """Power of a design of `pairs` at most; the pairs that it takes on average, and at most in half of all runs."""
+    """Power of a design of at most `pairs` pairs, with the mean and the median number of pairs that it needs."""
 
     rule: str
     pairs: int
@@ -41,10 +43,10 @@ def design_power(
     margin: float | None = None,
     looks: tuple[int, ...] = (),
 ) -> DesignPower:
-    """That of a design of so many pairs, exact but for "evidence", which is simulated 4,000 times.
+    """Return the power of a design of at most `pairs` pairs; exact, except for "evidence" (4,000 simulations).
 
-    With a `margin` its power is the probability of finding that the first's rate is not lower than the second's by that
-    much; `looks` are pairs, none: after every one.
+    With a `margin` the power is the probability of finding that the first arm's rate is not lower than the second's by
+    that much or more. `looks` are numbers of pairs; if empty, there is a look after every pair.
     """
     _check(rule, alpha, p_first, p_second)
     if not 1 <= pairs <= MOST:
@@ -55,8 +57,8 @@ def design_power(
         return _simulated(pairs, p_first, p_second, alpha)
     if rule == FIXED and margin is None:
         return DesignPower(rule, pairs, exact_power(pairs, p_first, p_second, alpha), float(pairs), pairs)
-    shape, at = ("late", (pairs,)) if rule == FIXED else (rule, looks)  # of one look there is no shape
-    # With a margin a boundary asks about its second arm.
+    shape, at = ("late", (pairs,)) if rule == FIXED else (rule, looks)  # unused with a single look
+    # With a margin, a boundary tests its second arm.
     rates = (p_first, p_second) if margin is None else (p_second, p_first)
     found = _boundary(shape, pairs, alpha, margin, at).operating_characteristics(*rates)
     return DesignPower(rule, pairs, found.power, found.mean / 2, found.median // 2)
@@ -65,7 +67,7 @@ def design_power(
 def pairs_needed(
     rule: str, p_first: float, p_second: float, power: float, alpha: float
 ) -> DesignPower | None:
-    """The design of the fewest pairs that has this power; None where 250 pairs have it not."""
+    """Return the design with the fewest pairs that reaches this power, or None if 250 pairs do not."""
     _check(rule, alpha, p_first, p_second)
     check_share("power", power)
     if p_first == p_second:
@@ -77,7 +79,7 @@ def pairs_needed(
             return None
         low, reached, high = high, found.power, min(MOST, math.ceil(1.15 * high))
     while high - low > 1:
-        share = (power - reached) / (found.power - reached)  # power grows almost evenly with the pairs
+        share = (power - reached) / (found.power - reached)  # power grows almost linearly with the pairs
         middle = min(max(round(low + share * (high - low)), low + 1), high - 1)
         tried = design_power(rule, middle, p_first, p_second, alpha)
         if tried.power >= power:
@@ -89,7 +91,11 @@ def pairs_needed(
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Of each design in the order of RULES: what a power needs, its course of so many pairs, its power by gain."""
+    """Comparison of all designs, each tuple in the order of RULES.
+
+    `needs`: design that reaches the power; `chances`: operating characteristics with the given pairs; `powers`: one
+    tuple per gain.
+    """
 
     needs: tuple[DesignPower | None, ...]
     chances: tuple[DesignPower, ...]
@@ -99,7 +105,9 @@ class Outlook:
 def outlook(
     p_first: float, p_second: float, power: float, alpha: float, pairs: int, gains: tuple[float, ...]
 ) -> Outlook:
-    """All designs at these rates, as far as 0 to 250 pairs go; `gains` are those over the first rate."""
+    """Return the outlook of all designs at these rates with `pairs` pairs (0 to 250); `gains` are added to the first
+    rate.
+    """
     needs = tuple(pairs_needed(rule, p_first, p_second, power, alpha) for rule in RULES)
     if not pairs:
         return Outlook(needs, (), ())
@@ -117,7 +125,7 @@ def _boundary(shape: str, pairs: int, alpha: float, margin: float | None, at: tu
 
 
 def _simulated(pairs: int, p_first: float, p_second: float, alpha: float) -> DesignPower:
-    """By the e-process of `sequential.success_evidence`, all runs at once."""
+    """Return the power by the e-process of `sequential.success_evidence`, all runs simulated at once."""
     import numpy as np
 
     chance = np.random.default_rng(_SEED)

@@ -1,9 +1,9 @@
-"""Designs of comparisons: how many blocks there are, after which one looks, what ends it, and what may be said then.
+"""Designs of comparisons: number of blocks, interim looks, stopping rule, and conclusions.
 
-Nothing but the design decides on planned comparisons. Blocks are taken in the order in which they were scheduled; what
-comes after the end belongs to the record, not to the decision. A paired block has one trial of each arm; of two arms in
-random order a block has two trials of whichever was drawn. Several comparisons share alpha equally (Bonferroni); those
-with one test at the end share it step by step (Holm 1979).
+Only the design decides planned comparisons. Blocks count in the order of the schedule; blocks after the end belong to
+the record, not to the decision. A paired block has one trial of each arm; with two arms in random order, a block has
+two trials of the arms that were drawn. Several comparisons share alpha equally (Bonferroni), or step by step if they
+have one test at the end (Holm 1979).
 """
 
 from __future__ import annotations
@@ -18,27 +18,33 @@ from evaweb.statistics.permutation import sign_flip_test
 from evaweb.statistics.sequential import score_evidence, success_evidence
 from evaweb.statistics.stagewise import stagewise
 
-FIXED, ANYTIME = "none", "evidence"  # as plans have named them since there are plans
+FIXED, ANYTIME = "none", "evidence"  # values of plans in the database: they must not change
 RULES = (FIXED, ANYTIME, *SHAPES)
 SUCCESS, SCORE = "success", "score"
-_TIE = 1e-9  # relative: a p that is alpha but for its last bits
-Values = tuple[float, float]  # of the first and the second arm in one paired block
-Block = Sequence[
-    tuple[int, float]
-]  # arm and outcome of each of its trials that count, in the schedule's order
+_TIE = 1e-9  # relative tolerance: p equals alpha up to its last bits
+Values = tuple[float, float]  # outcomes of the first and the second arm in one paired block
+Block = Sequence[tuple[int, float]]  # arm and outcome of each counted trial, in the schedule's order
 
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """The design of a plan's comparisons, as it is frozen.
+    """Frozen design of a plan's comparisons.
 
-    `rule`: "none", a fixed number of blocks with one test at the end; "evidence", an e-process after every pair; "late"
-    and "early", an exact `boundary` at its looks. Without a `margin` the question is whether two arms differ; with one,
-    whether the first's success rate is lower than the second's by less than that. `outcome` is "success" or "score".
-    `comparisons` are pairs of arms, each at its share of `alpha`; `drops`: an arm that one of them found worse, or that
-    is in none that is open, is tried no more. `counts` [blocks, 2]: trials of both arms after each block, where they
-    are not one of each. `holm`: of several comparisons with one test at the end the one that is farthest apart is
-    decided at its share, each next one at its share among those that are left, up to the first that is not.
+    Attributes:
+        rule: "none": fixed number of blocks with one test at the end; "evidence": e-process after every pair;
+            "late", "early": exact `boundary` at its looks.
+        blocks: Number of blocks at most.
+        alpha: Error probability of all comparisons together.
+        margin: None: the question is whether two arms differ. Otherwise: whether the first arm's success rate is
+            lower than the second's by less than this.
+        outcome: "success" or "score".
+        boundary: Boundary of each comparison, if the rule has one.
+        comparisons: Pairs of arms, each tested at its share of `alpha`.
+        drops: Whether an arm is no longer tried once a comparison found it worse, or all its comparisons have
+            ended.
+        counts: Trials of both arms after each block [blocks, 2]; None if every block has one of each.
+        holm: With one test at the end: the comparison with the smallest p is decided at its share of alpha, each
+            next one at its share among the remaining ones, up to the first that is not significant.
     """
 
     rule: str
@@ -59,17 +65,21 @@ class Design:
 
     @property
     def unit(self) -> str:
-        """Word for what enters one after the other."""
+        """Unit of the sequence: "pairs" or "blocks"."""
         return "pairs" if self.counts is None else "blocks"
 
 
 @dataclass(frozen=True, slots=True)
 class Conclusion:
-    """What a design says of one comparison, from the blocks there are, of those that are `foreseen`.
+    """Conclusion of a design about one comparison.
 
-    `at` is the number of blocks after which it ended, None while it goes on, and `winner` the arm ("first" or
-    "second") that a boundary was crossed for. `p` is that of the one test of a fixed number, None with any other rule.
-    `dropped`: it ended because one of its arms was dropped.
+    Attributes:
+        blocks: Number of blocks made so far.
+        ended_at_pair: Number of blocks after which the comparison ended; None while it continues.
+        winner: Arm ("first" or "second") for which a boundary was crossed or the final test was significant.
+        p: Probability of the single test of a fixed number; None with any other rule.
+        foreseen: Number of blocks of the design.
+        dropped: Whether it ended because one of its arms was dropped.
     """
 
     blocks: int
@@ -81,7 +91,7 @@ class Conclusion:
 
     @property
     def ended(self) -> str:
-        """Empty while it goes on, "full" where all blocks are made, whatever is found then, "boundary" before that."""
+        """ "" while it continues, "full" if all blocks are made, "boundary" if it ended before that."""
         return (
             ""
             if self.ended_at_pair is None
@@ -93,20 +103,22 @@ class Conclusion:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What a design says of each of its comparisons; `dropped`: after which block an arm is tried no more."""
+    """Conclusions of a design about all its comparisons; `dropped` maps arms to the block after which they were
+    dropped.
+    """
 
     each: tuple[Conclusion, ...]
     dropped: dict[int, int]
 
     @property
     def at(self) -> int | None:
-        """Number of blocks after which the last comparison ended; None while one goes on."""
+        """Number of blocks after which the last comparison ended; None while any continues."""
         ends = [one.ended_at_pair for one in self.each if one.ended_at_pair is not None]
         return max(ends) if len(ends) == len(self.each) else None
 
     @property
     def ended(self) -> str:
-        """As that of the last comparison to end."""
+        """`Conclusion.ended` of the last comparison to end; "" while any continues."""
         return "" if self.at is None else next(one.ended for one in self.each if one.ended_at_pair == self.at)
 
 
@@ -123,10 +135,11 @@ def design(
     counts: Sequence[tuple[int, int]] | None = None,
     holm: bool = False,
 ) -> Design:
-    """A design with its boundary, which is computed now; `looks` are blocks, none: after every one.
+    """Return a design and compute its boundary; `looks` are numbers of blocks, empty for a look after every block.
 
-    StatisticsError names what cannot be: a margin or looks with a rule that has none, a boundary of over 250 trials an
-    arm, scores or an e-process of arms in random order.
+    Raises:
+        StatisticsError: If the combination is not allowed: a margin or looks with a rule that has none, an exact
+            boundary with more than 250 trials per arm, scores or an e-process with arms in random order.
     """
     check_design(
         rule=rule,
@@ -167,7 +180,7 @@ def check_design(
     drops: bool = False,
     paired: bool = True,
 ) -> None:
-    """What `design` refuses, without computing a boundary; not `paired`: two arms in random order."""
+    """Raise the errors of `design` without computing a boundary; `paired` is False for two arms in random order."""
     check_alpha(alpha)
     if rule not in RULES:
         raise StatisticsError(f"design = {rule!r}; allowed: {', '.join(RULES)}")
@@ -205,12 +218,14 @@ def check_design(
 
 def _bounded(found: Design, looks: Sequence[int]) -> Boundary:
     at = [found.blocks] if found.rule == FIXED else list(looks) or None
-    shape = found.rule if found.rule in SHAPES else "late"  # of one look there is no shape
+    shape = (
+        found.rule if found.rule in SHAPES else "late"
+    )  # with a single look the shape of spending has no effect
     if found.counts is None:
         made = pair_counts(found.blocks, at)
     else:
         chosen = range(found.blocks) if at is None else [one - 1 for one in sorted({*at, found.blocks})]
-        # With a margin a boundary asks about its second arm: the comparison's first.
+        # With a margin, a boundary tests its second arm: the comparison's first.
         sides = (0, 1) if found.margin is None else (1, 0)
         counted = ((found.counts[one][sides[0]], found.counts[one][sides[1]]) for one in chosen)
         made = [count for count in counted if min(count) > 0]
@@ -218,11 +233,13 @@ def _bounded(found: Design, looks: Sequence[int]) -> Boundary:
 
 
 def findings(found: Design, blocks: Sequence[Block]) -> Findings:
-    """What `found` says of these blocks, in the schedule's order; the first one that is not made ends the list.
+    """Return the conclusions of a design from `blocks`, given in the schedule's order up to the first incomplete
+    block.
 
-    Comparisons are decided in the order of the blocks at which they end, so that it is the same whoever finishes first:
-    where arms are dropped a block is made when all arms that were not dropped before it are. An arm that one of them
-    found worse is in no other one any more, but for a control, which is in all; with a margin none is found worse.
+    Comparisons are decided in the order of the blocks at which they end, so that the result does not depend on which
+    trial finishes first. If arms are dropped, a block is complete when it has all arms that were not dropped before
+    it. An arm that was found worse leaves its other comparisons, except a control that is in all of them; with a
+    margin no arm is found worse.
     """
     given = blocks[: found.blocks]
     if not found.drops:
@@ -261,14 +278,14 @@ def findings(found: Design, blocks: Sequence[Block]) -> Findings:
 
 
 def unbeaten(found: Design, said: Findings) -> list[int]:
-    """The arms that no comparison found worse, of a design that has ended."""
+    """Return the arms that no comparison found worse, for a design that has ended."""
     pairs = zip(found.comparisons, said.each, strict=True)
     beaten = {pair[one.winner == "first"] for pair, one in pairs if one.winner}
     return [arm for arm in sorted({arm for pair in found.comparisons for arm in pair}) if arm not in beaten]
 
 
 def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> list[Conclusion]:
-    """By Holm's procedure, where all of them have their test."""
+    """Return the conclusions by Holm's procedure; unchanged until every comparison has its test."""
     tests = {number: one.p for number, one in enumerate(each) if one.p is not None}
     if len(tests) < len(each):
         return each
@@ -282,7 +299,7 @@ def _stepped(found: Design, blocks: Sequence[Block], each: list[Conclusion]) -> 
 
 
 def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]) -> list[Block]:
-    """The blocks before the first one that lacks an arm which was not dropped before it."""
+    """Return the blocks before the first that lacks an arm which was not dropped before it."""
     made = []
     for number, block in enumerate(blocks):
         there = {arm for arm, _ in block}
@@ -293,8 +310,9 @@ def _whole(blocks: Sequence[Block], arms: Sequence[int], dropped: dict[int, int]
 
 
 def evaluate_design(found: Design, blocks: Sequence[Block], pair: tuple[int, int] = (0, 1)) -> Conclusion:
-    """What `found` says of one comparison; the first block that lacks a trial of it ends the list. More blocks than
-    the design foresees are not looked at.
+    """Return the conclusion about one comparison, up to the first block that lacks one of its trials.
+
+    Blocks beyond those of the design are ignored.
     """
     given = list(_made(found, blocks[: found.blocks], pair))
     full = len(given) if len(given) == found.blocks else None
@@ -315,8 +333,9 @@ def evaluate_design(found: Design, blocks: Sequence[Block], pair: tuple[int, int
 def estimated(
     found: Design, blocks: Sequence[Block], pair: tuple[int, int], one: Conclusion
 ) -> Difference | None:
-    """The difference of rates that a comparison ended with, whatever stopped it; None where its rule does not stop it
-    early, or it asks about a margin, was dropped, or goes on.
+    """Return the difference of rates with which a comparison ended, corrected for early stopping.
+
+    None if the rule has no boundary, the design has a margin, or the comparison was dropped or continues.
     """
     if found.boundary is None or found.margin is not None or one.ended_at_pair is None or one.dropped:
         return None
@@ -331,7 +350,7 @@ Sides = tuple[list[float], list[float]]  # outcomes of the first and of the seco
 
 
 def _made(found: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
-    """The blocks before the first one that is not made, by side."""
+    """Yield the outcomes by side of the blocks before the first incomplete one."""
     before = (0, 0)
     for number, block in enumerate(blocks):
         sides = ([value for arm, value in block if arm == pair[0]], [v for arm, v in block if arm == pair[1]])
@@ -343,7 +362,7 @@ def _made(found: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iter
 
 
 def _succeeded(given: Sequence[Sides]) -> tuple[float, float]:
-    """Probability of the one test of a fixed number of blocks, and by how much the first's rate is ahead."""
+    """Return p of the single test of a fixed number of blocks, and the first arm's rate minus the second's."""
     (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
     if not n or not m:
         return 1.0, 0.0
@@ -351,7 +370,7 @@ def _succeeded(given: Sequence[Sides]) -> tuple[float, float]:
 
 
 def _sum(given: Sequence[Sides], side: int) -> tuple[int, int]:
-    """Successes and trials of one side."""
+    """Return successes and trials of one side."""
     return sum(bool(v) for sides in given for v in sides[side]), sum(len(sides[side]) for sides in given)
 
 
@@ -365,10 +384,10 @@ def _of_successes(values: Sequence[Values], alpha: float):  # type: ignore[no-un
 
 
 def _first_crossing(found: Boundary, given: Sequence[Sides]) -> tuple[int | None, str | None]:
-    """The block after which a boundary was crossed, and for which side."""
-    # With a margin a boundary asks about its second arm: the comparison's first.
+    """Return the number of blocks after which the boundary was crossed and the winning side, or (None, None)."""
+    # With a margin, a boundary tests its second arm: the comparison's first.
     sides = (0, 1) if found.margin is None else (1, 0)
-    totals = [(0, 0), (0, 0)]  # successes and trials
+    totals = [(0, 0), (0, 0)]  # (successes, trials) by side
     looks = {(look.first, look.second): number for number, look in enumerate(found.looks)}
     for at, block in enumerate(given, start=1):
         totals = [
@@ -387,16 +406,17 @@ def _ahead(first: float, second: float) -> str:
 
 
 def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tuple[Design, list[Block]]:
-    """One comparison of a paired design by itself, at its share of alpha, and the blocks that have both its arms.
+    """Return one comparison of a paired design as a design of its own at its share of alpha, and the blocks with both
+    arms.
 
-    For doubts about a design that dropped arms, whose later blocks lack some.
+    Used to check conclusions of a design that dropped arms: its later blocks lack some of them.
     """
     both = [block for block in blocks if {*pair} <= {arm for arm, _ in block}]
     return replace(found, alpha=found.share, comparisons=(pair,), drops=False), both
 
 
 def of_so_many(found: Design, blocks: int) -> Design:
-    """The design of one comparison as it would have been for so many pairs, its looks beyond them left out."""
+    """Return the design of one comparison for `blocks` pairs instead; looks beyond them are omitted."""
     looks = looks_at(found) if found.rule in SHAPES else []
     made = design(
         rule=found.rule,
@@ -410,22 +430,22 @@ def of_so_many(found: Design, blocks: int) -> Design:
 
 
 def in_blocks(values: Sequence[Values]) -> list[Block]:
-    """Paired blocks of two arms."""
+    """Return paired blocks of two arms from their outcomes."""
     return [((0, one), (1, other)) for one, other in values]
 
 
 def looks_at(found: Design) -> list[int]:
-    """Numbers of blocks after which its boundary is looked at; none without a boundary."""
+    """Return the numbers of blocks at which the boundary has looks; [] without a boundary."""
     looks = found.boundary.looks if found.boundary else ()
     return [(look.first + look.second) // 2 for look in looks]  # a block of a comparison has two trials
 
 
 def boundary_table(found: Boundary) -> list[list[int]]:
-    """The boundary in plain JSON: per look the trials of each arm, then the least extreme table that stops, if any."""
+    """Return the boundary as JSON: per look the trials of each arm, then the least extreme stopping table, if any."""
     return [[look.first, look.second, *(look.least or ())] for look in found.looks]
 
 
 def boundary_from_table(rows: Sequence[Sequence[int]], alpha: float, margin: float | None) -> Boundary:
-    """The boundary that `table` was made of."""
+    """Return the boundary from rows of `boundary_table`."""
     looks = (Look(n, m, (least[0], least[1]) if least else None) for n, m, *least in rows)
     return Boundary(tuple(looks), alpha, margin)

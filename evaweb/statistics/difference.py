@@ -1,4 +1,4 @@
-"""Comparison of two arms' success rates, each with trials of its own: interval, posterior, exact test.
+"""Comparison of the success rates of two independent arms: interval, posterior, exact test.
 
 Formulae: Newcombe (1998), method 10, for the interval of a difference; Barnard (1945), pooled statistic, for the exact
 unconditional test; the closed form for integer counts of the probability that one Beta variable exceeds another.
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_REMEMBERED = 4096  # tables whose test is kept
-# The common rate at which a table is likeliest is looked for on an even grid of angles, on which binomial masses are
-# equally wide everywhere, and then around its highest peaks.
+_REMEMBERED = 4096  # tables in the cache of `barnard`
+# The common rate at which extreme tables are likeliest is searched on a uniform grid of angles, on which binomial
+# masses have the same width everywhere, and then refined around the highest peaks.
 _RATES = 400
 _PEAKS = 4
 _ZOOMS = 4
@@ -28,28 +28,28 @@ _ZOOMS = 4
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Difference of success rates, the first arm's less the second's (-1 to 1), with its interval."""
+    """Difference of success rates, the first arm's minus the second's (-1 to 1), with its interval."""
 
     value: float
     interval: Interval
 
     @property
     def swapped(self) -> Difference:
-        """The second arm's less the first's."""
+        """The second arm's rate minus the first's."""
         ends = self.interval
         return Difference(-self.value, Interval(-ends.high, -ends.low, ends.level))
 
 
 @dataclass(frozen=True, slots=True)
 class ExactTest:
-    """A statistic and the two-sided probability of one as extreme where the arms are equal."""
+    """Statistic, and the two-sided probability of one at least as extreme if the arms are equal."""
 
     statistic: float
     p: float
 
 
 def newcombe(x1: int, n1: int, x2: int, n2: int, level: float = LEVEL) -> Difference:
-    """x1/n1 - x2/n2 with the interval made of both Wilson intervals; sensible also at 0/n and n/n."""
+    """Return x1/n1 - x2/n2 with the interval built from both Wilson intervals; usable at 0/n and n/n too."""
     first, second = wilson(x1, n1, level), wilson(x2, n2, level)
     p1, p2 = x1 / n1, x2 / n2
     down = math.hypot(p1 - first.low, second.high - p2)
@@ -59,10 +59,10 @@ def newcombe(x1: int, n1: int, x2: int, n2: int, level: float = LEVEL) -> Differ
 
 @lru_cache(maxsize=_REMEMBERED)
 def barnard(x1: int, n1: int, x2: int, n2: int) -> ExactTest:
-    """Barnard's exact test, two-sided and pooled, of x1/n1 against x2/n2.
+    """Return Barnard's exact test of x1/n1 against x2/n2, two-sided and pooled.
 
-    For a number of trials fixed beforehand: looked at again and again, it finds differences that are not there
-    (`sequential` is for that). Where all or none succeeded in both arms there is nothing to tell: statistic 0, p 1.
+    Valid for a number of trials fixed beforehand. Repeated testing finds differences that do not exist; use
+    `sequential` for that. If all or none succeeded in both arms, the statistic is 0 and p is 1.
     """
     check_counts(x1, n1)
     check_counts(x2, n2)
@@ -71,9 +71,9 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> ExactTest:
     import numpy as np
 
     z = _statistics(n1, n2)
-    # Tables as extreme as this one belong to it: what differs in the last bits is not less extreme.
+    # Equally extreme tables belong to the tail, also if they differ in the last bits.
     bound = abs(z[x1, x2]) * (1 - 1e-12)
-    # Along a row the statistic falls: what is extreme are so many tables at its beginning, and so many at its end.
+    # The statistic falls along a row: the extreme tables are at its beginning and at its end.
     tails = (
         ((z >= bound).sum(axis=1), (z <= -bound).sum(axis=1))
         if bound
@@ -95,7 +95,7 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> ExactTest:
 
 
 def _statistics(n1: int, n2: int) -> NDArray[np.float64]:
-    """The pooled statistic of every table: float64 [n1 + 1, n2 + 1]; 0 where all or none succeeded."""
+    """Return the pooled statistic of every table: float64 [n1 + 1, n2 + 1]; 0 if all or none succeeded."""
     import numpy as np
 
     x1, x2 = np.arange(n1 + 1)[:, None], np.arange(n2 + 1)[None, :]
@@ -105,9 +105,9 @@ def _statistics(n1: int, n2: int) -> NDArray[np.float64]:
 
 
 def _tail(extreme: NDArray[np.int64], n2: int, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The probability of extreme tables where both arms succeed at a rate of sin(angle)^2: float64 [angles].
+    """Return the probability of the extreme tables if both arms succeed at a rate of sin(angle)^2: float64 [angles].
 
-    `extreme` [2, n1 + 1] counts those at the beginning and at the end of each row of tables.
+    `extreme` [2, n1 + 1] counts the extreme tables at the beginning and at the end of each row.
     """
     import numpy as np
     from scipy.special import gammaln
@@ -127,7 +127,7 @@ def _tail(extreme: NDArray[np.int64], n2: int, angles: NDArray[np.float64]) -> N
 
 
 def probability_better(x1: int, n1: int, x2: int, n2: int) -> float:
-    """The posterior probability that the first arm's success rate is the higher, from uniform priors."""
+    """Return the posterior probability that the first arm's success rate is higher, with uniform priors."""
     from scipy.special import betaln
 
     a, b = posterior(x2, n2), posterior(x1, n1)

@@ -1,4 +1,4 @@
-"""More than two arms: probabilities corrected for how many comparisons were made, and letters that sum them up.
+"""Comparisons of more than two arms: corrected probabilities, and compact letters that summarise them.
 
 Formulae: Holm (1979); compact letters by insertion and absorption (Piepho 2004).
 """
@@ -12,7 +12,7 @@ from evaweb.statistics.base import StatisticsError, check_share
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Each probability corrected for how many there are, in the order given."""
+    """Return the probabilities corrected by Holm's procedure, in the given order."""
     for value in probabilities:
         check_share("p", value)
     order = sorted(range(len(probabilities)), key=lambda i: probabilities[i])
@@ -25,9 +25,9 @@ def holm(probabilities: Sequence[float]) -> list[float]:
 
 
 def letters(names: Sequence[str], separated: Collection[frozenset[str]]) -> dict[str, str]:
-    """Letters for `names`, best first: two share a letter if and only if they are not `separated`.
+    """Return letters for `names` (best first) such that two share a letter if and only if they are not `separated`.
 
-    `separated` are the pairs, as sets of two names, that a test has told apart.
+    `separated` are the pairs, as sets of two names, that a test found to differ.
     """
     if len(set(names)) != len(names):
         raise StatisticsError(f"a name stands twice in {list(names)}")
@@ -48,7 +48,7 @@ def letters(names: Sequence[str], separated: Collection[frozenset[str]]) -> dict
 
 
 def _absorbed(columns: list[frozenset[str]]) -> list[frozenset[str]]:
-    """Without those that lie within another."""
+    """Return the columns without those that are contained in another."""
     kept: list[frozenset[str]] = []
     for column in sorted(set(columns), key=lambda column: (-len(column), sorted(column))):
         if not any(column <= other for other in kept):
@@ -57,12 +57,12 @@ def _absorbed(columns: list[frozenset[str]]) -> list[frozenset[str]]:
 
 
 def _letter(i: int) -> str:
-    """a to z, then a1 to z1, a2 and so on: a plan with more groups than letters stays readable."""
+    """Return letter `i`: a to z, then a1 to z1, a2 and so on, so that many groups stay readable."""
     return chr(ord("a") + i % 26) + (str(i // 26) if i >= 26 else "")
 
 
 def separated_pairs(probabilities: Mapping[frozenset[str], float], alpha: float) -> set[frozenset[str]]:
-    """Those pairs whose probability, corrected by Holm for all given, is at most `alpha`."""
+    """Return the pairs with a Holm-corrected probability of at most `alpha`."""
     pairs = list(probabilities)
     corrected = holm([probabilities[pair] for pair in pairs])
     return {pair for pair, p in zip(pairs, corrected, strict=True) if p <= alpha}

@@ -1,4 +1,4 @@
-"""The mean of a figure that each trial has one of, with Student's interval (1908)."""
+"""Mean of one number per trial, with Student's interval (1908)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_level
 
 @dataclass(frozen=True, slots=True)
 class Average:
-    """A mean of `n` values; no interval where one value, or none that differs, says nothing of how they vary."""
+    """Mean of `n` values; `interval` is None if their spread is unknown (one value, or all equal)."""
 
     n: int
     value: float
@@ -19,7 +19,11 @@ class Average:
 
 
 def average(values: Sequence[float], level: float = LEVEL) -> Average | None:
-    """Of the values that there are; None where there is none. StatisticsError for one that is not finite."""
+    """Return the mean of `values`, or None if there are none.
+
+    Raises:
+        StatisticsError: If a value is not finite.
+    """
     check_level(level)
     wrong = next((value for value in values if not math.isfinite(value)), None)
     if wrong is not None:

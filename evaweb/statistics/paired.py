@@ -1,7 +1,7 @@
-"""Two arms tried from the same initial conditions: the exact test of discordant pairs, the difference over conditions.
+"""Comparison of two arms from the same initial conditions: exact test of discordant pairs, difference over conditions.
 
 Formulae: McNemar's test in its exact binomial form; Gaffke's interval of the conditions' differences, because trials
-from one condition are not independent of each other.
+from the same condition are not independent.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from evaweb.statistics.difference import Difference
 
 @dataclass(frozen=True, slots=True)
 class McNemar:
-    """Pairs in which only the first, and only the second, succeeded; the two-sided exact probability."""
+    """Numbers of pairs in which only the first and only the second succeeded, and the two-sided exact probability."""
 
     first_only: int
     second_only: int
@@ -26,7 +26,7 @@ class McNemar:
 
 
 def mcnemar(pairs: Sequence[tuple[bool, bool]]) -> McNemar:
-    """The exact test of pairs (first succeeded, second succeeded); without discordant pairs p is 1."""
+    """Return the exact test of pairs (first succeeded, second succeeded); without discordant pairs p is 1."""
     first = sum(1 for one, other in pairs if one and not other)
     second = sum(1 for one, other in pairs if other and not one)
     return McNemar(first, second, len(pairs), _binomial(first, second))
@@ -48,9 +48,12 @@ def over_conditions(
     level: float = LEVEL,
     draws: int = DRAWS,
 ) -> Difference:
-    """Difference of the means of both arms' outcomes (0 to 1), by initial condition, those being a sample of others.
+    """Return the difference of mean outcomes (0 to 1) over initial conditions, which are regarded as a random sample.
 
-    Only conditions that both arms were tried from count, each as heavy as any other. At least two are needed.
+    Only conditions with trials of both arms count, each with equal weight.
+
+    Raises:
+        StatisticsError: If fewer than two conditions are shared, or one of them has no trial of an arm.
     """
     shared = sorted(set(first) & set(second), key=str)
     if len(shared) < 2:

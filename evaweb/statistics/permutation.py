@@ -1,7 +1,6 @@
-"""The permutation test of paired differences: had both arms been the same, each difference could as well have been
-turned round.
+"""Permutation test of paired differences: if both arms are equal, each difference may as well have the other sign.
 
-Formulae: Fisher's sign flips (1935), all of them counted by way of their sums, not drawn.
+Formulae: Fisher's sign flips (1935), all counted by their sums instead of sampled.
 """
 
 from __future__ import annotations
@@ -12,16 +11,16 @@ from dataclasses import dataclass
 
 from evaweb.statistics.base import StatisticsError
 
-# Differences are taken to the finest of these parts of 1 at which the sums are few enough to be counted: the first
-# holds hundredths and every fraction with a denominator up to 10. The same parts for a difference and its opposite, so
-# that the test stays exact whatever is rounded.
+# Differences are rounded to the finest of these fractions of 1 for which the sums are few enough to count; the first
+# represents hundredths and every fraction with a denominator up to 10 exactly. A difference and its opposite are
+# rounded alike, so that the test stays exact.
 PARTS = (25_200, 2_520, 420, 60, 12)
-_MOST = 10_000_000  # sums times differences
+_MOST = 10_000_000  # greatest product of sums and differences
 
 
 @dataclass(frozen=True, slots=True)
 class SignFlipTest:
-    """Mean of the differences of `pairs`, and the two-sided probability of one as far from 0 by chance."""
+    """Mean difference of `pairs`, and the two-sided probability of one as far from 0 by chance."""
 
     pairs: int
     value: float
@@ -29,10 +28,12 @@ class SignFlipTest:
 
 
 def sign_flip_test(differences: Sequence[float], widest: float = 1.0) -> SignFlipTest:
-    """The test of `differences` from -widest to widest, of pairs whose number was fixed beforehand.
+    """Return the sign-flip test of `differences` (-widest to widest); the number of pairs must be fixed beforehand.
 
-    Exact: every one of the 2^n ways in which the signs may fall is counted. StatisticsError where there is none, or
-    one lies outside.
+    Exact: all 2^n combinations of signs are counted.
+
+    Raises:
+        StatisticsError: If there is no difference, or one lies outside.
     """
     if not differences:
         raise StatisticsError("no pair: a permutation test needs at least one")
@@ -44,7 +45,7 @@ def sign_flip_test(differences: Sequence[float], widest: float = 1.0) -> SignFli
 
 
 def _in_parts(shares: Sequence[float]) -> list[int]:
-    """`shares` in whole parts, those of 0 left out."""
+    """Return the non-zero `shares` as integers in a common unit."""
     units: list[int] = []
     for parts in PARTS:
         units = [unit for share in shares if (unit := round(share * parts))]
@@ -61,7 +62,7 @@ def _p(units: Sequence[int]) -> float:
     total, observed = sum(map(abs, units)), abs(sum(units))
     if not observed:
         return 1.0
-    # Probability of each sum of those differences that come out below 0.
+    # Probability of each sum of the differences that come out negative.
     below, reached = np.zeros(total + 1), 0
     below[0] = 1.0
     for unit in sorted(map(abs, units)):

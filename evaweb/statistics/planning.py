@@ -1,7 +1,7 @@
-"""Number of trials that a wanted difference needs, and what cannot be seen with those that there is time for.
+"""Number of trials needed for a difference, and the difference that a number of trials can detect.
 
 Formulae: the normal approximation for two proportions, checked by the exact power of Barnard's test, whose
-probabilities are taken over all tables at once.
+probabilities are computed for all tables at once.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 ALPHA = 0.05
 POWER = 0.8
-MOST = 250  # trials an arm: all tables of more would not fit into a page's time
-_RATES = 400  # common success rates at which a table's probability is taken; the largest counts
+MOST = 250  # trials per arm; the tables of more would take too long for a page
+_RATES = 400  # common success rates at which a table's probability is computed; the largest counts
 
 
 def trials_needed(p1: float, p2: float, power: float = POWER, alpha: float = ALPHA) -> int:
-    """Trials of each arm to find, with probability `power`, that success rates `p1` and `p2` differ (two-sided)."""
+    """Return the trials per arm to find with probability `power` that the rates `p1` and `p2` differ (two-sided)."""
     _check(p1, p2, alpha)
     check_share("power", power)
     middle = (p1 + p2) / 2
@@ -35,7 +35,7 @@ def trials_needed(p1: float, p2: float, power: float = POWER, alpha: float = ALP
 
 
 def approximate_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> float:
-    """With what probability `n` trials of each arm show that success rates `p1` and `p2` differ, by the normal law."""
+    """Return the power of `n` trials per arm to detect that rates `p1` and `p2` differ, by the normal approximation."""
     _check(p1, p2, alpha)
     from scipy.special import ndtr
 
@@ -46,7 +46,7 @@ def approximate_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> flo
 
 
 def exact_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> float:
-    """The same by Barnard's exact test, for at most 250 trials an arm."""
+    """Return the power by Barnard's exact test, for at most 250 trials per arm."""
     check_share("p1", p1)
     check_share("p2", p2)
     check_alpha(alpha)
@@ -59,9 +59,9 @@ def exact_power(n: int, p1: float, p2: float, alpha: float = ALPHA) -> float:
 
 
 def detectable(n: int, p: float, power: float = POWER, alpha: float = ALPHA) -> float | None:
-    """The smallest gain over success rate `p` that `n` trials of each arm show with probability `power`.
+    """Return the smallest gain over success rate `p` that `n` trials per arm detect with probability `power`.
 
-    None where not even the step to 1 is shown.
+    None if even a rate of 1 is not detected.
     """
     check_share("p", p)
     if p >= 1 or approximate_power(n, p, 1.0, alpha) < power:
@@ -78,9 +78,9 @@ def detectable(n: int, p: float, power: float = POWER, alpha: float = ALPHA) -> 
 
 @lru_cache(maxsize=MOST)
 def _barnard_tables(n: int) -> NDArray[np.float64]:
-    """Two-sided probability of Barnard's pooled test for every table of two arms of `n` trials: float64 [n+1, n+1].
+    """Return p of Barnard's two-sided pooled test for every table of two arms of `n` trials: float64 [n+1, n+1].
 
-    Each number of trials is computed once in a process; all of them together take 42 MB.
+    Cached for every `n`; all of them together use 42 MB.
     """
     import numpy as np
 
@@ -89,10 +89,10 @@ def _barnard_tables(n: int) -> NDArray[np.float64]:
     pooled = (p1 + p2) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.abs(p1 - p2) / np.sqrt(2 * pooled * (1 - pooled) / n)
-    z = np.where(np.isfinite(z), z, 0.0).round(10)  # tables as extreme as each other stay together
+    z = np.where(np.isfinite(z), z, 0.0).round(10)  # rounded, so that equally extreme tables stay together
     levels, level = np.unique(-z.ravel(), return_inverse=True)
     worst = np.zeros(len(levels))
-    # Success and failure exchanged, every table is as extreme as before: rates above a half tell nothing more.
+    # Exchanging success and failure leaves every table as extreme: rates above 0.5 add nothing.
     for mass in _masses(n, np.linspace(0, 1, _RATES + 2)[1 : _RATES // 2 + 1]):
         each = np.bincount(level.ravel(), weights=np.outer(mass, mass).ravel(), minlength=len(levels))
         np.maximum(worst, np.cumsum(each), out=worst)
@@ -100,7 +100,7 @@ def _barnard_tables(n: int) -> NDArray[np.float64]:
 
 
 def _masses(n: int, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The binomial distributions of `n` trials: float64 [rates, n+1]. scipy.stats would be seconds to import."""
+    """Return the binomial distributions of `n` trials: float64 [rates, n+1]; avoids the slow import of scipy.stats."""
     import numpy as np
     from scipy.special import gammaln, xlog1py, xlogy
 

@@ -1,9 +1,8 @@
-"""Which of several policies people prefer, from comparisons of two with ties, and with an effect of who was seen first.
+"""Ranking of policies by preference, from pairwise comparisons with ties and an effect of the order of presentation.
 
-Model: Bradley and Terry (1952), ties by Davidson (1970), order by Davidson and Beaver (1977). With log-worths t, of a
-comparison of i (seen first) and j the three outcomes have the log-weights t_i + g/2, t_j - g/2 and
-log 2 + f + (t_i + t_j)/2. A multinomial logit, fitted by Newton's method; where no finite estimate exists nothing is
-ranked.
+Model: Bradley and Terry (1952), ties by Davidson (1970), order by Davidson and Beaver (1977). With log-worths t, the
+outcomes of a comparison of i (shown first) and j have the log-weights t_i + g/2, t_j - g/2 and log 2 + f + (t_i +
+t_j)/2. It is a multinomial logit, fitted by Newton's method; if no finite estimate exists, nothing is ranked.
 """
 
 from __future__ import annotations
@@ -24,13 +23,14 @@ if TYPE_CHECKING:
 Outcome = Literal["first", "second", "tie"]
 _STEPS = 100
 _CLOSE = 1e-8  # largest component of the gradient at the solution
-_ROUNDED = 1e-13  # relative: by what a likelihood may be off
+_ROUNDED = 1e-13  # relative rounding error of a likelihood
 
 
 class NotIdentifiedError(StatisticsError):
-    """The comparisons determine no ranking; `components` are sets of policies that can be ranked among themselves.
+    """The comparisons determine no common ranking; `components` are sets of policies that can be ranked among
+    themselves.
 
-    They are in an order in which no later one was ever preferred to an earlier one, where there is such.
+    They are ordered such that no later set was ever preferred to an earlier one, if such an order exists.
     """
 
     def __init__(self, text: str, components: Sequence[Sequence[str]]) -> None:
@@ -40,9 +40,9 @@ class NotIdentifiedError(StatisticsError):
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """`first` was run or shown first, `second` second, and this was preferred.
+    """Comparison of two runs; `first` was run or shown first.
 
-    `weight`: the share that it has of one comparison, where several people compared the same two runs.
+    `weight` is its share if several people compared the same two runs, so that these count as one comparison.
     """
 
     first: str
@@ -53,7 +53,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Contrast:
-    """Advantage of the first policy: difference of log-worths, and as probability to win where no tie is."""
+    """Advantage of the first policy: difference of log-worths, and probability to win if there is no tie."""
 
     difference: float
     error: float
@@ -64,11 +64,11 @@ class Contrast:
 
 @dataclass(frozen=True, slots=True)
 class Preferences:
-    """The fit.
+    """Fitted preferences.
 
-    `worth` and `error` by policy are centred log-worths with their standard errors; `contrasts` are by pair
-    (alphabetical); `tie` is nu (None without any tie), at which equal policies tie with probability nu / (1 + nu);
-    `order` is the log odds that being first adds, with its z (None where it was not fitted).
+    `worth` and `error` are centred log-worths and their standard errors by policy; `contrasts` are by pair
+    (alphabetical). `tie` is nu (None without ties): equal policies tie with probability nu / (1 + nu). `order` is the
+    log odds that being first adds, `order_z` its z; both None if not fitted.
     """
 
     worth: Mapping[str, float]
@@ -81,20 +81,21 @@ class Preferences:
 
     @property
     def ranking(self) -> list[str]:
-        """Best first; those that are equal but for rounding by their names."""
+        """Policies, best first; policies that are equal up to rounding are in alphabetical order."""
         return sorted(self.worth, key=lambda name: (-round(self.worth[name], 6), name))
 
     def rating(self, name: str) -> float:
-        """1500 + 200 times the centred log-worth, as RoboArena shows it; not the slope of chess ratings."""
+        """Return 1500 + 200 * centred log-worth, the scale of RoboArena; it is not the scale of chess ratings."""
         return 1500 + 200 * self.worth[name]
 
 
 def preferences(
     comparisons: Sequence[Comparison], *, order_effect: bool = False, level: float = LEVEL
 ) -> Preferences:
-    """Fit all `comparisons`; Wald intervals of contrasts.
+    """Fit all `comparisons`, with Wald intervals of the contrasts.
 
-    Raises NotIdentifiedError where they determine no finite, unique ranking.
+    Raises:
+        NotIdentifiedError: If the comparisons determine no finite, unique ranking.
     """
     check_level(level)
     import numpy as np
@@ -136,7 +137,7 @@ def preferences(
 
 
 class _Design:
-    """Comparisons as cells of a multinomial logit, linear in x = (log-worths but the first, f, g)."""
+    """Comparisons as cells of a multinomial logit, linear in x = (log-worths except the first, f, g)."""
 
     def __init__(self, comparisons: Sequence[Comparison], order_effect: bool) -> None:
         import numpy as np
@@ -165,7 +166,9 @@ class _Design:
         self.vectors = np.zeros((len(shown), len(outcomes), self.size))
         self.counts = np.array([[cells[*pair, o] for o in outcomes] for pair in shown])
         self.offsets = np.array([0.0, 0.0, math.log(2)][: len(outcomes)])
-        place = {name: i - 1 for i, name in enumerate(self.names)}  # the first policy has no slot
+        place = {
+            name: i - 1 for i, name in enumerate(self.names)
+        }  # the first policy is the reference: index -1
         for row, (first, second) in zip(self.vectors, shown, strict=True):
             for name, outcome in ((first, 0), (second, 1)):
                 if place[name] >= 0:
@@ -178,7 +181,7 @@ class _Design:
                 row[0, -1], row[1, -1] = 0.5, -0.5
 
     def check(self) -> None:
-        """Raise NotIdentifiedError unless a finite, unique estimate exists: exact, by rank and linear program."""
+        """Raise NotIdentifiedError unless a finite, unique estimate exists; exact, by rank and linear program."""
         import numpy as np
         from scipy.optimize import linprog
 
@@ -207,7 +210,9 @@ class _Design:
             )
 
     def components(self) -> list[list[str]]:
-        """Policies that are mutually reachable by wins, those that were never beaten from outside first."""
+        """Return the sets of policies that are mutually reachable by wins, sets that were never beaten from outside
+        first.
+        """
         reach = {name: {name} | {other for (w, other) in self.wins if w == name} for name in self.names}
         for via in self.names:
             for name in self.names:
@@ -221,7 +226,7 @@ class _Design:
 
 
 def _fit(design: _Design) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-    """The maximum of the log-likelihood: where, how high, and the information there."""
+    """Return the maximiser of the log-likelihood, its maximum, and the information matrix there."""
     import numpy as np
 
     x = np.zeros(design.size)
@@ -233,7 +238,7 @@ def _fit(design: _Design) -> tuple[NDArray[np.float64], float, NDArray[np.float6
             return x, height, information
         step = np.linalg.solve(information, gradient)
         length, slope = 1.0, float(gradient @ step)
-        least = height - _ROUNDED * abs(height)  # near the top it rises by less than it is rounded by
+        least = height - _ROUNDED * abs(height)  # near the maximum the increase is below the rounding error
         while True:
             tried = _likelihood(design, x + length * step)
             if tried[0] >= least + 1e-4 * length * slope or length < 1e-10:

@@ -1,4 +1,4 @@
-"""Progress within trials: the funnel of milestones."""
+"""Progress within trials: funnel of milestones."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from evaweb.statistics.proportions import Proportion, proportion
 
 @dataclass(frozen=True, slots=True)
 class FunnelStep:
-    """One milestone: how many of all trials reached it, and of those that reached the one before."""
+    """Share of all trials that reached a milestone, and share of those that reached the milestone before it."""
 
     of_all: Proportion
     of_previous: Proportion
 
 
 def funnel(reached: Sequence[Sequence[bool]]) -> list[FunnelStep]:
-    """For each milestone, of trials that say of each whether it was reached.
+    """Return the funnel step of each milestone; `reached` [trials, milestones] is whether a trial reached it.
 
-    `of_previous` counts trials that reached the milestone before, whether or not those are ordered.
+    `of_previous` counts trials that reached the previous milestone, whether or not the milestones are ordered.
     """
     if not reached:
         return []

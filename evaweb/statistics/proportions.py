@@ -1,7 +1,7 @@
 """Success rate: `successes` out of `n`, its intervals and its posterior.
 
-Formulae: Wilson (1927) for the interval of a proportion; Clopper and Pearson (1934) where a guarantee is wanted;
-the Beta posterior of a uniform prior (Bayes, Laplace) where a distribution is drawn.
+Formulae: Wilson (1927) for the interval of a proportion; Clopper and Pearson (1934) if coverage must be guaranteed;
+the Beta posterior of a uniform prior (Bayes, Laplace) for drawing a distribution.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["LEVEL", "Interval", "Posterior", "Proportion", "StatisticsError", "S
 
 @dataclass(frozen=True, slots=True)
 class Proportion:
-    """`successes` out of `n`; `rate` and `interval` are None where n is 0: nothing is known then."""
+    """`successes` out of `n`; `rate` and `interval` are None if n is 0."""
 
     successes: int
     n: int
@@ -29,18 +29,18 @@ class Proportion:
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Posterior of a success rate after x of n, all equally likely before: Beta(1 + x, 1 + n - x)."""
+    """Posterior of a success rate after x of n with a uniform prior: Beta(1 + x, 1 + n - x)."""
 
     a: float
     b: float
 
     @property
     def mean(self) -> float:
-        """Its expectation, (x + 1) / (n + 2)."""
+        """Posterior mean, (x + 1) / (n + 2)."""
         return self.a / (self.a + self.b)
 
     def interval(self, level: float = LEVEL) -> Interval:
-        """The equal-tailed credible interval."""
+        """Return the equal-tailed credible interval."""
         check_level(level)
         from scipy.special import betaincinv
 
@@ -50,7 +50,7 @@ class Posterior:
         )
 
     def density(self, rates: Sequence[float]) -> list[float]:
-        """Its density at each of `rates` (0 to 1), for a violin."""
+        """Return the density at each of `rates` (0 to 1), for a violin plot."""
         from scipy.stats import beta
 
         return [float(value) for value in beta.pdf(rates, self.a, self.b)]
@@ -58,7 +58,7 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Statistics of a set of scored trials; None where there is nothing they could be made from."""
+    """Statistics of a set of scored trials; a value is None if there is no data for it."""
 
     success: Proportion
     mean_score: float | None
@@ -67,7 +67,7 @@ class Summary:
 
 
 def proportion(successes: int, n: int, level: float = LEVEL) -> Proportion:
-    """`successes` out of `n` with its Wilson interval."""
+    """Return `successes` out of `n` with the Wilson interval; n may be 0."""
     if n == 0 and successes == 0:
         return Proportion(0, 0, None, None)
     interval = wilson(successes, n, level)
@@ -75,9 +75,10 @@ def proportion(successes: int, n: int, level: float = LEVEL) -> Proportion:
 
 
 def wilson(successes: int, n: int, level: float = LEVEL) -> Interval:
-    """Wilson's score interval of a proportion; never wider than 0 to 1, sensible also at 0/n and n/n.
+    """Return Wilson's score interval of a proportion; within 0 to 1, usable at 0/n and n/n too.
 
-    Raises StatisticsError for n below 1 and successes outside 0 to n.
+    Raises:
+        StatisticsError: If n is below 1 or successes are outside 0 to n.
     """
     check_counts(successes, n)
     check_level(level)
@@ -85,13 +86,13 @@ def wilson(successes: int, n: int, level: float = LEVEL) -> Interval:
     p = successes / n
     centre = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = math.sqrt(z2) / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
-    low = 0.0 if successes == 0 else max(0.0, centre - half)  # exact there, rounding would leave 1e-17
+    low = 0.0 if successes == 0 else max(0.0, centre - half)  # exact; rounding would leave 1e-17
     high = 1.0 if successes == n else min(1.0, centre + half)
     return Interval(low, high, level)
 
 
 def clopper_pearson(successes: int, n: int, level: float = LEVEL) -> Interval:
-    """The exact interval of a proportion: covers with at least `level` whatever the truth is."""
+    """Return the exact interval of a proportion: its coverage is at least `level` at every true rate."""
     check_counts(successes, n)
     check_level(level)
     from scipy.special import betaincinv
@@ -103,7 +104,7 @@ def clopper_pearson(successes: int, n: int, level: float = LEVEL) -> Interval:
 
 
 def posterior(successes: int, n: int) -> Posterior:
-    """Posterior of the rate after `successes` out of `n`; n may be 0."""
+    """Return the posterior of the rate after `successes` out of `n`; n may be 0."""
     if n != 0 or successes != 0:
         check_counts(successes, n)
     return Posterior(1.0 + successes, 1.0 + n - successes)
@@ -115,7 +116,9 @@ def summary(
     durations: Sequence[float],
     smoothness: Sequence[float] = (),
 ) -> Summary:
-    """Of the scored trials of one cell: success, score (0 to 1), duration [s] and SPARC of each, as far as known."""
+    """Return the summary of the scored trials of one cell: success, score (0 to 1), duration [s] and SPARC, as far as
+    known.
+    """
     return Summary(
         proportion(sum(map(bool, outcomes)), len(outcomes)),
         math.fsum(scores) / len(scores) if scores else None,

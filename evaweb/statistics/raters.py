@@ -1,7 +1,7 @@
-"""Agreement of two people who scored the same trials, beyond what chance would do.
+"""Agreement of two raters of the same trials beyond chance.
 
-Formulae: Cohen (1960; weighted 1968), Gwet's AC1 (2008) beside it because kappa collapses where nearly all trials end
-the same way, Krippendorff's alpha (2004) where ratings are missing.
+Formulae: Cohen (1960; weighted 1968); Gwet's AC1 (2008), because kappa collapses if nearly all trials end alike;
+Krippendorff's alpha (2004) for missing ratings.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ Metric = Literal["nominal", "interval"]
 
 
 def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
-    """Agreement of two raters on unordered categories, 1 where they always agree, about 0 where by chance.
+    """Return the agreement of two raters on unordered categories: 1 if they always agree, about 0 if by chance.
 
-    StatisticsError where both always said the same word: chance alone would agree as often.
+    Raises:
+        StatisticsError: If only one category was used: kappa is then undefined.
     """
     _require_pairs(pairs)
     n = len(pairs)
@@ -32,7 +33,7 @@ def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
 
 
 def weighted_kappa(pairs: Sequence[tuple[int, int]], levels: int, weights: Weights = "linear") -> float:
-    """Agreement on levels 0 to `levels` - 1, where being one level apart is less wrong than being two."""
+    """Return the agreement on levels 0 to `levels` - 1; with `weights` near levels count as a smaller disagreement."""
     _require_pairs(pairs)
     if levels < 2:
         raise StatisticsError(f"{levels} levels; allowed: 2 or more")
@@ -55,7 +56,7 @@ def _distance(i: int, j: int, levels: int, weights: Weights) -> float:
 
 
 def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) -> float:
-    """Agreement of two raters that stays readable where one category is rare; 1 where both always said the same."""
+    """Return the agreement of two raters by a measure that is robust to a rare category; 1 if they always agree."""
     _require_pairs(pairs)
     used = Counter(name for pair in pairs for name in pair)
     if len(used) > categories or categories < 2:
@@ -70,9 +71,10 @@ def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) ->
 
 
 def krippendorff_alpha(units: Sequence[Sequence[float | None]], metric: Metric = "nominal") -> float:
-    """Agreement of any number of raters; `units` are trials, each with what each rater said, None where nothing.
+    """Return the agreement of any number of raters; `units` are trials, each with one rating per rater or None.
 
-    StatisticsError where no value but one was ever said.
+    Raises:
+        StatisticsError: If no trial has two ratings, or all ratings are equal.
     """
     rated = [[value for value in unit if value is not None] for unit in units]
     rated = [unit for unit in rated if len(unit) > 1]

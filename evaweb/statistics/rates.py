@@ -1,4 +1,4 @@
-"""Events over time: units per hour, mean time between interventions.
+"""Rates of events over time: units per hour, mean time between interventions.
 
 Formula: the exact interval of a Poisson rate (Garwood 1936), by the Gamma distribution.
 """
@@ -15,7 +15,7 @@ HOUR = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """`events` in `exposure` [s]: `per_hour` with its interval."""
+    """`events` in `exposure` [s], as a rate per hour with its interval."""
 
     events: int
     exposure: float
@@ -24,18 +24,18 @@ class Rate:
 
     @property
     def mean_time(self) -> float | None:
-        """Mean time between events [s]; None where there was none."""
+        """Mean time between events [s]; None without events."""
         return HOUR / self.per_hour if self.events else None
 
     @property
     def mean_time_interval(self) -> Interval:
-        """Of the mean time between events [s]; its end is infinite where there was none."""
+        """Interval of the mean time between events [s]; its upper end is infinite without events."""
         high = HOUR / self.interval.low if self.interval.low > 0 else math.inf
         return Interval(HOUR / self.interval.high, high, self.interval.level)
 
 
 def rate(events: int, exposure: float, level: float = LEVEL) -> Rate:
-    """Rate of `events` in `exposure` [s] of running."""
+    """Return the rate of `events` in `exposure` [s] of running."""
     check_level(level)
     if events < 0:
         raise StatisticsError(f"{events} events; allowed: 0 or more")

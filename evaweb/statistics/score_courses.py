@@ -1,10 +1,11 @@
-"""How a design whose outcome is a score ends, at scores that are assumed: power, and after how many pairs.
+"""Operating characteristics of designs that compare scores, at assumed scores: power, and number of pairs.
 
-Assumed are means, a standard deviation, and that a score is a share of so many equal points: beta-binomial (Skellam,
-1948), the widest family there is between points that are reached independently of each other and all or none. Pairs
-are independent, and so are the two scores of a pair. Simulated with a fixed seed; each simulated evaluation is decided
-by the design's own test. That of a fixed number is `permutation.sign_flips`, whose sums are counted exactly, here by
-their characteristic function, for all evaluations at once; the other is `sequential.score_evidence`.
+Assumptions: means, a standard deviation, and scores that are shares of a number of equal points with a beta-binomial
+distribution (Skellam 1948), the widest family between points that are reached independently and all or none. Pairs are
+independent, and so are the two scores of a pair. Evaluations are simulated with a fixed seed, and each is decided by
+the design's own test. For a fixed number this is the test of `permutation.sign_flip_test`, whose sums are counted
+exactly, here by their characteristic function for all evaluations at once; otherwise it is
+`sequential.score_evidence`.
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ from evaweb.statistics.sequential import BET_FRACTIONS
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-RULES = (FIXED, ANYTIME)  # the designs that compare scores
-LARGEST = 10  # points of a score: finer ones are as good as continuous
+RULES = (FIXED, ANYTIME)  # designs that can compare scores
+LARGEST = 10  # greatest number of points of a score; finer scores are nearly continuous
 RUNS = 4000
 _SEED = 20_261
-_TIE = 1e-9  # relative, as where a design concludes
+_TIE = 1e-9  # relative; the same as in `designs`
 
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """Mean scores of two checkpoints, the standard deviation of each, and of how many points a score is a share."""
+    """Assumed mean scores of two checkpoints, their standard deviation, and the number of points of a score."""
 
     first: float
     second: float
@@ -51,7 +52,7 @@ class Scores:
             raise StatisticsError(f"{self.points} points; allowed: 1 to {LARGEST}")
 
     def spreads(self) -> tuple[float, float]:
-        """The standard deviations that they have: as near to the assumed one as there are scores of such a mean."""
+        """Return the standard deviations of both: the feasible value nearest to the assumed one, given the mean."""
         first, second = (self._spread(mean) for mean in (self.first, self.second))
         return first, second
 
@@ -60,11 +61,11 @@ class Scores:
         return min(max(self.spread, widest / math.sqrt(self.points)), widest)
 
     def chances(self, mean: float) -> list[float]:
-        """The probabilities of 0, 1 and so on up to all points."""
+        """Return the probabilities of 0, 1, ... up to all points for a mean score."""
         k, widest, spread = self.points, mean * (1 - mean), self._spread(mean)
         if not widest:
             return [float(n == round(mean * k)) for n in range(k + 1)]
-        # How much one point that is reached says of the others: 0 nothing, 1 all.
+        # Correlation between points: 0 independent, 1 identical.
         share = (spread**2 / widest * k - 1) / (k - 1) if k > 1 else 0.0
         if share > 1 - 1e-9:
             return [1 - mean, *[0.0] * (k - 1), mean]
@@ -81,7 +82,7 @@ def _log_beta(a: float, b: float) -> float:
 
 @lru_cache(maxsize=512)
 def score_course(rule: str, pairs: int, scores: Scores, alpha: float) -> DesignPower:
-    """That of a design of so many pairs at most, among 4,000 simulated evaluations."""
+    """Return the power of a design of at most `pairs` pairs, from 4,000 simulated evaluations."""
     import numpy as np
 
     check_alpha(alpha)
@@ -100,12 +101,12 @@ def score_course(rule: str, pairs: int, scores: Scores, alpha: float) -> DesignP
 
 
 def score_pairs_needed(rule: str, scores: Scores, power: float, alpha: float) -> DesignPower | None:
-    """The design of the fewest pairs that has this power; None where 250 pairs have it not."""
+    """Return the design with the fewest pairs that reaches this power, or None if 250 pairs do not."""
     check_share("power", power)
     low, high = 0, MOST
     if score_course(rule, high, scores, alpha).power < power:
         return None
-    while high - low > 1:  # power grows with the pairs, but for what the steps of the test take
+    while high - low > 1:  # power grows with the pairs, apart from the discreteness of the test
         middle = (low + high) // 2
         if score_course(rule, middle, scores, alpha).power >= power:
             high = middle
@@ -116,7 +117,7 @@ def score_pairs_needed(rule: str, scores: Scores, power: float, alpha: float) ->
 
 @lru_cache(maxsize=8)
 def _differences(scores: Scores) -> NDArray[Any]:
-    """Differences of simulated scores in points [runs, most pairs]; the first columns are a smaller design's."""
+    """Return simulated score differences in points [runs, MOST]; the first columns are those of a smaller design."""
     import numpy as np
 
     chance = np.random.default_rng(_SEED)
@@ -129,18 +130,18 @@ def _differences(scores: Scores) -> NDArray[Any]:
 
 
 def _flipped(differences: NDArray[Any], points: int) -> NDArray[Any]:
-    """Two-sided probability of each row [rows, pairs] by the permutation test, all signs counted."""
+    """Return the two-sided p of each row [rows, pairs] by the permutation test, all signs counted."""
     import numpy as np
 
     sizes = np.abs(differences)
     total = sizes.sum(axis=1, dtype=np.int64)
     observed = np.abs(differences.sum(axis=1, dtype=np.int64))
-    length = int(total.max()) + 1  # of the sums of what comes out below 0
+    length = int(total.max()) + 1  # number of possible sums of the negative differences
     turns = np.exp(2j * np.pi * np.arange(length // 2 + 1) / length)
     spectrum = np.ones((len(sizes), len(turns)), complex)
     for size in range(1, points + 1):
         counts = (sizes == size).sum(axis=1)
-        one = (1 + turns**-size) / 2  # of one difference, which comes out below 0 in half of all cases
+        one = (1 + turns**-size) / 2  # of one difference, which is negative in half of all cases
         spectrum *= (one ** np.arange(int(counts.max()) + 1)[:, None])[counts]
     below = np.cumsum(np.fft.irfft(spectrum, length, axis=1), axis=1)
     least = ((total - observed) // 2)[:, None]
@@ -150,7 +151,7 @@ def _flipped(differences: NDArray[Any], points: int) -> NDArray[Any]:
 
 @lru_cache(maxsize=32)
 def _stops(scores: Scores, alpha: float) -> NDArray[Any]:
-    """After how many pairs each simulated evaluation is stopped by the e-process; one more than the most: never."""
+    """Return the number of pairs after which the e-process stops each simulated evaluation; MOST + 1: never."""
     import numpy as np
 
     differences = _differences(scores).astype(np.intp) + scores.points

@@ -1,9 +1,9 @@
-"""Evidence that may be looked at after every pair of trials, and stopped on, without finding what is not there.
+"""Anytime-valid evidence: it may be examined, and the evaluation stopped, after every pair of trials.
 
-An e-process is a bet against "both arms are equal" whose expected worth is at most 1 as long as that is true; by
-Ville's inequality it reaches 1/alpha with probability at most alpha, however often one looks. Two directions are
-watched at alpha/2 each. Sources: Turner and Gruenwald (2023), safe two-sample tests, for success and failure;
-Waudby-Smith and Ramdas (2023), betting, for partial credit.
+An e-process is a bet against "both arms are equal" with an expected wealth of at most 1 while that is true. By Ville's
+inequality it reaches 1/alpha with probability at most alpha, however often it is examined. Both directions are tested,
+each at alpha/2. Sources: Turner and Gruenwald (2023), safe two-sample tests, for success and failure; Waudby-Smith and
+Ramdas (2023), betting, for partial credit.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import dataclass
 from evaweb.statistics.base import check_alpha, check_share
 
 ALPHA = 0.05
-BET_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)  # of all that a gambler has, on each pair
+BET_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)  # share of its wealth that each gambler bets on each pair
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of a sequence of pairs, for both directions, after each pair.
+    """Evidence of a sequence of pairs for both directions, after each pair.
 
-    `first` and `second` [pairs] are log e-values that the first, and the second, arm is the better; `p_first` and
-    `p_second` [pairs] the anytime-valid probabilities min over time of 1/e. `stop` is the number of pairs after which
-    one of them was first at most alpha/2, None where none was; `winner` is which ("first" or "second").
+    `first` and `second` [pairs] are log e-values that the first, or the second, arm is better; `p_first` and
+    `p_second` [pairs] are the anytime-valid probabilities, the running minimum of 1/e. `stop` is the number of pairs
+    after which one of them was first at most alpha/2, None if neither was; `winner` is that arm ("first" or "second").
     """
 
     first: tuple[float, ...]
@@ -37,27 +37,27 @@ class Evidence:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs that were looked at."""
+        """Number of pairs."""
         return len(self.first)
 
     @property
     def p(self) -> float:
-        """Two-sided: twice the smaller of both, at most 1; 1 before the first pair."""
+        """Two-sided probability: twice the smaller of both, at most 1; 1 before the first pair."""
         return min(1.0, 2 * min(self.p_first[-1], self.p_second[-1])) if self.pairs else 1.0
 
 
 def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -> Evidence:
-    """Of pairs (first succeeded, second succeeded) in the order in which they were run.
+    """Return the evidence of pairs (first succeeded, second succeeded) in the order in which they were run.
 
-    Each pair may have a success rate of its own, as when both arms start from the same initial condition: the bet is
-    fair whatever the common rate is. The order matters, and must be the true one; pairs must not be left out.
+    Each pair may have its own success rate, as when both arms start from the same initial condition: the bet is fair
+    at any common rate. The order must be the true one, and pairs must not be omitted.
     """
     check_alpha(alpha)
     first, second = [], []
     log_first = log_second = 0.0
     n = wins1 = wins2 = 0
     for one, other in pairs:
-        # Who is bet on has the prior Beta(2, 1), the other Beta(1, 2): before any trial the bet is already placed.
+        # The favoured arm has the prior Beta(2, 1), the other Beta(1, 2): so there is a bet before the first trial.
         log_first += _factor((1 + wins2) / (3 + n), (2 + wins1) / (3 + n), other, one)
         log_second += _factor((1 + wins1) / (3 + n), (2 + wins2) / (3 + n), one, other)
         first.append(log_first)
@@ -67,7 +67,7 @@ def success_evidence(pairs: Iterable[tuple[bool, bool]], alpha: float = ALPHA) -
 
 
 def _factor(p: float, q: float, worse: bool, better: bool) -> float:
-    """Gain of log e by the outcome of one pair, with the rates that were predicted before it."""
+    """Return the gain of log e from one pair, with the rates `p` and `q` that were predicted before it."""
     if p >= q:
         return 0.0
     m = (p + q) / 2
@@ -79,7 +79,7 @@ def _log(rate: float, success: bool) -> float:
 
 
 def score_evidence(pairs: Iterable[tuple[float, float]], alpha: float = ALPHA) -> Evidence:
-    """Of pairs (score of the first, score of the second), each 0 to 1, in the order in which they were run."""
+    """Return the evidence of pairs (score of the first, score of the second), each 0 to 1, in the order of running."""
     check_alpha(alpha)
     given = list(pairs)
     for one, other in given:
@@ -89,8 +89,9 @@ def score_evidence(pairs: Iterable[tuple[float, float]], alpha: float = ALPHA) -
 
 
 def _log_wealth(differences: Sequence[float]) -> list[float]:
-    """Log worth after each of `differences` (-1 to 1) of gamblers who bet that their mean is above 0, each a stake of
-    its own, with equal shares of the money: which stake is good need not be guessed from what came before.
+    """Return the log wealth after each of `differences` (-1 to 1) of gamblers who bet that their mean is above 0.
+
+    The money is divided equally among gamblers with different stakes, so that a good stake need not be guessed.
     """
     worths, path = [0.0] * len(BET_FRACTIONS), []
     for d in differences:
@@ -118,5 +119,5 @@ def _anytime(path: Sequence[float]) -> list[float]:
 
 
 def pair_by_order(first: Sequence[bool], second: Sequence[bool]) -> list[tuple[bool, bool]]:
-    """The k-th trial of one arm beside the k-th of the other; those one arm is ahead by wait for the other."""
+    """Pair the k-th trials of both arms; surplus trials of one arm are not used until the other arm has caught up."""
     return list(zip(first, second, strict=False))

@@ -1,9 +1,9 @@
-"""Evaluations in simulation beside real ones of the same checkpoints.
+"""Comparison of simulated and real evaluations of the same checkpoints.
 
-Whether simulation orders them as the robot does: Spearman's rank correlation (1904), and the mean maximum rank
-violation of SIMPLER (Li et al. 2024), the real difference that is lost where simulation orders two the other way round.
-What many simulated trials add to a few real ones: prediction-powered inference (Angelopoulos et al. 2023) with the
-weight of simulation that makes the interval narrowest (PPI++, 2023); where both have nothing in common it is 0.
+Agreement of the rankings: Spearman's rank correlation (1904), and the mean maximum rank violation of SIMPLER (Li et
+al. 2024), the real difference that is lost if simulation reverses the order of two checkpoints. Gain from many
+simulated trials added to a few real ones: prediction-powered inference (Angelopoulos et al. 2023) with the weight of
+simulation that makes the interval narrowest (PPI++, 2023); the weight is 0 if the two are unrelated.
 """
 
 from __future__ import annotations
@@ -17,22 +17,24 @@ from evaweb.statistics.base import LEVEL, Interval, StatisticsError, check_level
 from evaweb.statistics.difference import Difference
 
 Pair = tuple[float, float]  # real and simulated outcome of the same checkpoint under the same condition
-_FEWEST = 8  # pairs of an arm, for an interval that stands on the normal approximation
-_FEWEST_OF_EACH = (
-    5  # and of real successes, and of failures: of rates near 0 and 1 it would be far too narrow
-)
+_FEWEST = 8  # fewest pairs per arm for an interval by the normal approximation
+_FEWEST_OF_EACH = 5  # fewest real successes and failures: near 0 and 1 the interval would be far too narrow
 
 
 @dataclass(frozen=True, slots=True)
 class Powered:
-    """Real outcomes of one arm (0 to 1), each `paired` with a simulated one, and simulated ones `beside` them."""
+    """Real outcomes of one arm (0 to 1), each `paired` with a simulated outcome, and further simulated outcomes
+    (`beside`).
+    """
 
     paired: Sequence[Pair]
     beside: Sequence[float]
 
 
 def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float | None:
-    """Spearman's, ties sharing their ranks; None of fewer than two, or where one side is all the same."""
+    """Return Spearman's rank correlation with averaged ties; None for fewer than two values or if one side is
+    constant.
+    """
     _check(simulated, real)
     ours, theirs = _ranks(simulated), _ranks(real)
     if len(ours) < 2:
@@ -42,7 +44,9 @@ def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float
 
 
 def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
-    """Mean over checkpoints of the largest real difference to another one that simulation orders the other way."""
+    """Return the mean over checkpoints of the largest real difference to a checkpoint that simulation orders
+    differently.
+    """
     _check(simulated, real)
     numbers = range(len(real))
     worst = [
@@ -60,8 +64,9 @@ def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
 
 
 def powered_difference(first: Powered, second: Powered, level: float = LEVEL) -> Difference | None:
-    """The first arm's real rate less the second's, with what simulation says of both; None of fewer than eight pairs
-    of either, or of fewer than five real successes or failures.
+    """Return the first arm's real rate minus the second's, estimated with the help of simulation.
+
+    None if an arm has fewer than eight pairs, or fewer than five real successes or failures.
     """
     check_level(level)
     for arm in (first, second):
@@ -75,7 +80,7 @@ def powered_difference(first: Powered, second: Powered, level: float = LEVEL) ->
 
 
 def _powered(arm: Powered) -> tuple[float, float]:
-    """Mean, and its variance."""
+    """Return the estimated mean and its variance."""
     real, matched = ([pair[side] for pair in arm.paired] for side in (0, 1))
     n, beside = len(real), list(arm.beside)
     if len(beside) < 2:
@@ -93,7 +98,7 @@ def _powered(arm: Powered) -> tuple[float, float]:
 
 
 def _covariance(one: Sequence[float], other: Sequence[float]) -> float:
-    """Sum of products of what both are off their means."""
+    """Return the sum of products of both deviations from their means."""
     mean, of_other = math.fsum(one) / len(one), math.fsum(other) / len(other)
     return math.fsum((a - mean) * (b - of_other) for a, b in zip(one, other, strict=True))
 

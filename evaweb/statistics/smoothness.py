@@ -6,16 +6,18 @@ from collections.abc import Sequence
 
 from evaweb.statistics.base import StatisticsError
 
-CUT_OFF = 10.0  # [Hz] beyond it is no movement
-_AMPLITUDE = 0.05  # of the largest: what is below, at the end, is noise
-_PADDING = 4  # the spectrum is taken at 2^4 times the next power of two samples
+CUT_OFF = 10.0  # [Hz] higher frequencies are not movement
+_AMPLITUDE = 0.05  # share of the largest amplitude; lower ones at either end are noise
+_PADDING = 4  # exponent: the spectrum has 2^4 times the next power of two samples
 
 
 def sparc(speed: Sequence[float], rate: float) -> float:
-    """Of a profile of `speed` at `rate` [Hz]; at most 0 in practice, and the nearer to 0 the smoother.
+    """Return SPARC of a `speed` profile sampled at `rate` [Hz]; in practice at most 0, closer to 0 is smoother.
 
-    Independent of how large and how long the movement is. Raises StatisticsError for less than two samples, and where
-    nothing moved.
+    It does not depend on amplitude and duration of the movement.
+
+    Raises:
+        StatisticsError: If there are fewer than two samples, one is not finite, or nothing moved.
     """
     import numpy as np
 

@@ -1,10 +1,11 @@
-"""How much two arms differ, where a design may stop early: an estimate that is as often too large as too small.
+"""Median-unbiased estimate of the difference of two arms for a design that may stop early.
 
-A design that stops where the difference is large overestimates it. Outcomes are ordered by the stage at which they come
-(Armitage 1957; Tsiatis, Rosner and Mehta 1984): a stop for the first arm says more for it the earlier it comes, one for
-the second the later; at the end, and of tables at one look, the larger difference says more. The estimate is the
-difference of rates under which what was observed lies in the middle of that order; the interval's ends are those under
-which no more than half of what is left lies as far out. The other rate is the likeliest one for each difference.
+A design that stops when the difference is large overestimates it. Outcomes are therefore ordered by the stage at which
+they occur (Armitage 1957; Tsiatis, Rosner and Mehta 1984): an early stop for the first arm ranks highest, an early
+stop for the second lowest; at the end, and among tables of one look, the larger difference ranks higher. The estimate
+is the difference of rates under which the observed outcome is the median of that order; at the interval's ends the
+probability of an outcome at least as far out is (1 - level) / 2. For each difference the other rate is the most likely
+one.
 """
 
 from __future__ import annotations
@@ -24,15 +25,24 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-_EDGE = 1e-9  # of rates and of differences, nearer to whose ends none is taken
+_EDGE = 1e-9  # distance of rates and differences from the ends of their range
 _HALVED = 60
 
 
 @lru_cache(maxsize=256)
 def stagewise(found: Boundary, first: int, n: int, second: int, m: int, level: float = LEVEL) -> Difference:
-    """The first arm's rate less the second's, where a design without a margin ended with these successes of trials.
+    """Return the first arm's rate minus the second's for a design without margin that ended with these successes.
 
-    StatisticsError where it did not end there.
+    Args:
+        found: Boundary of the design.
+        first: Successes of the first arm, in `n` trials.
+        n: Trials of the first arm.
+        second: Successes of the second arm, in `m` trials.
+        m: Trials of the second arm.
+        level: Confidence level of the interval.
+
+    Raises:
+        StatisticsError: If the design did not end there.
     """
     look = next((i for i, at in enumerate(found.looks) if (at.first, at.second) == (n, m)), None)
     if found.margin is not None or look is None:
@@ -43,7 +53,9 @@ def stagewise(found: Boundary, first: int, n: int, second: int, m: int, level: f
     tail = (1 - level) / 2
 
     def at(wanted: float, more: Callable[[float, float], float]) -> float:
-        """The difference under which `more`, of the probabilities of more and of the same, is just what is wanted."""
+        """Return the difference at which `more`, applied to the probabilities of higher and equal ranks, equals
+        `wanted`.
+        """
         low, high = -1.0 + _EDGE, 1.0 - _EDGE
         for _ in range(_HALVED):
             middle = (low + high) / 2
@@ -61,10 +73,9 @@ def stagewise(found: Boundary, first: int, n: int, second: int, m: int, level: f
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Tables that say more (or, `mirrored`, less) for the first arm than what was observed, and those that say as much.
+    """Tables that rank higher than the observed one (lower if `mirrored`), and tables of the same rank.
 
-    Each has successes and failures of both arms, and the logarithm of its probability at rates of a half: float64
-    [tables, 5].
+    Each row holds successes and failures of both arms, and the log probability at rates of 0.5: float64 [tables, 5].
     """
 
     beyond: NDArray[np.float64]
@@ -72,7 +83,7 @@ class _Order:
     mirrored: bool
 
     def probabilities(self, p_first: float, p_second: float) -> tuple[float, float]:
-        """Of what says more for the first arm, and of what says the same, at these rates."""
+        """Return the probabilities of outcomes with a higher and with the same rank at these rates."""
         beyond, same = (_mass(tables, p_first, p_second) for tables in (self.beyond, self.same))
         return (1 - beyond - same if self.mirrored else beyond), same
 
@@ -97,7 +108,9 @@ def _ordered(found: Boundary, look: int, first: int, second: int) -> _Order:
         observed = first * at.second - second * at.first
         among = stops if winner else ~region
         ahead = among & ((lead < observed) if mirrored else (lead > observed))
-        if winner is None:  # whatever stops for the first at the end says more than what does not stop
+        if (
+            winner is None
+        ):  # at the last look, every stop for the first arm ranks above the tables that do not stop
             ahead |= stops
         beyond.append(_tables(np.where(ahead, alive, 0.0)))
         return _Order(
@@ -122,7 +135,7 @@ def _mass(tables: NDArray[np.float64], p_first: float, p_second: float) -> float
 
 
 def _likeliest(difference: float, first: int, n: int, second: int, m: int) -> tuple[float, float]:
-    """The rates with this difference under which the successes are likeliest: where the likelihood's slope is 0."""
+    """Return the rates with this difference that maximise the likelihood (root of its slope)."""
     low, high = max(0.0, -difference) + _EDGE / 4, min(1.0, 1.0 - difference) - _EDGE / 4
     for _ in range(_HALVED):
         q = (low + high) / 2

@@ -1,4 +1,4 @@
-"""Two arms compared over strata, so that an easy scene tried more often by one arm decides nothing.
+"""Comparison of two arms over strata, so that a different share of easy scenes in one arm has no influence.
 
 Formulae: Cochran (1954), Mantel and Haenszel (1959) without continuity correction; exact tests conditional on the
 margins of each stratum, of a common odds ratio of 1 (Gart 1970) and of equal odds ratios (Zelen 1971).
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from evaweb.statistics.base import StatisticsError, check_counts
 
-_MOST = 20_000  # ways to fill the tables that are looked at one by one
+_MOST = 20_000  # greatest number of combinations of tables to enumerate
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +30,12 @@ class StratumTable:
 
     @property
     def tells(self) -> bool:
-        """False where its margins leave one table only."""
+        """Whether the stratum is informative: its margins allow more than one table."""
         return self.n1 > 0 and self.n2 > 0 and 0 < self.x1 + self.x2 < self.n1 + self.n2
 
     @property
     def ways(self) -> dict[int, int]:
-        """In how many ways each number of the first's successes can come about with these margins."""
+        """Number of combinations for each number of the first arm's successes that these margins allow."""
         successes = self.x1 + self.x2
         lowest, highest = max(0, successes - self.n2), min(self.n1, successes)
         return {
@@ -45,11 +45,12 @@ class StratumTable:
 
 @dataclass(frozen=True, slots=True)
 class Stratified:
-    """The comparison over scenes.
+    """Comparison over scenes.
 
-    `odds_ratio` is Mantel and Haenszel's (None where it has no bound, or no scene tells), `p` of their test, `crude`
-    the difference of the pooled rates, `stratified` that of the scenes' rates, weighted by what each scene tells.
-    `reversed` where both have opposite signs: Simpson's paradox, the pooled rates must not be quoted.
+    `odds_ratio` is that of Mantel and Haenszel (None if unbounded, or if no scene is informative) and `p` the
+    probability of their test. `crude` is the difference of the pooled rates, `stratified` the weighted mean of the
+    scenes' differences. `reversed` is True if both have opposite signs (Simpson's paradox): the pooled rates must not
+    be quoted then.
     """
 
     odds_ratio: float | None
@@ -60,7 +61,7 @@ class Stratified:
 
 
 def mantel_haenszel(tables: Sequence[StratumTable]) -> Stratified:
-    """Both arms over the scenes in which both were tried."""
+    """Return the comparison of both arms over the scenes in which both were tried."""
     if not tables:
         raise StatisticsError("no scene in which both arms were tried")
     surplus = variance = above = below = weighted = weights = 0.0
@@ -84,15 +85,16 @@ def mantel_haenszel(tables: Sequence[StratumTable]) -> Stratified:
         t.n2 for t in tables
     )
     stratified = weighted / weights
-    # Beyond rounding: equal rates that differ in the last bit are no paradox.
+    # Equal rates that differ in the last bit only are not a paradox.
     return Stratified(
         ratio, p, crude, stratified, crude * stratified < 0 and min(abs(crude), abs(stratified)) > 1e-12
     )
 
 
 def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None:
-    """Two-sided probability, within strata, of the first's successes or any as improbable, were both arms equal in
-    each; None where fewer than `least` strata tell anything.
+    """Return the two-sided exact probability, within strata, of a total at least as improbable if both arms are equal.
+
+    None if fewer than `least` strata are informative.
     """
     telling = [table for table in tables if table.tells]
     if len(telling) < least:
@@ -109,8 +111,9 @@ def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None
 
 
 def interaction(tables: Sequence[StratumTable]) -> float | None:
-    """Probability of these tables or any as improbable, were the odds ratio the same in all strata; None where fewer
-    than two tell anything, or there are too many ways to count.
+    """Return the exact probability of tables at least as improbable if the odds ratio is the same in all strata.
+
+    None if fewer than two strata are informative, or the combinations are too many to enumerate.
     """
     telling = sorted((table for table in tables if table.tells), key=lambda table: len(table.ways))
     if len(telling) < 2 or math.prod(len(table.ways) for table in telling[:-1]) > _MOST:
@@ -124,7 +127,7 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
 
 
 def _fillings(tables: Sequence[dict[int, int]], left: int) -> Iterator[int]:
-    """The ways of each filling whose successes of the first add up to `left`."""
+    """Yield the number of combinations of each filling in which the first arm's successes add up to `left`."""
     first, *rest = tables
     if not rest:
         if left in first:

@@ -1,8 +1,8 @@
-"""Time to success within a horizon: the share that has succeeded by each time, and the mean with failures in it.
+"""Time to success within a horizon: cumulative share of successes, and restricted mean that includes failures.
 
-A trial that failed never succeeds: had it been given longer, it would have been another trial. Nothing is cut off
-before the horizon, so that shares are counts of all trials, and the mean is that of the times themselves (the
-restricted mean of Royston and Parmar 2013, without anything to estimate).
+A failed trial counts as never successful; with a longer time limit it would have been a different trial. Nothing is
+censored before the horizon, so shares are counts over all trials, and the mean is computed from the times themselves
+(the restricted mean of Royston and Parmar 2013, without an estimated survival curve).
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from evaweb.statistics.base import LEVEL, Interval, StatisticsError
 from evaweb.statistics.bounded import bounded_mean
 from evaweb.statistics.proportions import wilson
 
-Times = Sequence[float | None]  # when each trial succeeded [s]; None: it did not
+Times = Sequence[float | None]  # time to success of each trial [s]; None: it failed
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Share that has succeeded: from `times[i]` [s] on it is `share[i]`, with its pointwise Wilson interval.
+    """Share of successes by time: from `times[i]` [s] on it is `share[i]`, with its pointwise Wilson interval.
 
-    Before the first time it is 0; the last one is at or before `until` [s], up to which all `n` trials are known.
+    It is 0 before the first time. The last time is at most `until` [s], the horizon of all `n` trials.
     """
 
     times: tuple[float, ...]
@@ -35,13 +35,13 @@ class Curve:
 
     @property
     def median(self) -> float | None:
-        """When half have succeeded [s]; None where that was never reached."""
+        """Time at which half of the trials have succeeded [s]; None if that share is not reached."""
         return next((t for t, s in zip(self.times, self.share, strict=True) if s >= 0.5), None)
 
 
 @dataclass(frozen=True, slots=True)
 class RestrictedMean:
-    """Mean time to success [s], where a trial that has not succeeded by `until` [s] counts for so much."""
+    """Mean time to success [s]; a trial without success by `until` [s] counts as `until`."""
 
     value: float
     interval: Interval
@@ -49,7 +49,7 @@ class RestrictedMean:
 
 
 def cumulative_incidence(times: Times, until: float, level: float = LEVEL) -> Curve:
-    """The curve of trials that succeeded at `times` [s], up to `until` [s]."""
+    """Return the curve of trials with these `times` to success [s], up to `until` [s]."""
     known = [t for t in censor_at_horizon(times, until) if t is not None]
     n, steps = len(times), sorted(set(known))
     counts = [sum(t <= step for t in known) for step in steps]
@@ -66,14 +66,18 @@ def cumulative_incidence(times: Times, until: float, level: float = LEVEL) -> Cu
 
 
 def restricted_mean(times: Times, until: float, *, seed: int, level: float = LEVEL) -> RestrictedMean:
-    """The mean of `times` [s] up to `until` [s]."""
+    """Return the restricted mean of `times` [s] up to `until` [s]."""
     lasted = {"all": [until if t is None else t for t in censor_at_horizon(times, until)]}
     found = bounded_mean(lasted, seed=seed, bounds=(0.0, until), level=level)
     return RestrictedMean(found.value, found.interval, until)
 
 
 def censor_at_horizon(times: Times, until: float) -> list[float | None]:
-    """`times` [s] with None for each beyond `until` [s]; StatisticsError for what can be no time, or none at all."""
+    """Return `times` [s] with None for each beyond `until` [s].
+
+    Raises:
+        StatisticsError: If there is no trial, a time is negative or not finite, or `until` is not above 0.
+    """
     if not (math.isfinite(until) and until > 0):
         raise StatisticsError(f"until = {until} s; allowed: above 0")
     if not times:

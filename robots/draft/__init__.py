@@ -1,4 +1,4 @@
-"""Drafts a robot folder from a URDF: `python -m robots new`."""
+"""Drafting of a robot folder from a URDF: `python -m robots new`."""
 
 from robots.draft.drafting import DraftResult, draft_robot
 

@@ -1,4 +1,4 @@
-"""Which groups a URDF suggests, by names and by the shape of the tree: arms, hands, torso, head, base."""
+"""Groups that a URDF suggests, by names and structure of the tree: arms, hands, torso, head, base."""
 
 from __future__ import annotations
 
@@ -17,28 +17,36 @@ _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _FINGERS = ("finger", "grip", "jaw", "claw", "knuckle", "thumb")
 _WHEELS = ("wheel", "caster", "steer", "chassis")
 _ARM = {"arm", "forearm", "upperarm", "shoulder", "elbow", "wrist", "hand"}
-_WORDS: tuple[tuple[Kind, set[str]], ...] = (  # what is told first counts
+_WORDS: tuple[tuple[Kind, set[str]], ...] = (  # ordered by precedence
     ("arm", _ARM),
     ("head", {"head", "neck"}),
     ("torso", {"torso", "waist", "body", "trunk", "spine", "chest", "lift", "column", "elevator"}),
     ("base", {"base", "platform", "rail", "gantry"}),
     ("other", {"leg", "hip", "knee", "ankle", "foot", "tail"}),
 )
-_TURNS = {"roll", "pitch", "yaw", "rotate", "rotation", "wrist"}  # what a finger's joint is not called
+_TURNS = {
+    "roll",
+    "pitch",
+    "yaw",
+    "rotate",
+    "rotation",
+    "wrist",
+}  # words that a finger's joint does not contain
 _SIDES = {"left": {"left", "l", "lh"}, "right": {"right", "r", "rh"}}
 _ORDER: tuple[Kind, ...] = ("arm", "hand", "torso", "head", "base", "other")
-_FORK = 3  # joints in a row behind which two that end there are fingers
-_ARM_LENGTH = 4  # joints in a row that make an arm of what has no telling name
-_BEYOND_LIFT, _BEYOND_TURN = 4, 6  # joints that an arm has to have beyond a torso in one row with it
-_SIDEWAYS = 0.01  # m off the middle from which an arm is on a side
+_FORK = 3  # joints in a row after which two ending joints are fingers
+_ARM_LENGTH = 4  # joints in a row that make an arm without a telling name
+_BEYOND_LIFT, _BEYOND_TURN = 4, 6  # joints that an arm needs beyond a torso in the same row
+_SIDEWAYS = 0.01  # [m] distance from the middle from which an arm is on a side
 
 
 @dataclass(frozen=True, slots=True)
 class GroupGuess:
-    """A group: `joints` of the URDF outwards, `fingers` of its gripper; `above` is the link that it begins on.
+    """Suggested group: `joints` of the URDF outwards, `fingers` of its gripper, and the link `above` on which it
+    begins.
 
-    `side` is "left", "right" or "". `wheels` are joints that roll and that nobody commands one by one: a base that
-    has them is commanded in speeds.
+    `side` is "left", "right" or "". `wheels` are joints that roll and are not commanded individually: a base with
+    wheels is commanded by speeds.
     """
 
     name: str
@@ -51,7 +59,11 @@ class GroupGuess:
 
 
 def guess_groups(tree: Urdf) -> tuple[GroupGuess, ...]:
-    """The groups that the tree suggests, arms first; RobotError where nothing moves."""
+    """Return the groups that the tree suggests, arms first.
+
+    Raises:
+        RobotError: If nothing moves.
+    """
     moving = [joint for joint in tree.outwards() if joint.kind != "fixed" and joint.mimic is None]
     if not moving:
         raise RobotError(f"{tree.path}: no joint moves by itself; needed: at least one")
@@ -68,7 +80,7 @@ def guess_groups(tree: Urdf) -> tuple[GroupGuess, ...]:
 
 
 class _Skeleton:
-    """The joints that move by themselves, and which hangs on which."""
+    """Joints that move by themselves, and their tree."""
 
     def __init__(self, tree: Urdf, moving: Sequence[Joint]) -> None:
         self.tree = tree
@@ -80,20 +92,20 @@ class _Skeleton:
         }
 
     def children(self, name: str | None, without: Iterable[str] = ()) -> list[str]:
-        """The joints right behind one; behind None those on the root."""
+        """Return the joints directly after `name`, without `without`; None for those on the root."""
         return [child for child in self.names if self.parent[child] == name and child not in without]
 
     def descendants(self, name: str) -> set[str]:
-        """All joints that one of them above is `name`."""
+        """Return all joints after `name`."""
         below = self.children(name)
         return set(below).union(*(self.descendants(child) for child in below))
 
     def depth(self, name: str | None) -> int:
-        """Count of joints from the root to this one."""
+        """Return the number of joints from the root to this one."""
         return 0 if name is None else 1 + self.depth(self.parent[name])
 
     def fingers(self, wheels: set[str]) -> dict[str, str | None]:
-        """The joints of fingers, each with the joint that carries its hand (None: the root does)."""
+        """Return the joints of fingers, each with the joint that carries its hand (None: the root)."""
         found: set[str] = set()
         for name in reversed(self.names):  # from the tips inwards
             if name not in wheels and found.issuperset(self.children(name)) and self._is_finger(name):
@@ -108,10 +120,10 @@ class _Skeleton:
         return carriers
 
     def runs(self, without: set[str]) -> list[tuple[tuple[str, ...], bool]]:
-        """Joints in a row without a branch, outwards, each with whether it ends there."""
+        """Return the unbranched rows of joints, outwards, each with whether the tree ends there."""
         found: list[tuple[tuple[str, ...], bool]] = []
         starts = self.children(None, without)
-        for start in starts:  # grows while it is walked
+        for start in starts:  # the list grows during the loop
             run = [start]
             while len(behind := self.children(run[-1], without)) == 1:
                 run += behind
@@ -149,7 +161,9 @@ class _Skeleton:
 def _limbs(
     skeleton: _Skeleton, run: tuple[tuple[str, ...], bool], fingers: dict[str, str | None], *, alone: bool
 ) -> list[GroupGuess]:
-    """Limbs of a run of joints; a torso or base leading to an arm without a branch is a limb of its own."""
+    """Return the limbs of a row of joints; a torso or base that leads to an arm without branching is a
+    separate limb.
+    """
     joints, ends = run
     own = tuple(name for name, carrier in fingers.items() if carrier == joints[-1])
     cut = _trunk(skeleton.tree, joints) if ends else len(joints)
@@ -167,7 +181,7 @@ def _limbs(
 
 
 def _trunk(tree: Urdf, joints: tuple[str, ...]) -> int:
-    """Count of joints of a torso or a base at the beginning of a row that ends in an arm."""
+    """Return the number of joints of a torso or base at the beginning of a row that ends in an arm."""
     cut = next((i for i, name in enumerate(joints) if _kind_of(name) not in ("torso", "base")), 0)
     slides = any(tree.joint(name).kind == "prismatic" for name in joints[:cut])
     return cut if len(joints) - cut >= (_BEYOND_LIFT if slides else _BEYOND_TURN) else 0
@@ -182,7 +196,7 @@ def _limb(skeleton: _Skeleton, kind: Kind, joints: tuple[str, ...]) -> GroupGues
 
 
 def _base(tree: Urdf) -> str:
-    """The link that everything stands on: the root, or what is fixed to a root that is only the world."""
+    """Return the base link: the root, or the link fixed to a root that only represents the world."""
     behind = [joint for joint in tree.joints.values() if joint.parent == tree.root]
     if tree.root in ("world", "map", "odom", "ground") and len(behind) == 1 and behind[0].kind == "fixed":
         return behind[0].child
@@ -190,14 +204,14 @@ def _base(tree: Urdf) -> str:
 
 
 def _one_gripper(skeleton: _Skeleton, fingers: Sequence[str]) -> bool:
-    """True if the fingers open and close by one number; more of them, or jointed ones, are a hand."""
+    """Return True if the fingers open and close by one number; more or jointed fingers are a hand."""
     return 0 < len(fingers) <= _FORK and not any(skeleton.parent[name] in fingers for name in fingers)
 
 
 def _loose(
     skeleton: _Skeleton, limbs: Sequence[GroupGuess], fingers: dict[str, str | None]
 ) -> list[GroupGuess]:
-    """Hands: fingers that are no arm's gripper, by what carries them."""
+    """Return the hands: fingers that are not an arm's gripper, by what carries them."""
     taken = {name for limb in limbs for name in limb.fingers}
     hands: dict[str | None, list[str]] = {}
     for name, carrier in fingers.items():
@@ -207,7 +221,7 @@ def _loose(
 
 
 def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
-    """One torso and one base, however often they branch."""
+    """Return the limbs with torso parts merged to one torso, and base parts to one base."""
     found: list[GroupGuess] = []
     for limb in limbs:
         same = next(
@@ -222,7 +236,7 @@ def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
 
 
 def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
-    """Two arms whose names tell no side are left and right where they begin on different sides (y is left)."""
+    """Return the limbs with two unnamed arms assigned to left and right by where they begin (y is left)."""
     arms = [limb for limb in limbs if limb.kind == "arm"]
     if len(arms) != 2 or any(arm.side for arm in arms):
         return list(limbs)
@@ -235,7 +249,7 @@ def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
 
 
 def _named(limbs: Sequence[GroupGuess]) -> tuple[GroupGuess, ...]:
-    """With names that each occur once: left_arm, torso, other2; arms first, left before right."""
+    """Return the limbs with unique names: left_arm, torso, other2; arms first, left before right."""
     ordered = sorted(limbs, key=lambda limb: (_ORDER.index(limb.kind), limb.side != "left", limb.side == ""))
     plain = ["_".join(filter(None, (limb.side, limb.kind))) for limb in ordered]
     names = []
@@ -258,14 +272,14 @@ def _kind_of(name: str) -> Kind | None:
 
 
 def _kind(joints: Sequence[str]) -> Kind | None:
-    """Kind that at least half of the names say."""
+    """Return the kind that at least half of the names indicate."""
     kinds = [_kind_of(name) for name in joints]
     likely = max(dict.fromkeys(kinds), key=kinds.count)
     return likely if 2 * kinds.count(likely) >= len(kinds) else None
 
 
 def _side(tree: Urdf, joints: Sequence[str]) -> str:
-    """The side that the names of most joints, or else of the links behind them, tell."""
+    """Return the side that the names of most joints, or else of their child links, indicate."""
     for names in (joints, [tree.joint(name).child for name in joints]):
         told = np.array([[bool(_words(name) & words) for words in _SIDES.values()] for name in names]).sum(
             axis=0

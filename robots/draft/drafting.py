@@ -1,4 +1,4 @@
-"""Makes a robot's folder of a URDF: robot.toml, the URDF, its meshes, a README; loads it before it is left there."""
+"""Drafting of a robot's folder: robot.toml, URDF, meshes and README, loaded as a test before it is moved into place."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from robots.robot import Robot
 from robots.rotations import Float64
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
-_MOST = 8  # copies of one arm
+_MOST = 8  # greatest number of copies of one arm
 
 
 @dataclass(frozen=True, slots=True)
 class DraftResult:
-    """A robot's new `folder`, what was made of its shapes, and what a look at it says."""
+    """New `folder` of a robot, what happened to its shapes, and the findings of its inspection."""
 
     folder: Path
     pictures: MeshCopyReport
@@ -33,9 +33,16 @@ class DraftResult:
 
 
 def draft_robot(name: str, source: Path, into: Path, copies: int = 1) -> DraftResult:
-    """Drafts the robot `name` from the URDF `source` in a new folder of `into`; RobotError leaves nothing behind.
+    """Draft the robot `name` from the URDF `source` in a new folder of `into`.
 
-    `copies` is how many of the one arm that the URDF describes stand side by side.
+    Args:
+        name: Name of the robot.
+        source: URDF file.
+        into: Folder of robots.
+        copies: Number of copies of the single arm in the URDF, side by side.
+
+    Raises:
+        RobotError: If it fails; nothing is left behind.
     """
     folder = _free(name, into)
     if not 1 <= copies <= _MOST:
@@ -52,7 +59,7 @@ def draft_robot(name: str, source: Path, into: Path, copies: int = 1) -> DraftRe
             guessed = build_draft(tree, shown, pictures.drawn, title, copies)
             (made / "README.md").write_text(render_readme(name, guessed, pictures), "utf-8")
             _write(made, guessed)
-        except RobotError as error:  # which names files that are gone when it is read
+        except RobotError as error:  # messages name temporary files that no longer exist when they are read
             said = str(error).replace(str(shown), str(source)).replace(str(made), str(folder))
             raise RobotError(said) from None
         made.rename(folder)
@@ -73,7 +80,7 @@ def _free(name: str, into: Path) -> Path:
 
 
 def _write(folder: Path, guessed: RobotDraft) -> None:
-    """robot.toml, first with every group at rest, then with postures in which nothing touches."""
+    """Write robot.toml, first with every group at rest, then with postures in which nothing touches."""
     file = folder / "robot.toml"
     home = {group.name: group.rest for group in guessed.groups}
     file.write_text(render_robot_toml(guessed, {"home": home}, ()), "utf-8")

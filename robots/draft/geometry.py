@@ -1,4 +1,4 @@
-"""Places of a URDF's links and reach of their shapes, before there is a robot."""
+"""Poses of a URDF's links and extents of their shapes, before there is a robot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from robots.urdf import Urdf
 
 
 def places(tree: Urdf, values: Mapping[str, float]) -> dict[str, Float64]:
-    """Root <- link [4, 4] by link, for values of joints that move by themselves [rad or m]; 0 where none is given."""
+    """Return root <- link [4, 4] by link, for values of independent joints [rad or m]; missing ones are 0."""
     found = {tree.root: np.eye(4)}
     for joint in tree.outwards():
         here = joint.origin
@@ -26,7 +26,7 @@ def places(tree: Urdf, values: Mapping[str, float]) -> dict[str, Float64]:
 
 
 def corners(shapes: Iterable[Shape]) -> dict[str, Float64]:
-    """The corners [n, 3] of the boxes about a link's shapes, in the link, by link."""
+    """Return the corners [n, 3] of the bounding boxes of each link's shapes, in the link."""
     found: dict[str, list[Float64]] = {}
     for shape in shapes:
         ends = np.array(shape.bounds())  # [2, 3]

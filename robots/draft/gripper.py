@@ -1,4 +1,4 @@
-"""A gripper in a URDF: its number, its open end, the distance of its fingers, the places of their tips."""
+"""Gripper in a URDF: its number, open end, distance of the fingers, and frame of their tips."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from robots.draft.limits import FASTEST
 from robots.rotations import Float64, quaternion_of_matrix
 from robots.urdf import Joint, Urdf
 
-_SLIDE, _TURN = 0.04, 1.0  # m and rad: the way of a finger of which the URDF says none
-_SECONDS = 0.5  # for the whole way, where the URDF gives no speed
-_PAD = 0.01  # m from the end of a finger's shapes to what it holds
+_SLIDE, _TURN = 0.04, 1.0  # [m], [rad] travel of a finger for which the URDF gives none
+_SECONDS = 0.5  # [s] for the whole travel if the URDF gives no speed
+_PAD = 0.01  # [m] from the end of a finger's shapes to its contact
 _TINY = 1e-6
 _GRASPS = ("tcp", "grasp", "center", "centre", "eef", "ee_link")
 _PREFERRED = (*_GRASPS, "tool0", "ee", "tip", "flange", "hand")
@@ -24,10 +24,10 @@ _PREFERRED = (*_GRASPS, "tool0", "ee", "tip", "flange", "hand")
 
 @dataclass(frozen=True, slots=True)
 class GripperDraft:
-    """A gripper's number is the position of `driver`; `fingers` are values at `lower` and at `upper`.
+    """Suggested gripper: its number is the position of `driver`; `fingers` are values at `lower` and at `upper`.
 
-    `apart` is how far they part [m] from `close` to `open`, None where they do not; `tip` [7] lies in the end
-    effector. `doubts` are sentences about what is a placeholder.
+    `apart` is the distance by which they part [m] from `close` to `open`, None if they do not; `tip` [7] is in the end
+    effector. `placeholder_notes` are sentences about placeholders.
     """
 
     driver: str
@@ -44,7 +44,9 @@ class GripperDraft:
 
 
 def end_link(tree: Urdf, limb: GroupGuess) -> str:
-    """An arm's end effector: a leaf behind its last joint that is named so, else the link that fingers hang on."""
+    """Return an arm's end effector: a leaf after its last joint with a typical name, else the link that
+    carries the fingers.
+    """
     last = tree.joint(limb.joints[-1]).child
     if limb.fingers:
         return _hand(tree, limb, last)
@@ -54,16 +56,16 @@ def end_link(tree: Urdf, limb: GroupGuess) -> str:
 
 
 def _hand(tree: Urdf, limb: GroupGuess, last: str) -> str:
-    """A frame for grasping behind the last joint, else the link that the fingers hang on."""
+    """Return a frame for grasping after the last joint, else the link that carries the fingers."""
     rigid = _rigid(tree, last)
     named = (link for word in _GRASPS for link in rigid if word in link.lower())
     return next(named, tree.joint(limb.fingers[0]).parent)
 
 
 def _rigid(tree: Urdf, link: str) -> list[str]:
-    """The link and all that is fixed to it, outwards."""
+    """Return the link and all links fixed to it, outwards."""
     found = [link]
-    for here in found:  # grows while it is walked
+    for here in found:  # the list grows during the loop
         found += [
             joint.child for joint in tree.joints.values() if joint.parent == here and joint.kind == "fixed"
         ]
@@ -73,7 +75,7 @@ def _rigid(tree: Urdf, link: str) -> list[str]:
 def guess_gripper(
     tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]
 ) -> GripperDraft:
-    """The gripper of an arm with fingers; `corners` [n, 3] of the shapes of links that show what they are."""
+    """Return the gripper of an arm with fingers; `corners` [n, 3] are those of links with real shapes."""
     followed = {tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None}
     driver = tree.joint(
         max(limb.fingers, key=lambda name: (name in followed, tree.joint(name).kind == "prismatic"))
@@ -117,13 +119,13 @@ def _velocity(joint: Joint, way: float, doubts: list[str]) -> float:
 
 
 def _ways(tree: Urdf, limb: GroupGuess, driver: str) -> dict[str, tuple[float, float]]:
-    """The ends of the fingers that move by themselves beside the driver and that have ends."""
+    """Return the limits of the fingers that move independently of the driver and have limits."""
     joints = [tree.joint(name) for name in limb.fingers if name != driver]
     return {joint.name: _range(joint, []) for joint in joints if joint.kind != "continuous"}
 
 
 class _Jaws:
-    """The fingers' branches, with a point near the end of each, seen from the end effector."""
+    """Branches of the fingers, with a point near the end of each, in the end effector."""
 
     def __init__(self, tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]) -> None:
         self._tree = tree
@@ -148,7 +150,7 @@ class _Jaws:
     def closing_values(
         self, driver: str, ends: tuple[float, float], others: Mapping[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
-        """Every finger's values at the driver's ends: those with which they come together and part most."""
+        """Return every finger's values at the driver's limits, with the directions in which the fingers part most."""
         choices = [
             {driver: ends} | dict(zip(others, turned, strict=True))
             for turned in product(*((way, way[::-1]) for way in others.values()))
@@ -158,22 +160,26 @@ class _Jaws:
     def opening(
         self, fingers: Mapping[str, tuple[float, float]], lower: float, upper: float
     ) -> tuple[float | None, dict[str, float], float]:
-        """Distance that they part [m], the fingers' values when closed, and the driver's value when open."""
+        """Return the distance by which the fingers part [m], their values when closed, and the driver's value
+        when open.
+        """
         partings = self._partings(fingers)
         pair = self._pairs[int(np.argmax(partings))]
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
         if max(partings) < _TINY:
             return None, at_lower, upper
         gaps = [float(np.linalg.norm(self._between(pair, values))) for values in (at_lower, at_upper)]
-        if len(self._branches) == 1:  # against a jaw that stands still: open is where it goes
+        if len(self._branches) == 1:  # against a fixed jaw: it opens away from zero
             gaps = [abs(lower), abs(upper)]
         opened = round(max(partings), 4)
         return (opened, at_upper, lower) if gaps[0] > gaps[1] else (opened, at_lower, upper)
 
     def tip(self, closed: Mapping[str, float], *, named: bool) -> Float64:
-        """The frame [7] between the fingertips in the end effector: z the way they point, y the way they open.
+        """Return the frame [7] between the fingertips in the end effector: z pointing ahead, y in the opening
+        direction.
 
-        Its place is read off the fingers' shapes; where they have none, it is that of an end effector `named` so.
+        Its position comes from the fingers' shapes; without shapes, it is that of an end effector with a grasp-like
+        name.
         """
         at = self._in_eef(closed)
         points = [self._point(index, at) for index in range(len(self._ends))]
@@ -191,7 +197,7 @@ class _Jaws:
         return np.concatenate([middle, quaternion_of_matrix(frame)])
 
     def _pointing(self, at: Mapping[str, Float64]) -> Float64:
-        """The axis of the end effector along which the fingers reach away from the hand."""
+        """Return the axis of the end effector along which the fingers extend from the hand."""
         hand = at[self._hand][:3, 3]
         reaching = [
             max(
@@ -202,7 +208,7 @@ class _Jaws:
         return _along(np.mean(reaching, axis=0))
 
     def _end(self, branch: list[str], at: Mapping[str, Float64]) -> tuple[str, Float64]:
-        """The link of a branch that reaches farthest, and the middle of its far end in that link."""
+        """Return the link of a branch that extends farthest, and the centre of its far end in that link."""
         seen = {link: self._seen(link, at) for link in branch}
         link = max(branch, key=lambda name: float((seen[name] @ self._z).max()))
         along = seen[link] @ self._z
@@ -211,13 +217,13 @@ class _Jaws:
         return link, np.linalg.inv(at[link]) @ np.append(end, 1.0)
 
     def _partings(self, fingers: Mapping[str, tuple[float, float]]) -> list[float]:
-        """By how much [m] each pair of branches moves against each other from one end to the other."""
+        """Return the relative motion [m] of each pair of branches between the limits."""
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
         ways = [self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs]
         return [float(np.linalg.norm(way)) for way in ways]
 
     def _opens_along(self, closed: Mapping[str, float]) -> Float64:
-        """The direction in the end effector in which fingers begin to part."""
+        """Return the direction in the end effector in which the fingers begin to part."""
         step = {name: value + 1e-3 for name, value in closed.items()}
         ways = [self._between(pair, step) - self._between(pair, closed) for pair in self._pairs]
         return max(ways, key=lambda way: float(np.linalg.norm(way)))
@@ -237,7 +243,7 @@ class _Jaws:
         return {link: back @ place for link, place in at.items()}
 
     def _seen(self, link: str, at: Mapping[str, Float64]) -> Float64:
-        """The corners [n, 3] of a link's shapes, or else its origin, in the end effector."""
+        """Return the corners [n, 3] of a link's shapes in the end effector, or its origin if it has none."""
         shapes = self._corners.get(link, np.zeros((1, 3)))
         return np.asarray(shapes @ at[link][:3, :3].T + at[link][:3, 3])
 
@@ -246,21 +252,21 @@ class _Jaws:
         return np.asarray((seen.min(axis=0) + seen.max(axis=0)) / 2)
 
     def _reach(self, at: Mapping[str, Float64]) -> float | None:
-        """Reach of the fingers' shapes along z."""
+        """Return the extent of the fingers' shapes along z, None without shapes."""
         shown = [link for branch in self._branches for link in branch if link in self._corners]
         return max((float((self._seen(link, at) @ self._z).max()) for link in shown), default=None)
 
 
 def _behind(tree: Urdf, link: str) -> list[str]:
-    """The link and all that hangs on it, outwards."""
+    """Return the link and all its descendants, outwards."""
     found = [link]
-    for here in found:  # grows while it is walked
+    for here in found:  # the list grows during the loop
         found += [joint.child for joint in tree.joints.values() if joint.parent == here]
     return found
 
 
 def _along(direction: Float64) -> Float64:
-    """The axis, to either side, that the direction goes along most; z where it is none."""
+    """Return the signed axis that is closest to the direction; z for a zero vector."""
     axis = np.zeros(3)
     index = int(np.abs(direction).argmax()) if np.abs(direction).max() > _TINY else 2
     axis[index] = -1.0 if direction[index] < 0 else 1.0

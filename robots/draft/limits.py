@@ -1,4 +1,4 @@
-"""Limits that a URDF does not give, or gives as nobody means them: placeholders that say so."""
+"""Placeholders for limits that a URDF lacks, or gives with unrealistic values."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 from robots.urdf import Joint
 
-_TURN, _SLIDE = 3.1416, 0.5  # rad to both sides, m
-_SPEED, _SLIDING = 1.0, 0.1  # rad/s, m/s
-_WIDEST = 4 * math.pi + 0.01  # rad: arms' joints turn twice round at most
-FASTEST = 10.0  # rad/s, m/s
+_TURN, _SLIDE = 3.1416, 0.5  # [rad] to both sides, [m]
+_SPEED, _SLIDING = 1.0, 0.1  # [rad/s], [m/s]
+_WIDEST = 4 * math.pi + 0.01  # [rad] arm joints have at most two turns
+FASTEST = 10.0  # [rad/s], [m/s]
 
 
 @dataclass(frozen=True, slots=True)
 class Placeholder:
-    """Limits of one number instead of the URDF's, and why."""
+    """Limits of one number in place of the URDF's, with the reason."""
 
     joint: str
     lower: float | None
@@ -25,7 +25,7 @@ class Placeholder:
 
 
 def placeholder_limits(joint: Joint) -> Placeholder | None:
-    """Substitute for limits of the joint that cannot be used; None where the URDF's can."""
+    """Return the placeholder for unusable limits of a joint; None if the URDF's are usable."""
     reasons = [*_positions(joint), *_speeds(joint)]
     if not reasons:
         return None

@@ -1,4 +1,4 @@
-"""A URDF with all that it shows, copied into a robot's folder: meshes beside it, stand-ins for what cannot be shown."""
+"""Copy of a URDF with its visuals into a robot's folder: meshes beside it, stand-ins for what cannot be shown."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ from robots.rotations import Float64
 from robots.urdf import Joint, Urdf, parsed
 
 _MESHES = "meshes"
-_STICK, _THICKEST, _THINNEST = 0.15, 0.04, 0.012  # of its length, m, m: the radius of a stand-in
-_SHORTEST = 0.02  # m between two joints from which a stand-in is drawn
-_KNOB = 0.015  # m: the radius of what stands in for the end of a chain
+_STICK, _THICKEST, _THINNEST = (
+    0.15,
+    0.04,
+    0.012,
+)  # radius of a stand-in: share of its length, greatest [m], smallest [m]
+_SHORTEST = 0.02  # [m] distance of two joints from which there is a stand-in
+_KNOB = 0.015  # [m] radius of the stand-in for the end of a chain
 _COLOUR = "0.55 0.58 0.63 1"
 
 
 @dataclass(frozen=True, slots=True)
 class MeshCopyReport:
-    """Results for the shapes: `copied` are files, `missing` are meshes that were not found or cannot be read.
+    """Result for the shapes: `copied` files, and `missing` meshes that were not found or are unreadable.
 
-    `drawn` are links that stand-ins show, `plain` are links whose material was not declared, or has no colour.
+    `drawn` are links shown by stand-ins; `plain` are links whose material was not declared, or has no valid colour.
     """
 
     copied: tuple[str, ...]
@@ -39,10 +43,10 @@ class MeshCopyReport:
 
 
 def copy_urdf(tree: Urdf, target: Path) -> MeshCopyReport:
-    """Writes the URDF to `target` and its meshes into the folder meshes/ beside it.
+    """Write the URDF to `target`, and its meshes to the folder meshes/ beside it.
 
-    It is copied as it is where it shows what can be shown. Otherwise visuals of missing meshes are replaced by
-    cylinders from joint to joint, as in all links where none shows anything.
+    If everything can be shown, the URDF is copied unchanged. Otherwise visuals of missing meshes are replaced by
+    cylinders from joint to joint; if nothing can be shown, this applies to all links.
     """
     robot = parsed(tree.path, comments=True)
     work = _UrdfCopy(tree, target, robot)
@@ -56,7 +60,7 @@ def copy_urdf(tree: Urdf, target: Path) -> MeshCopyReport:
         document.write(target, encoding="utf-8", xml_declaration=True)
     else:
         shutil.copyfile(tree.path, target)
-    shapes.read_shapes(target)  # what still cannot be shown is refused here, not when it is drawn
+    shapes.read_shapes(target)  # refuse here what still cannot be shown, instead of when drawing
     return MeshCopyReport(tuple(work.copied), tuple(work.missing), tuple(work.drawn), tuple(work.plain))
 
 
@@ -78,7 +82,7 @@ class _UrdfCopy:
         return bool(self.copied or self.drawn or self.plain or self._bare or self._recoloured)
 
     def meshes(self) -> None:
-        """Copies meshes that can be read and points to the copies; takes out visuals that cannot be shown."""
+        """Copy readable meshes and point to the copies; remove visuals that cannot be shown."""
         for link in self._robot.findall("link"):
             for visual in link.findall("visual"):
                 geometry = visual.find("geometry")
@@ -93,7 +97,7 @@ class _UrdfCopy:
                     self._bare.append(link)
 
     def _sized(self, shape: ET.Element) -> bool:
-        """True if it has lengths above zero, or factors that are not."""
+        """Return True if the shape has positive lengths, or non-zero factors."""
         try:
             shapes.size_of(self._tree.path, "a visual", shape)
         except RobotError:
@@ -101,7 +105,7 @@ class _UrdfCopy:
         return True
 
     def colours(self) -> None:
-        """Takes out colours that are none: not three or four numbers from 0 to 1."""
+        """Remove invalid colours: all except four numbers from 0 to 1."""
         for link in self._robot.findall("link"):
             for material in link.iter("material"):
                 if self._without_odd_colour(material) and link.get("name", "") not in self.plain:
@@ -123,7 +127,7 @@ class _UrdfCopy:
         return True
 
     def stand_ins(self) -> None:
-        """Cylinders in links that lost a visual and have none left; in all links where nothing is shown at all."""
+        """Add cylinders to links that lost all visuals; to all links if nothing is shown at all."""
         links = self._robot.findall("link")
         if not any(link.find("visual") is not None for link in links):
             self._bare = links
@@ -134,7 +138,7 @@ class _UrdfCopy:
                 self.drawn += [link.get("name", "")] if shown else []
 
     def materials(self) -> None:
-        """Takes out materials that nobody declares: such a shape has the plain colour."""
+        """Remove undeclared materials: such shapes get the plain colour."""
         declared = {
             material.get("name")
             for material in self._robot.iter("material")
@@ -165,7 +169,7 @@ class _UrdfCopy:
         return True
 
     def _sticks(self, link: str) -> Iterator[ET.Element]:
-        """Visuals from the link's origin to each joint on it; a knob where nothing more comes."""
+        """Yield visuals from the link's origin to each of its joints; a sphere at the end of a chain."""
         behind = [
             joint
             for joint in self._tree.joints.values()
@@ -184,7 +188,7 @@ class _UrdfCopy:
             yield _visual(way / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
 
     def _is_frame(self, joint: Joint) -> bool:
-        """True if the joint leads to a mere name of a place, as that between fingertips."""
+        """Return True if the joint leads to a mere frame, such as that between fingertips."""
         link = next(link for link in self._robot.findall("link") if link.get("name") == joint.child)
         leads_on = any(other.parent == joint.child for other in self._tree.joints.values())
         return joint.kind == "fixed" and not leads_on and link.find("visual") is None
@@ -200,7 +204,7 @@ def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:
 
 
 def _names(file: Path) -> Iterator[str]:
-    """Names for a copy of it, the first that no other file has."""
+    """Yield names for a copy, until the caller finds an unused one."""
     yield file.name
     yield f"{file.parent.name}_{file.name}"
     for number in itertools.count(2):
@@ -208,7 +212,7 @@ def _names(file: Path) -> Iterator[str]:
 
 
 def _places(source: Path, named: str) -> Iterator[Path]:
-    """Paths at which a mesh of the URDF `source` may lie: beside it, or in its package above or beside."""
+    """Yield paths at which a mesh of the URDF `source` may be: beside it, or in its package above or beside."""
     scheme, separator, rest = named.partition("://")
     folder = source.resolve().parent
     if not separator:

@@ -1,4 +1,4 @@
-"""Home and ready for a robot of which only the URDF is known: clear of itself and of the table."""
+"""Home and ready poses for a robot of which only the URDF is known: clear of itself and of the table."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from robots.robot import Group, Robot
 from robots.rotations import Float64
 from robots.urdf import Urdf
 
-CLEAR = 0.01  # m between links that a posture is to have
-_INSIDE = 0.05  # of a joint's range, from its ends
-_SAMPLES, _FEW, _ELITE, _ROUNDS = 256, 64, 24, 14  # of a search by the cross-entropy method
-_LOWEST = 0.05  # m over the table that fingertips stay
+CLEAR = 0.01  # [m] distance between links that a posture must have
+_INSIDE = 0.05  # margin to the ends of a joint's range, as a share of it
+_SAMPLES, _FEW, _ELITE, _ROUNDS = 256, 64, 24, 14  # parameters of the cross-entropy search
+_LOWEST = 0.05  # [m] least height of fingertips over the table
 _NONE: Float64 = np.empty(0)
-_STARTS = 4  # of a search
+_STARTS = 4  # restarts of a search
 _WAY = 24  # points between home and ready
-_LOOKED_AT = np.array([0.3, 0.6, 1.0])  # of them, while searching
+_LOOKED_AT = np.array([0.3, 0.6, 1.0])  # shares of the path that are checked during the search
 _HEIGHT, _AHEAD, _ASIDE = (
     0.2,
     0.15,
     0.33,
-)  # m: where fingertips are to be, beside what they work on and cameras see
-_NEAR, _ALIKE = 0.02, 1e-3  # m, and of a cosine: within which two arms mirror each other
+)  # [m] target of the fingertips: beside the work area and the cameras' view
+_NEAR, _ALIKE = 0.02, 1e-3  # [m], cosine: tolerances for two arms that mirror each other
 
 
 def rest_posture(lower: Float64, upper: Float64) -> Float64:
-    """Zero, or as near to it as keeps a twentieth of the range to both limits."""
+    """Return zero, or the nearest value with a margin of a twentieth of the range to both limits."""
     inside = _INSIDE * (upper - lower)
     return np.clip(np.zeros_like(lower), lower + inside, upper - inside)
 
 
 class PostureSearch:
-    """Looks for postures of the robot's arms; all other groups, and grippers, stay as at home."""
+    """Search for postures of the robot's arms; all other groups, and grippers, stay as at home."""
 
     def __init__(self, robot: Robot, tree: Urdf) -> None:
         self._robot = robot
@@ -48,10 +48,10 @@ class PostureSearch:
         self._signs = {name: signs for name, signs in pairs if signs is not None}
         inside = _INSIDE * (robot.upper - robot.lower)
         self._low, self._high = robot.lower + inside, robot.upper - inside
-        self._draw = np.random.default_rng(0)  # the same URDF gives the same draft
+        self._draw = np.random.default_rng(0)  # fixed seed: the same URDF gives the same draft
 
     def home(self) -> Float64:
-        """The robot's home, or the posture nearest to it in which fewest links touch, mirrored where arms are."""
+        """Return the home pose, or the nearest posture with the fewest touching links, mirrored for mirrored arms."""
         home = self._robot.poses["home"]
         dims = self._dims()
         best, fewest = home, int(self._touching(home))
@@ -71,11 +71,11 @@ class PostureSearch:
         best = self._plain(best, home, fewest)
         self._looked_at &= (
             self._clearance.distances(best) >= MARGIN
-        )  # what touches anyway tells postures not apart
+        )  # pairs that always touch cannot distinguish postures
         return best
 
     def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
-        """The posture with every joint back where it was at home that need not be elsewhere."""
+        """Return the posture with every joint reset to home if this adds no touching pair."""
         for dim in self._dims():
             tried = q.copy()
             tried[dim] = home[dim]
@@ -86,7 +86,7 @@ class PostureSearch:
         return q
 
     def ready(self, home: Float64) -> Float64:
-        """Every arm over its side of the table, fingers down; as at home where no such posture can be gone to."""
+        """Return a posture with every arm over its side of the table, fingers down; as at home if none is reachable."""
         ready = home.copy()
         for arm in self._arms:
             found = self._mirrored(arm, ready)
@@ -96,7 +96,7 @@ class PostureSearch:
         return ready
 
     def touching(self, poses: dict[str, Float64]) -> tuple[tuple[str, str], ...]:
-        """The pairs that touch at these postures all the same."""
+        """Return the pairs that touch at these postures."""
         found = {
             pair
             for q in poses.values()
@@ -106,18 +106,18 @@ class PostureSearch:
         return tuple(sorted(found))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """Count of pairs that are too near, and of arms too low [...]."""
+        """Return the number of pairs that are too close, plus that of arms that are too low [...]."""
         near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
 
     def _heights(self, q: Float64) -> Float64:
-        """Of the fingertips over the table [..., arms]: they are no pair, because they reach down to it on purpose."""
+        """Return the heights of the fingertips over the table [..., arms]; they are not checked as pairs."""
         return (
             np.stack([self._tips(arm, q)[..., 2, 3] for arm in self._arms], axis=-1) if self._arms else _NONE
         )
 
     def _apart(self, q: Float64) -> Float64:
-        """The least distance [...] of the pairs that are looked at."""
+        """Return the smallest distance [...] of the checked pairs."""
         return np.asarray(self._clearance.distances(q)[..., self._looked_at].min(axis=-1, initial=np.inf))
 
     def _dims(self) -> NDArray[np.intp]:
@@ -130,9 +130,9 @@ class PostureSearch:
         return bool(self._apart(way).min() >= min(MARGIN, float(self._apart(home))) and high.all())
 
     def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
-        """The best posture of one arm to which the straight way is clear; `start` where none is found.
+        """Return the best posture of one arm with a clear straight path from home; `start` if none is found.
 
-        By the cross-entropy method: draw, keep the best, draw about them; begun anew from wherever.
+        Cross-entropy method: sample, keep the best, sample around them; restarted from random centres.
         """
         for _ in range(_STARTS):
             best = self._refined(arm, start, home)
@@ -160,11 +160,13 @@ class PostureSearch:
         return np.asarray(best.round(3))
 
     def _costs(self, arm: Group, q: Float64, home: Float64) -> Float64:
-        """Cost of a posture: fingertips off their place, off down, joints near limits, distance from home."""
+        """Return the cost of postures: position and direction of the fingertips, joints near limits, distance
+        from home.
+        """
         at = self._tips(arm, q)
         wanted = np.array([self._side(arm) * _ASIDE, _AHEAD, _HEIGHT])
         away = np.linalg.norm(at[:, :3, 3] - wanted, axis=-1) / 0.1
-        upright = 1 + at[:, 2, 2]  # 0 where the fingers point straight down
+        upright = 1 + at[:, 2, 2]  # 0 if the fingers point straight down
         dims = arm.joint_dims
         ranges = self._robot.upper[dims] - self._robot.lower[dims]
         room = np.minimum(q[:, dims] - self._robot.lower[dims], self._robot.upper[dims] - q[:, dims]) / ranges
@@ -173,7 +175,7 @@ class PostureSearch:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """Depth of links in each other or of fingertips too low, at the posture or on the way to it."""
+        """Return a cost for the depth of collisions, or of fingertips too low, at the posture and on the path to it."""
         way = home + _LOOKED_AT[:, None, None] * (q - home)
         deep = np.maximum(2 * CLEAR - self._apart(way), 0.0) + np.maximum(
             _LOWEST - self._heights(way), 0.0
@@ -185,13 +187,15 @@ class PostureSearch:
         return end if arm.tip is None else end @ arm.tip
 
     def _side(self, arm: Group) -> float:
-        """-1 for an arm that begins on the left side of the scene or in its middle, 1 for one on the right."""
+        """Return -1 for an arm that begins on the left side of the scene or in its middle, 1 for the right side."""
         child = self._tree.joint(arm.urdf_joints[0]).child
         x = float(self._body.poses(self._robot.poses["home"])[self._body.link_of(arm.name, child), 0, 3])
         return 1.0 if x > _NEAR else -1.0
 
     def _mirrored(self, arm: Group, q: Float64) -> Float64:
-        """The same postures [..., D], but that the arm mirrors the first one, within its limits, where it is such."""
+        """Return the postures [..., D] with this arm mirroring the first one, within its limits, if they are
+        mirrored.
+        """
         if arm.name not in self._signs:
             return q
         found, dims = q.copy(), arm.joint_dims
@@ -200,7 +204,9 @@ class PostureSearch:
         return found
 
     def _mirroring(self, first: Group, second: Group) -> Float64 | None:
-        """For each joint 1 or -1 by which values of `first` mirror it in `second` (y turned round); None if none do."""
+        """Return for each joint 1 or -1 by which values of `first` are mirrored in `second` (y inverted);
+        None if not mirrored.
+        """
         if len(first.urdf_joints) != len(second.urdf_joints):
             return None
         at = places(self._tree, {})
@@ -214,11 +220,11 @@ class PostureSearch:
             slides = joints[0].kind == "prismatic"
             axis = axes[0] * (
                 [1, -1, 1] if slides else [-1, 1, -1]
-            )  # an axis of turning mirrors the other way
+            )  # a rotation axis is mirrored in the other direction
             off = there[:3, 3] - here[:3, 3] * [1, -1, 1]
             off = (
                 off if slides else off - axis * (off @ axis)
-            )  # where on its axis a joint is drawn is nothing
+            )  # the position of a rotation joint along its axis is irrelevant
             cosine = float(axis @ axes[1])
             if abs(abs(cosine) - 1) > _ALIKE or np.abs(off).max() > _NEAR:
                 return None

@@ -1,4 +1,4 @@
-"""Declarations of a draft: the tables of robot.toml as they are guessed, before they are written down."""
+"""Content of a draft: the guessed tables of robot.toml, before they are written."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from robots.rotations import Float64
 from robots.urdf import Urdf
 
 _SPEEDS = (("vx", 0.3, "m/s"), ("vy", 0.3, "m/s"), ("wz", 0.5, "rad/s"))
-_SPACING = 0.5  # m between arms that are copies of one
-_HIGHEST = 0.6  # m over the root: a shoulder above is no arm's that stands on a table
-_SHOULDER = 0.35  # m over the table, of a robot that stands before it
-_BEFORE = -0.2  # m: the table's near side, where such a robot's shoulders are
-_QUARTER = (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)  # the robot's x looks over the table
+_SPACING = 0.5  # [m] between copies of an arm
+_HIGHEST = 0.6  # [m] over the root: an arm on a table has its shoulder below this
+_SHOULDER = 0.35  # [m] over the table, for a robot that stands in front of it
+_BEFORE = -0.2  # [m] near side of the table, where such a robot's shoulders are
+_QUARTER = (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)  # the robot's x points over the table
 
 
 @dataclass(frozen=True, slots=True)
 class PoseDraft:
-    """x, y, z [m] and unit quaternion w, x, y, z."""
+    """Pose: x, y, z [m] and unit quaternion w, x, y, z."""
 
     xyz: tuple[float, float, float]
     wxyz: tuple[float, float, float, float]
@@ -38,7 +38,7 @@ class PoseDraft:
 
 @dataclass(frozen=True, slots=True)
 class GroupDraft:
-    """One group; `numbers` are names on the wire, the gripper's last. `rest` are its values at home."""
+    """Group of a draft; `numbers` are names on the wire, the gripper's last. `rest` are its values at home."""
 
     name: str
     kind: Kind
@@ -56,7 +56,7 @@ class GroupDraft:
 
 @dataclass(frozen=True, slots=True)
 class RobotDraft:
-    """A whole draft; `idle` are joints that no group moves, `held` those that are floating or planar."""
+    """Complete draft; `unassigned_joints` are not moved by any group, `held` joints are floating or planar."""
 
     title: str
     urdf: str
@@ -68,9 +68,12 @@ class RobotDraft:
 
 
 def build_draft(tree: Urdf, shown: Path, drawn: Collection[str], title: str, copies: int) -> RobotDraft:
-    """The draft of a robot with that URDF, whose shapes are those of the file `shown`; RobotError if nothing moves.
+    """Return the draft of a robot with that URDF, whose visuals are in the file `shown`.
 
-    The shapes of the links `drawn` only stand in for what they are.
+    The shapes of the links `drawn` are only stand-ins, and are not used for measuring.
+
+    Raises:
+        RobotError: If nothing moves, or copies are requested of a URDF without exactly one arm.
     """
     limbs = guess_groups(tree)
     arms = [limb for limb in limbs if limb.kind == "arm"]
@@ -132,18 +135,20 @@ def _rest(tree: Urdf, joints: Sequence[str]) -> tuple[float, ...]:
 
 
 def _ends(tree: Urdf, name: str) -> tuple[float, float]:
-    """A joint's position limits as the draft has them."""
+    """Return the position limits of a joint in the draft."""
     joint = tree.joint(name)
     instead = placeholder_limits(joint)
     if instead is not None and instead.lower is not None and instead.upper is not None:
         return instead.lower, instead.upper
-    assert joint.lower is not None  # or there would be a placeholder
+    assert joint.lower is not None  # otherwise there is a placeholder
     assert joint.upper is not None
     return joint.lower, joint.upper
 
 
 def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[str, float]:
-    """Joints of optional groups in drawings while they do not move, if they are not 0; at the first arm."""
+    """Return non-zero rest values of joints of optional groups, for drawing while they do not move; on the
+    first arm only.
+    """
     if limb.kind != "arm" or limb is not next(other for other in limbs if other.kind == "arm"):
         return {}
     others = [other for other in limbs if other.kind in ("torso", "head", "other", "base")]
@@ -156,7 +161,7 @@ def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[s
 
 
 def _speeds(limb: GroupGuess) -> GroupDraft:
-    """A base on wheels: numbers that move no joint of the URDF."""
+    """Return a base on wheels: numbers that move no joint of the URDF."""
     overrides = tuple(
         Placeholder(
             name, -fastest, fastest, 2 * fastest, f"{fastest:g} {unit} is a placeholder, and so is its change"
@@ -181,7 +186,7 @@ def _speeds(limb: GroupGuess) -> GroupDraft:
 
 
 def _copy(group: GroupDraft, index: int, copies: int) -> GroupDraft:
-    """The group of one of several equal arms, side by side, the first on the left."""
+    """Return the group for one of several equal arms, side by side, the first on the left."""
     side = ("left", "right")[index] if copies == 2 else ""
     name = f"{side}_{group.name}" if side else f"{group.name}{index + 1}"
     x = round((index - (copies - 1) / 2) * _SPACING, 4)
@@ -190,13 +195,13 @@ def _copy(group: GroupDraft, index: int, copies: int) -> GroupDraft:
 
 
 def _cameras(arms: Sequence[str]) -> dict[str, str]:
-    """One over the table and one per wrist, named as policies are mostly trained with."""
+    """Return one camera over the table and one per wrist, with the names common in training data."""
     sides = [name.replace("arm", "wrist") for name in arms]
     return {"front": "cam_high"} | {side: f"cam_{side}" for side in sides}
 
 
 def _stand(tree: Urdf, limbs: Sequence[GroupGuess]) -> PoseDraft:
-    """Place of the root such that arms reach over the table: on it, or on the floor before it."""
+    """Return the pose of the root such that the arms reach over the table: on it, or on the floor in front of it."""
     at = places(tree, {})
     shoulders: list[Float64] = [
         at[tree.joint(limb.joints[0]).child][:3, 3] for limb in limbs if limb.kind == "arm" and limb.joints

@@ -1,4 +1,4 @@
-"""A draft written down: robot.toml with a comment at every guess, and the README of what is to be verified."""
+"""Text of a draft: robot.toml with a comment at every guess, and a README of what to verify."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LIMITS = "joints: position and velocity limits of the URDF; placeholders, as ov
 def render_robot_toml(
     sheet: RobotDraft, poses: Mapping[str, Mapping[str, Sequence[float]]], touching: Sequence[tuple[str, str]]
 ) -> str:
-    """The file, whose poses are vectors by group."""
+    """Return the text of robot.toml; `poses` are vectors by group, `touching` pairs are ignored in collisions."""
     lines = [
         "# Drafted from a URDF. What was guessed says so in capitals: verify it on the robot, then delete the word.",
         f"title = {_text(sheet.title)}",
@@ -109,7 +109,7 @@ def _tip(tip: Float64) -> Iterator[str]:
 
 
 def _unit(wxyz: Sequence[float]) -> list[float]:
-    """As long as 1 again after rounding."""
+    """Return the quaternion normalised again after rounding."""
     length = sum(value * value for value in wxyz) ** 0.5
     return [value / length for value in wxyz]
 
@@ -140,7 +140,7 @@ def _numbers(numbers: Iterable[float]) -> str:
 
 
 def render_readme(name: str, sheet: RobotDraft, pictures: MeshCopyReport) -> str:
-    """List to tick off of what was guessed and has to be verified."""
+    """Return the README with a checklist of guesses to verify."""
     numbers = sum(len(group.numbers) for group in sheet.groups if not group.optional)
     lines = [
         f"# {sheet.title}",

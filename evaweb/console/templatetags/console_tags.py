@@ -1,4 +1,4 @@
-"""Parts of every page's bar: the tabs, and the role of the user."""
+"""Template tags of every page's bar: tabs, and the user's role."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ register = template.Library()
 
 @register.inclusion_tag("console/tabs.html", takes_context=True)
 def tab_bar(context: template.Context) -> dict[str, Any]:
-    """The tabs that exist, with the one that this address belongs to."""
+    """Render the tabs, with the one that this address belongs to."""
     return {"tabs": tabs.page_tabs(context["request"]), "request": context["request"]}
 
 
 @register.simple_tag
 def role_name(user: Any) -> str:
-    """The highest role of a user."""
+    """Return the highest role of a user."""
     return role_of(user).value

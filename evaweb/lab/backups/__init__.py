@@ -1,1 +1,1 @@
-"""Backups of a lab: its database and its data folder at one moment, listed with digests, verified and put back."""
+"""Backups of a lab: consistent copies of database and data folder, with digests, verification and restore."""

@@ -1,4 +1,4 @@
-"""Makes, verifies and puts back backups of a lab; each is a folder with a database, files and their list."""
+"""Creating, verifying and restoring backups; each is a folder with a database dump, files and their list."""
 
 from __future__ import annotations
 
@@ -29,20 +29,24 @@ from runtime.recording.files import sync_folder
 FORMAT = 1
 ABOUT, LIST, FILES = "backup.json", "files.jsonl", "files"
 _PARTIAL = ".partial"
-_STARTS_WITH = {"secret_key", "lab_id", "logs"}  # what any command makes in an empty data folder
+_STARTS_WITH = {"secret_key", "lab_id", "logs"}  # files that every command creates in an empty data folder
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A whole backup at `path`, and what its `backup.json` says of it."""
+    """Complete backup at `path`, with the contents of its `backup.json`."""
 
     path: Path
     about: Mapping[str, Any]
 
     @classmethod
     def at(cls, path: Path) -> Backup:
-        """Read it; a BackupError where it is none, was not finished, or is of another format."""
+        """Return the backup at `path`.
+
+        Raises:
+            BackupError: If it is not a backup, is incomplete, or has another format.
+        """
         try:
             about = json.loads((path / ABOUT).read_text(encoding="utf-8"))
             given = about["format"]
@@ -61,31 +65,38 @@ class Backup:
         return self.path / self.about["database"]["file"]
 
     def listed(self) -> Iterator[Listed]:
-        """Its files, as they were copied."""
+        """Yield the files of the backup."""
         return read_list(self.path / LIST)
 
 
 def backups_in(folder: Path) -> list[Backup]:
-    """Those of a folder, the oldest first."""
+    """Return the complete backups in a folder, oldest first."""
     names = sorted(each for each in folder.iterdir() if (each / ABOUT).is_file() and each.suffix != _PARTIAL)
     return [Backup.at(each) for each in names]
 
 
 def make(folder: Path, *, keep: int | None, tell: Tell) -> Backup:
-    """Make one in `folder`, named by its time; files that have not changed share the disk with those of the one before.
+    """Create a backup in `folder`, named by its time; unchanged files are hard links to those of the previous backup.
 
-    The database is copied first: every file that it knows is there when the files are. `keep`: of more whole backups
-    than that the oldest ones go. Raises BackupError; then nothing is left of it.
+    The database is copied first, so that every file to which it refers is in the copy.
+
+    Args:
+        folder: Folder of all backups, outside the data folder.
+        keep: Number of backups to keep, None for all; the oldest are removed.
+        tell: Called with a text for each part.
+
+    Raises:
+        BackupError: If it fails; nothing of it is left.
     """
     folder = folder.expanduser().absolute()
     data = Path(settings.DATA_DIR).absolute()
     if folder.is_relative_to(data):
         raise BackupError(f"{folder} is in the data folder: name a folder elsewhere, best on another disk")
-    os.umask(0o077)  # a reader of a backup can act as anybody who is logged in
+    os.umask(0o077)  # a reader of a backup could act as any logged-in user
     folder.mkdir(parents=True, exist_ok=True)
     with _alone(folder):
         for left in folder.glob(f"*{_PARTIAL}"):
-            shutil.rmtree(left)  # of one that was killed
+            shutil.rmtree(left)  # left by an interrupted backup
         before = backups_in(folder)
         now = timezone.now()
         name = now.strftime("%Y-%m-%dT%H%M%S.%fZ")
@@ -146,7 +157,7 @@ def _write(draft: Path, before: Backup | None, now: str, tell: Tell) -> None:
 
 
 def verify(path: Path, tell: Tell) -> tuple[Backup, list[str]]:
-    """Read all of a backup; returns it and what is not as it was written, a sentence for each file."""
+    """Read the complete backup; return it with one sentence per file that differs from what was written."""
     backup = Backup.at(path.expanduser().absolute())
     problems = list(_database_problems(backup))
     if digest_of(backup.path / LIST)[0] != backup.about["files"]["sha256"]:
@@ -188,10 +199,14 @@ def _file_problem(path: Path, listed: Listed) -> str:
 
 
 def restore(path: Path, tell: Tell) -> Backup:
-    """Put a backup back into the settings' data folder and database, which are empty.
+    """Restore a backup into the data folder and database of the settings, which must be empty.
 
-    Every file is compared with its digest on the way, and the tables with their numbers of rows; the data folder is
-    filled when all of it is there. Raises BackupError; what fails after that leaves RESTORING, on which no lab starts.
+    Every file is compared with its digest during the copy, and every table with its number of rows; files are moved
+    into the data folder when all are complete.
+
+    Raises:
+        BackupError: If it fails. From the restore of the database on, a failure leaves the folder RESTORING, with
+            which no lab starts.
     """
     backup, ours = Backup.at(path.expanduser().absolute()), databases.database()
     about = backup.about["database"]
@@ -251,7 +266,7 @@ def _put_back(source: Path, target: Path, listed: Listed) -> None:
 
 def _replace(source: Path, target: Path) -> None:
     if target.is_dir() and not target.is_symlink():
-        shutil.rmtree(target)  # logs of the command that runs
+        shutil.rmtree(target)  # logs of this command
     source.rename(target)
 
 

@@ -1,4 +1,4 @@
-"""Commands about a backup that was made."""
+"""Base of the commands that work on an existing backup."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaweb.lab.backups.errors import BackupError
 
 
 class BackupCommand(BaseCommand):
-    """Takes the folder of a backup; needs no lab that works."""
+    """Command that takes the folder of a backup; it does not need a working lab."""
 
     requires_system_checks = ()
 
@@ -30,4 +30,8 @@ class BackupCommand(BaseCommand):
 
     @abstractmethod
     def work_on(self, path: Path) -> None:
-        """Do it; BackupError where it cannot be done."""
+        """Do the work of the command.
+
+        Raises:
+            BackupError: If it fails.
+        """

@@ -1,4 +1,4 @@
-"""The lab's database in one file: a copy of SQLite's, or what pg_dump writes; with the number of rows of each table."""
+"""Dump of the lab's database to one file, by SQLite's backup or pg_dump, with the number of rows of each table."""
 
 from __future__ import annotations
 
@@ -22,31 +22,39 @@ Rows = Mapping[str, int]
 
 
 class Database(Protocol):
-    """The one that the settings name."""
+    """Database of the settings."""
 
     engine: str
-    file: str  # its name in a backup
+    file: str  # name in a backup
 
     def write(self, path: Path) -> Rows:
-        """Write what is in it at one moment; returns the number of rows of each table."""
+        """Write a consistent dump; return the number of rows of each table."""
 
     def read(self, path: Path) -> Rows:
-        """Look through a file that `write` made; returns its rows, none where only a server could count them."""
+        """Check a dump; return its number of rows of each table, {} if only a server could count them."""
 
     def require_empty(self) -> None:
-        """A BackupError where it has a table."""
+        """Raise BackupError if the database has a table."""
 
     def restore(self, path: Path) -> None:
-        """Put back what `write` wrote, all of it or nothing."""
+        """Restore a dump, completely or not at all."""
 
 
 def database() -> Database:
-    """That of the settings; a BackupError where it is of another kind."""
+    """Return the database of the settings.
+
+    Raises:
+        BackupError: If its kind is not supported.
+    """
     return of("sqlite3" if connection.vendor == "sqlite" else connection.vendor)
 
 
 def of(engine: str) -> Database:
-    """Of a kind of database: sqlite3 or postgresql."""
+    """Return the database of a kind: sqlite3 or postgresql.
+
+    Raises:
+        BackupError: If the kind is not supported.
+    """
     for known in (_SQLite(), _PostgreSQL()):
         if known.engine == engine:
             return known
@@ -54,7 +62,7 @@ def of(engine: str) -> Database:
 
 
 def rows() -> Rows:
-    """The number of rows of each table of the lab's database."""
+    """Return the number of rows of each table of the lab's database."""
     quote = connection.ops.quote_name
     with connection.cursor() as cursor:
         names = connection.introspection.table_names(cursor)
@@ -88,8 +96,8 @@ class _SQLite:
             closing(sqlite3.connect(f"{self._path.as_uri()}?mode=ro", uri=True)) as ours,
             closing(sqlite3.connect(path)) as copy,
         ):
-            ours.backup(copy)  # all pages in one read: writers go on behind it, in the journal
-            copy.execute("PRAGMA journal_mode=DELETE")  # one file
+            ours.backup(copy)  # all pages in one read transaction: writers continue in the write-ahead log
+            copy.execute("PRAGMA journal_mode=DELETE")  # a single file
         _sync(path)
         return self.read(path)
 
@@ -139,7 +147,7 @@ class _PostgreSQL:
                 "pg_dump",
                 ["--format=custom", "--no-owner", "--no-acl", f"--snapshot={moment}", f"--file={path}"],
             )
-            counted = rows()  # of the same moment
+            counted = rows()  # in the same transaction as the snapshot
         _sync(path)
         return counted
 
@@ -164,7 +172,9 @@ class _PostgreSQL:
     def _run(
         self, program: str, options: Iterable[str], files: Iterable[str] = (), *, named: bool = False
     ) -> None:
-        """With the settings' server and user; the password goes by the environment, where `ps` does not show it."""
+        """Run a program with server and user of the settings; the password is in the environment, because
+        `ps` shows arguments.
+        """
         (_, *where), environment = connection.client.settings_to_cmd_args_env(connection.settings_dict, [])
         *server, name = where
         _call([program, *options, *server, *(["--dbname"] if named else []), name, *files], environment or {})

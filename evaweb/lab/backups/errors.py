@@ -1,4 +1,4 @@
-"""Fault of a backup, with a sentence for the administrator."""
+"""Error of a backup, with a sentence for the administrator."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from evaweb.errors import EvaError
 
 
 class BackupError(EvaError):
-    """It cannot be made, read or put back."""
+    """A backup cannot be created, read or restored."""

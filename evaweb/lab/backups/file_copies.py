@@ -1,4 +1,4 @@
-"""Copies of the files of a data folder that is in use, each listed with its digest."""
+"""Copies of the files of a data folder in use, each listed with its digest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import BinaryIO
 from evaweb.lab.backups.errors import BackupError
 
 SEALS = ("outcome.json", "sealed.json")
-_LEFT_OUT = {  # of the top of the data folder: made anew at the next start, or of one machine and moment alone
+_LEFT_OUT = {  # entries of the data folder that are recreated at the next start, or belong to one machine and moment
     "broker",
     "cache",
     "diagnosis",
@@ -29,16 +29,16 @@ _LEFT_OUT_ANYWHERE = {
     "bus.key",
     "endpoints",
     "panel.pin",
-}  # of a station: new ones are made, docs/administrator.md
+}  # of a station: recreated, see docs/administrator.md
 _TRIES = 3
 _BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """A file of a backup: `path` in the data folder, size [bytes], SHA-256 of its content, mode, time of change [ns].
+    """File of a backup: `path` in the data folder, size [bytes], SHA-256, mode, and modification time [ns].
 
-    A symbolic link has `link`, where it leads, and no content.
+    A symbolic link has its target as `link`, and no content.
     """
 
     path: str
@@ -50,9 +50,10 @@ class Listed:
 
 
 class FileCopies:
-    """Copies a data folder to `target`; what has not changed since the backup in `before` is linked to its copy there.
+    """Copier of a data folder to `target`; files unchanged since the backup in `before` are hard-linked to their
+    copies.
 
-    `changing` are the folders that went on changing while they were copied: their files are of different moments.
+    `changing` are the folders that kept changing during the copy: their files are from different moments.
     """
 
     def __init__(
@@ -70,7 +71,11 @@ class FileCopies:
         self.linked = 0
 
     def made(self) -> Iterator[Listed]:
-        """Copy everything and list it; an unreadable file or a full disk is a BackupError with its name."""
+        """Copy everything, and yield the list.
+
+        Raises:
+            BackupError: If a file cannot be read, or the disk is full; it names the file.
+        """
         for top in sorted(os.scandir(self._data), key=lambda entry: entry.name):
             if top.name in _LEFT_OUT or Path(top.path).absolute() in self._without:
                 continue
@@ -86,7 +91,7 @@ class FileCopies:
                     yield from self._steady(f"{top.name}/{entry.name}")
 
     def _steady(self, unit: str) -> list[Listed]:
-        """The files of a folder as they were at one moment, if it rests for one."""
+        """Copy a folder in a consistent state, if it does not change during one of several attempts."""
         for _ in range(_TRIES):
             names = list(self._walk(unit))
             signs = self._signs(names)
@@ -97,7 +102,9 @@ class FileCopies:
         return listed
 
     def _walk(self, unit: str) -> Iterator[str]:
-        """Its files, what seals a recording first: where that is there, the others do not change any more."""
+        """Return its files, with the seal of a recording first: once that exists, the other files do not
+        change any more.
+        """
         found = []
         for folder, folders, files in os.walk(self._data / unit, onerror=_unless_gone):
             folders[:] = [name for name in folders if name not in _LEFT_OUT_ANYWHERE]
@@ -118,7 +125,7 @@ class FileCopies:
         for name in names:
             with suppress(
                 FileNotFoundError
-            ):  # a draft that has got its name, a stop that was written into the database
+            ):  # a draft that was renamed, or a stop that was moved to the database
                 if (listed := self._copy(name)) is not None:
                     yield listed
 
@@ -126,13 +133,13 @@ class FileCopies:
         source, target = self._data / name, self._target / name
         seen = os.lstat(source)
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.unlink(missing_ok=True)  # of the try before
+        target.unlink(missing_ok=True)  # of the previous attempt
         if stat.S_ISLNK(seen.st_mode):
             link = os.readlink(source)
             os.symlink(link, target)
             return Listed(name, 0, "", 0o777, seen.st_mtime_ns, link)
         if not stat.S_ISREG(seen.st_mode):
-            return None  # a socket, a pipe
+            return None  # a socket or a pipe
         if (same := self._unchanged(name, seen)) is not None:
             os.link(self._before[0] / name, target)  # type: ignore[index]
             self.linked += 1
@@ -147,7 +154,7 @@ class FileCopies:
 
 
 def copied(source: Path, target: Path, name: str) -> Listed:
-    """Copy one regular file as far as it reaches now; what is written behind that meanwhile is not in it."""
+    """Copy a regular file up to its current size; data appended meanwhile is not included."""
     try:
         with source.open("rb") as read, target.open("xb") as written:
             seen = os.fstat(read.fileno())
@@ -165,13 +172,13 @@ def copied(source: Path, target: Path, name: str) -> Listed:
 
 
 def digest_of(path: Path) -> tuple[str, int]:
-    """SHA-256 of a file's content, and its size [bytes]."""
+    """Return SHA-256 and size [bytes] of a file."""
     with path.open("rb") as file:
         return _through(file, None, None)
 
 
 def write_list(path: Path, files: Iterable[Listed]) -> tuple[int, int]:
-    """Write a line for each file; returns how many files and bytes those are."""
+    """Write one line per file; return the numbers of files and bytes."""
     count = size = 0
     with path.open("x", encoding="ascii") as lines:
         for each in files:
@@ -183,7 +190,11 @@ def write_list(path: Path, files: Iterable[Listed]) -> tuple[int, int]:
 
 
 def read_list(path: Path) -> Iterator[Listed]:
-    """What `write_list` wrote; a BackupError names a line that is not ours."""
+    """Yield the files of a list.
+
+    Raises:
+        BackupError: If a line is not valid, or names a path outside the data folder.
+    """
     with path.open(encoding="ascii") as lines:
         for number, line in enumerate(lines, 1):
             try:
@@ -216,7 +227,7 @@ def _unless_gone(error: OSError) -> None:
 
 
 def room_for(folder: Path, wanted: int) -> None:
-    """A BackupError where the disk of `folder` has less than `wanted` bytes left."""
+    """Raise BackupError if the disk of `folder` has fewer than `wanted` bytes free."""
     free = shutil.disk_usage(folder).free
     if free < wanted:
         raise BackupError(f"{folder}: {free:,} bytes free, {wanted:,} wanted")

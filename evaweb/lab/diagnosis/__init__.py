@@ -1,1 +1,3 @@
-"""The diagnostic bundle: how a lab is, in one file that can be sent on: no secrets, and blind for who is blind."""
+"""Diagnostic bundle: the state of a lab in one file that can be passed on, without secrets and with blinding
+respected.
+"""

@@ -1,4 +1,6 @@
-"""Writes a bundle: every part through the scrubber, logs by their ends, and a summary of what is in it and what not."""
+"""Writer of a bundle: all parts through the scrubber, the ends of logs, and a summary of what is included and
+omitted.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +21,22 @@ from evaweb.lab.diagnosis import contents, summary
 from evaweb.lab.diagnosis.scrubbing import Scrubber, known_secrets
 from evaweb.stations.models import Station
 
-LONGEST_LOG = 2_000_000  # bytes of its end
-LONGEST_LOGS = 24_000_000  # of all together
-LONGEST_PART = 8_000_000  # characters of any other file
+LONGEST_LOG = 2_000_000  # [bytes] of the end of each log
+LONGEST_LOGS = 24_000_000  # [bytes] of all logs together
+LONGEST_PART = 8_000_000  # [characters] of any other file
 Tell = Callable[[str], None]
 Named = tuple[str, Any]
 
 
 def write(path: Path, sight: Visibility, tell: Tell) -> list[str]:
-    """Write the bundle at `path`, for its user alone, as `sight` may see it; returns what is not in it.
+    """Write the bundle to `path`, readable only by this account; return notes on what it omits.
 
-    `tell` hears which part is being gathered. It is whole, or not there.
+    It contains only what `sight` allows. `tell` is called with each part that is being gathered. The file is written
+    completely or not at all.
     """
     scrubber = Scrubber(known_secrets(), sight.names)
     notes: list[str] = []
-    draft = path.with_name(
-        f".{path.name}"
-    )  # of one that was cut off: the job that is done again writes over it
+    draft = path.with_name(f".{path.name}")  # fixed name: a repeated job overwrites an interrupted one
     try:
         made = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with os.fdopen(made, "wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
@@ -106,7 +107,7 @@ def _stations(sight: Visibility, notes: list[str], tell: Tell) -> Iterator[Named
 
 
 def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Named]:
-    """The parts as far as they can be gathered: a lab is looked into because something of it is broken."""
+    """Yield the parts that can be gathered; errors become notes, because a diagnosed lab may be broken anywhere."""
     try:
         yield from parts
     except (Error, OSError, EvaError) as error:
@@ -114,7 +115,7 @@ def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Na
 
 
 def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
-    """Names and ends of logs; they name checkpoints and servers, so that who is blind gets none."""
+    """Yield names and ends of logs; none for blind readers, because logs name checkpoints and servers."""
     if not sight.sees_everything:
         return
     room = LONGEST_LOGS
@@ -129,13 +130,13 @@ def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
         with path.open("rb") as file:
             file.seek(size - length)
             end = file.read(length)
-        if length < size:  # not from within a line: half a secret is not known as one
+        if length < size:  # not from within a line: the scrubber would not recognise half a secret
             end = end.partition(b"\n")[2]
         yield f"logs/{path.name}", end.decode("utf-8", "replace")
 
 
 def sight_for(user: Any) -> Visibility:
-    """What the user may see; of a database that does not say, nothing that a plan could hide."""
+    """Return the visibility of a user; if the database does not answer, everything that a plan could hide is hidden."""
     try:
         return visibility_for_user(user)
     except Error as error:
@@ -143,7 +144,7 @@ def sight_for(user: Any) -> Visibility:
 
 
 def folder(user: Any) -> Path:
-    """Folder of the bundles that a user had made; nobody else is given them."""
+    """Return the folder of a user's bundles, which only that user may download."""
     made = Path(settings.DATA_DIR) / "diagnosis" / str(user.pk)
     made.mkdir(mode=0o700, parents=True, exist_ok=True)
     return made

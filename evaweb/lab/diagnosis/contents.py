@@ -1,6 +1,6 @@
-"""Parts of a bundle: versions, the machine, settings, deployments, stations, jobs, the database.
+"""Contents of a bundle: versions, machine, settings, deployments, stations, jobs, database.
 
-Everything is shown as the reader may see it; logs are read where the reader is blind for nothing.
+All parts respect the reader's visibility; logs are included only if nothing is hidden from the reader.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from runtime.config.loader import ConfigurationError, tree_of
 from runtime.core.git_revision import revision
 
 _ASK_S = 2.0
-_COMMANDS, _JOBS = 200, 100  # the newest of them
-# Settings of the environment whose values are shown; of all others only that they are set.
+_COMMANDS, _JOBS = 200, 100  # newest rows
+# Environment variables with values in the bundle; of all others only the names.
 _SHOWN = (
     *(
         "EVA_DATA_DIR",
@@ -58,7 +58,7 @@ _SHOWN = (
 
 
 def versions() -> dict[str, Any]:
-    """Program, Python, kernel and packages."""
+    """Return the versions of program, Python, kernel and packages."""
     release = Path("/etc/os-release")
     lines = release.read_text("utf-8").splitlines() if release.is_file() else []
     system = next(
@@ -74,12 +74,12 @@ def versions() -> dict[str, Any]:
 
 
 def machine() -> list[dict[str, Any]]:
-    """The set-up check of this machine, as it is now."""
+    """Return the current results of the machine check."""
     return [asdict(line) for line in machine_check.lines()]
 
 
 def lab_settings() -> dict[str, Any]:
-    """Settings by an allow list, and which of the others are set."""
+    """Return settings from the allow list, and the names of other variables that are set."""
     ours = sorted(
         name for name in os.environ if name.startswith("EVA_") or name in ("DATABASE_URL", "REDIS_URL")
     )
@@ -93,7 +93,7 @@ def lab_settings() -> dict[str, Any]:
 
 
 def database() -> dict[str, Any]:
-    """Migrations that are not applied, and how many rows each table has."""
+    """Return the unapplied migrations, and the number of rows of each table."""
     executor = MigrationExecutor(connection)
     plan = executor.migration_plan(executor.loader.graph.leaf_nodes())
     models = [model for model in apps.get_models() if model.__module__.startswith("evaweb.")]
@@ -105,7 +105,7 @@ def database() -> dict[str, Any]:
 
 
 def jobs(sight: Visibility) -> list[dict[str, Any]]:
-    """The newest jobs; what may tell which checkpoint was worked on is covered for who is blind."""
+    """Return the newest jobs; details that may reveal a checkpoint are hidden from blind readers."""
     names = ("id", "kind", "key", "queue", "status", "attempts", "deaths", "progress", "error")
     rows = []
     for job in Job.objects.order_by("-created_at", "-pk")[:_JOBS]:
@@ -118,7 +118,7 @@ def jobs(sight: Visibility) -> list[dict[str, Any]]:
 
 
 def deployment_files(sight: Visibility) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Name and table of each deployment that a station or the data folder has, as it is written, without comments."""
+    """Yield name and content of each deployment of a station or of the data folder, without comments."""
     known = {one.name: one.path for one in deployments.kept()}
     for station in Station.objects.exclude(deployment=""):
         known.setdefault(station.name, Path(station.deployment))
@@ -133,7 +133,7 @@ def deployment_files(sight: Visibility) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def station_parts(station: Station, sight: Visibility) -> Iterator[tuple[str, Any]]:
-    """(part, contents) of one station: its state now, its newest events, the newest commands."""
+    """Yield (part, content) of a station: current state, newest events, newest commands."""
     wire = connection_to(station.name)
     about = {name: getattr(station, name) for name in ("name", "robot", "simulated", "active", "message")}
     try:
@@ -154,15 +154,15 @@ def station_parts(station: Station, sight: Visibility) -> Iterator[tuple[str, An
 
 
 def logs() -> list[Path]:
-    """The logs of this lab's programs, the newest first."""
+    """Return the logs of this lab's programs, newest first."""
     found = [path for path in (Path(settings.DATA_DIR) / "logs").glob("*.log*") if path.is_file()]
     return sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
 
 
 def programs(sight: Visibility) -> list[dict[str, Any]]:
-    """Whether the lab runs and, of each program that has a log, how long it has said nothing [s].
+    """Return whether the lab runs and, for each program with a log, the time since its last line [s].
 
-    Which policy was asked last tells which checkpoint ran: who is blind is told of the lab alone.
+    The policy that was used last reveals the checkpoint: blind readers get only the lab.
     """
     now = time.time()
     rows: list[dict[str, Any]] = [{"program": "lab", "runs": deployments.lab_runs()}]

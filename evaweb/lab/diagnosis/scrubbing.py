@@ -1,4 +1,4 @@
-"""Takes secrets out of text and out of tables: those that this machine knows, and whatever looks like one."""
+"""Removal of secrets from texts and tables: known secrets of this machine, and everything that looks like a secret."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from evaweb.blinding import HIDDEN
 from runtime.core.environment import without_web_secrets
 
 REMOVED = "(removed)"
-_SHORTEST = 6  # characters of a value that is looked for everywhere: a shorter one stands in every word
+_SHORTEST = 6  # [characters] shorter values are not searched for everywhere, because they occur within words
 _WORDS = (
     r"pass(?:word|wd|phrase)?|secret|token|credential|api[_-]?key|private[_-]?key|access[_-]?key|signature"
 )
-# `..._key` that names a place in what a policy is sent, and holds no secret
+# `..._key` that names a field of a policy's input, not a secret
 _PLACES = r"(?:images|state|prompt|language|unnorm)_key"
 _KEY = re.compile(rf"{_WORDS}|^auth|authorization|cookie|(?:^|_)pin$|^(?!{_PLACES}$).+_key$", re.IGNORECASE)
 _NUMBERS = re.compile(
     r"(?:^|_)(?:pass(?:word|wd|phrase|code)?|pin)$", re.IGNORECASE
-)  # a number is a secret too
+)  # a number may be a secret too
 _VARIABLES = re.compile(
     r"(?:^|_)KEY$|^EVA_POLICY_", re.IGNORECASE
-)  # of the environment, besides those of _KEY
+)  # environment variables, in addition to those of _KEY
 _NAMES_ONLY = re.compile(r"_(env|variable)s?$|^variables$")  # keys whose values are names of variables
 _NO_NAME = r"(?![\w.-]{0,60}_(?:env|variables?)[\"']?\s*[:=]\s*[\"']?(?-i:[A-Z][A-Z0-9_]*)(?![\w.-]))"
 _VALUE = r"(?:\"[^\"\n]*\"|'[^'\n]*'|[^\s,;&\"']+)"
-# After blanks alone it is no secret unless it looks like one: "the password is changed" is a sentence.
+# After blanks alone, only a value that looks like a secret counts: "the password is changed" is a sentence.
 _BLANKS = r"(?:[ \t]++(?:is|was)\b)?+(?:[ \t]*+[:=][ \t]*+|[ \t]++)"
-_ODD = r"(?=[^\s,;]*[^A-Za-z\s.,:;()'\"-])[^\s,;\"']{4,}"  # four signs or more, not letters alone
-# Each of them is done with a text in a time that grows as the text does, whatever stands in it.
+_ODD = r"(?=[^\s,;]*[^A-Za-z\s.,:;()'\"-])[^\s,;\"']{4,}"  # four characters or more, not letters alone
+# The time of each pattern is linear in the length of the text, for any text.
 _PATTERNS = (
     (
         re.compile(
@@ -83,7 +83,7 @@ _PATTERNS = (
 
 
 class Scrubber:
-    """`text` and `tree` without secrets, and without the names that are hidden from the reader."""
+    """Scrubber that removes secrets, and names that are hidden from the reader, from texts and trees."""
 
     def __init__(self, secrets: Iterable[str], hidden: Iterable[str] = ()) -> None:
         known = sorted({one for one in secrets if len(one) >= _SHORTEST}, key=len, reverse=True)
@@ -92,7 +92,7 @@ class Scrubber:
         self._hidden = re.compile(rf"(?<!\w)(?:{hides})(?!\w)") if hides else None
 
     def text(self, text: str) -> str:
-        """A text of any kind."""
+        """Return any text without secrets and hidden names."""
         if self._known:
             text = self._known.sub(REMOVED, text)
         for pattern, instead in _PATTERNS:
@@ -100,7 +100,7 @@ class Scrubber:
         return self._hidden.sub(HIDDEN, text) if self._hidden else text
 
     def tree(self, value: Any) -> Any:
-        """Tables and lists as JSON has them: what stands under the name of a secret goes, whatever it is."""
+        """Return JSON tables and lists without secrets; values under the name of a secret are always removed."""
         if isinstance(value, Mapping):
             return {self.text(str(key)): self._under(str(key), one) for key, one in value.items()}
         if isinstance(value, list | tuple):
@@ -116,7 +116,7 @@ class Scrubber:
 
 
 def known_secrets() -> set[str]:
-    """Secrets of this lab as far as this process can read them: keys, passwords, and what is in the environment."""
+    """Return the secrets of this lab that this process can read: keys, passwords, environment variables."""
     data = Path(settings.DATA_DIR)
     files = [data / "secret_key", data / "first_account", *data.glob("stations/*/bus.key")]
     found = {settings.SECRET_KEY, *(_read(path) for path in files)}
@@ -137,7 +137,7 @@ def _read(path: Path) -> str:
 
 
 def _passwords(url: str) -> set[str]:
-    """The password in an address, as it is written and as it is meant."""
+    """Return the password in a URL, as written and decoded."""
     try:
         password = urlsplit(url).password
     except ValueError:

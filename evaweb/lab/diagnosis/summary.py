@@ -1,4 +1,4 @@
-"""The first page of a bundle: what stands out, and what is in it; as text, and as a page that needs no network."""
+"""First page of a bundle: notable findings and contents, as text and as an offline HTML page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; }
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading and its lines; a line may name a file of the bundle that says more."""
+    """Heading and lines; a line may name a file of the bundle with details."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
@@ -26,9 +26,9 @@ class Section:
 def sections(
     parts: dict[str, Any], contents: Sequence[tuple[str, int]], notes: Sequence[str]
 ) -> list[Section]:
-    """What stands out of the `parts`, by the names of their files.
+    """Return the sections of notable findings in `parts`, which are keyed by file name.
 
-    `contents` are files with their bytes, `notes` sentences on what is not in the bundle.
+    `contents` are files with their sizes [bytes], `notes` sentences on what the bundle omits.
     """
     versions, found = parts["versions.json"], parts["machine.json"]
     rows = parts.get("database.json")
@@ -62,7 +62,7 @@ def sections(
 
 
 def as_text(title: str, found: Sequence[Section]) -> str:
-    """For a terminal."""
+    """Return the summary for a terminal."""
     lines = [title, "=" * len(title)]
     for section in found:
         lines += ["", section.title, "-" * len(section.title), *(f"  {line}" for line, _ in section.lines)]
@@ -70,7 +70,7 @@ def as_text(title: str, found: Sequence[Section]) -> str:
 
 
 def as_html(title: str, found: Sequence[Section]) -> str:
-    """For a browser: one file, no script, nothing from elsewhere."""
+    """Return the summary for a browser: one file without scripts and external resources."""
     body = "".join(
         f"<h2>{escape(section.title)}</h2><ul>{''.join(map(_item, section.lines))}</ul>" for section in found
     )

@@ -1,1 +1,1 @@
-"""Numbers of a plan's trials."""
+"""Analysis of a plan's trials."""

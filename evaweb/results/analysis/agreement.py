@@ -1,4 +1,4 @@
-"""Agreement of raters and of automatic judges, and preferred checkpoint, as JSON; what cannot be said is null."""
+"""Agreement of raters and automatic judges, and preference ranking, as JSON; undefined values are null."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ OUTCOMES = {"first", "second", "tie"}
 
 
 def rater_agreement(plan: Plan) -> dict[str, Any] | None:
-    """Of first and second raters, on success and on each milestone; None without second ratings.
+    """Return the agreement of first and second raters on success and on each milestone; None without second ratings.
 
-    Each second rating is held against the score that stood when it was made: what was corrected since may follow it.
+    Each second rating is compared with the score that was current when it was made, because later corrections may
+    follow the second rating.
     """
     rows = list(
         Rating.objects.filter(trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED)
@@ -47,7 +48,9 @@ def rater_agreement(plan: Plan) -> dict[str, Any] | None:
 
 
 def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
-    """Of two raters on yes and no: how often the same, beyond chance by Cohen, Gwet and Krippendorff."""
+    """Return the agreement of two raters on yes/no pairs: share of equal ratings, Cohen's kappa, Gwet's AC1,
+    Krippendorff's alpha.
+    """
     same = proportion(sum(one == other for one, other in pairs), len(pairs))
     return {
         "n": same.n,
@@ -60,7 +63,7 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
 
 
 def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """What was said of each milestone; of several with the same words the second is "held (2)", in their order."""
+    """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:
         label, n = text, 1
@@ -72,7 +75,9 @@ def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _score_at(rating: Rating | Judgement) -> Score:
-    """The newest score of its trial when it was made; the first one where a clock that was set back says none was."""
+    """Return the score that was current when the rating was made; the first score if a clock set back puts
+    all of them later.
+    """
     scores = list(rating.trial.scores.all())
     return next((score for score in reversed(scores) if score.scored_at <= rating.at), scores[0])
 
@@ -92,7 +97,7 @@ def _scored(score: Score) -> dict[str, bool]:
 
 
 def _defined(statistic: Callable[..., float], *given: Any) -> float | None:
-    """None where the data do not give it, as where everybody always said the same word."""
+    """Return the statistic, or None if it is undefined, for example if all ratings are equal."""
     try:
         return statistic(*given)
     except StatisticsError:
@@ -100,9 +105,10 @@ def _defined(statistic: Callable[..., float], *given: Any) -> float | None:
 
 
 def judge_agreement(plan: Plan) -> list[dict[str, Any]] | None:
-    """Of each version of each automatic judge and the score that stood then, milestone by milestone; None without any.
+    """Return the agreement of each version of each automatic judge with the scores of that time; None without
+    judgements.
 
-    No rating of a person is in it, and nothing of it in theirs.
+    Second raters and judges are kept strictly apart: neither counts in the other's agreement.
     """
     counted = Judgement.objects.filter(
         trial__evaluation=plan.evaluation_id, trial__status=TrialStatus.SCORED
@@ -141,15 +147,16 @@ def _on_milestone(said: list[tuple[bool, bool | None, float | None]]) -> dict[st
 
 
 def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any] | None:
-    """Of probabilities that milestones were reached, beside whether people said so."""
+    """Return the calibration of the probabilities that milestones were reached against the scores, None without any."""
     given = [(probability, scored) for scored, _, probability in said if probability is not None]
     return asdict(calibration(given)) if given else None
 
 
 def preference_comparisons(plan: Plan) -> list[Comparison]:
-    """Preferences of people, by checkpoint: all that were said of the same two trials weigh as one.
+    """Return the preferences by checkpoint; all preferences about the same two trials together have weight 1.
 
-    In random order two trials of a block may be of one checkpoint: they are asked about like others and say nothing.
+    With random order, two trials of a block may have the same checkpoint: raters are asked about them as well, but
+    they are left out here.
     """
     same = Q(first__checkpoint=F("second__checkpoint"))
     rows = Preference.objects.filter(~same, plan=plan).order_by("pk")
@@ -160,10 +167,10 @@ def preference_comparisons(plan: Plan) -> list[Comparison]:
 
 
 def preference_ranking(plan: Plan) -> dict[str, Any] | None:
-    """Bradley-Terry-Davidson of the plan's preferences; None where there is none.
+    """Return the Bradley-Terry-Davidson ranking of the plan's preferences, None without any.
 
-    Where no finite, unique ranking exists `ranking` is null, `reason` says why, and `groups` can be ranked among
-    themselves.
+    If no finite, unique ranking exists, `ranking` is null, `reason` explains it, and each of `groups` can be ranked on
+    its own.
     """
     given = preference_comparisons(plan)
     if not given:

@@ -1,6 +1,6 @@
-"""Everything that is said of an evaluation, computed once from its outcomes; pages, exports and reports only show it.
+"""Complete analysis of an evaluation, computed once from its outcomes; pages, exports and reports only display it.
 
-Methods are those of docs/evaluation.md. What cannot be computed is None with its reason in `notes`.
+The methods are those of docs/evaluation.md. A value that cannot be computed is None, with the reason in `notes`.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from evaweb.statistics.sequential import Evidence, score_evidence, success_evide
 from evaweb.statistics.success_times import Curve, RestrictedMean, cumulative_incidence, restricted_mean
 from evaweb.trials.failure_words import UNSPECIFIED, failure_text
 
-SEED = 20_260  # of all that is drawn: the same data give the same interval
+SEED = 20_260  # seed of all random draws: equal data give equal intervals
 _RANDOM = "checkpoints came in random order: there are no pairs"
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Funnel:
-    """The milestones of one scene, with the words for each."""
+    """Milestone funnel of one scene, with the text of each milestone."""
 
     scene: str
     labels: tuple[str, ...]
@@ -52,9 +52,10 @@ class Funnel:
 
 @dataclass(frozen=True, slots=True)
 class FailureMode:
-    """A phase and cause, "" where they were not said, of `count` out of `n` trials, with the exact interval of that.
+    """Phase and cause of failure ("" if unspecified) of `count` out of `n` trials, with the exact interval of the
+    share.
 
-    Each interval is of one mode, named beforehand: of the most frequent one of many it says too much.
+    The interval is valid for a single mode named beforehand; for the most frequent of many it is too optimistic.
     """
 
     phase: str
@@ -65,20 +66,27 @@ class FailureMode:
 
     @property
     def words(self) -> str:
-        """As it is shown."""
+        """Text for display."""
         return failure_text(self.phase, self.cause) or UNSPECIFIED
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One checkpoint: how often it succeeds, how far it comes, how long it takes.
+    """Results of one checkpoint.
 
-    `macro` is the mean of the scenes' success rates, each equally heavy; `cells` success by initial condition;
-    `speed` successes per hour of running, `interventions` how often a run was broken off. `curve` and `mean_time` are
-    of time to success [s], up to one horizon for all arms, by which a trial that failed has not succeeded.
-    `smoothness` is SPARC of what was measured, `commanded` of what was sent, over those trials of which there is a
-    recording. `failures` are all that failed, the most frequent mode first. `series`: as which series it is drawn, in
-    every figure of its evaluation.
+    Attributes:
+        exact: Clopper-Pearson interval of the success rate.
+        macro: Mean of the scenes' success rates, with equal weights.
+        cells: Success by initial condition.
+        curve: Cumulative successes over time [s], up to one horizon for all arms; a failed trial has not succeeded
+            by then.
+        mean_time: Restricted mean time to success [s] up to the same horizon.
+        speed: Successes per hour of running.
+        interventions: Interrupted runs per hour of running.
+        failures: Failure modes, most frequent first.
+        smoothness: SPARC of the measured motion, over the trials with a recording.
+        commanded: SPARC of the sent commands.
+        series: Index of its colour in every figure of its evaluation.
     """
 
     checkpoint: str
@@ -102,7 +110,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """The exact test within strata, of `strata` in which both checkpoints were tried."""
+    """Exact test within `strata` strata in which both checkpoints were tried."""
 
     p: float
     strata: int
@@ -110,10 +118,10 @@ class Within:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the design of a planned comparison says: whether it has ended, and with both told apart.
+    """Result of a planned comparison by its design: whether it has ended, and whether it separated the two.
 
-    `apart` is None where it asks something else than whether they differ. `evidence`: the outcome whose e-process is
-    the design, "" of any other design.
+    `apart` is None if the question is not whether they differ (non-inferiority), or if it has not ended. `evidence` is
+    the outcome ("success", "score") whose e-process is the design, "" for any other design.
     """
 
     ended: bool = False
@@ -122,7 +130,7 @@ class Verdict:
 
 
 class Standing(StrEnum):
-    """Who decides a comparison: nobody (it was not planned), its plan's design, or that some day."""
+    """Status of a comparison: unplanned, decided by its plan's design, or planned and still open."""
 
     UNPLANNED = "not planned"
     DECIDED = "decided"
@@ -131,19 +139,27 @@ class Standing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two checkpoints: the first minus the second.
+    """Comparison of two checkpoints: the first minus the second.
 
-    `standing` says who decides: of a planned comparison its design alone, once that has ended. Of one that is open no
-    test, evidence or letter is there: what describes it stays. `alpha` is its share.
+    A planned comparison is decided by its design alone, once that has ended. While it is open, tests, evidence and
+    letters are omitted and only descriptions remain.
 
-    `within` has the exact test within conditions, scenes, operators and stations, where there are several that tell
-    something; `scenes` the difference in each scene, of several, and `interaction` the probability of their being as
-    different were the odds ratio the same in all.
-    `test` is Barnard's and `corrected` its probability after Holm's correction for all pairs of the evaluation; valid
-    for a number of trials fixed beforehand, as is `scored`, of the pairs' scores. `evidence` and `score_evidence` may
-    be looked at any time, as may `anytime` and `score_anytime`: what the mean difference of the pairs' successes, and
-    scores, can be, at 1 less the evidence's alpha; None where no one difference fits all pairs. `sooner` is of times
-    to success [s], pair by pair, failures counted as the horizon.
+    Attributes:
+        standing: Whether the comparison is planned, and decided.
+        alpha: This comparison's share of alpha.
+        test: Barnard's test, for a number of trials fixed beforehand.
+        corrected: Its probability after Holm's correction for all pairs of the evaluation.
+        better: Posterior probability that the first is better.
+        scored: Sign-flip test of the pairs' scores, for a number of trials fixed beforehand.
+        within: Exact tests within conditions, scenes, operators and stations, if several strata are informative.
+        scenes: Difference in each scene, if there are several.
+        interaction: Probability of scenes differing this much if the odds ratio is the same in all.
+        evidence: Anytime-valid evidence on success; may be examined at any time.
+        score_evidence: The same on the scores.
+        anytime: Confidence sequence of the mean difference of successes at 1 - alpha; None if no difference fits
+            all pairs.
+        score_anytime: The same for the scores.
+        time_test: Sign-flip test of times to success [s] by pair, with failures counted as the horizon.
     """
 
     first: str
@@ -172,9 +188,10 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Training runs of one recipe: the success rate of each, and their mean with the interval over runs, not trials.
+    """Training runs of one recipe: the success rate of each, and their mean with an interval over runs instead of
+    trials.
 
-    Fewer than three runs have no interval: what is between them is what another training would be, too.
+    With fewer than three runs there is no interval: it has to cover what another training run would achieve.
     """
 
     name: str
@@ -184,7 +201,9 @@ class Recipe:
 
 @dataclass(frozen=True, slots=True)
 class Analysis:
-    """The evaluation: its arms, best first, all comparisons, letters that sum those up, and recipes of several runs."""
+    """Analysis of an evaluation: its arms, best first, all comparisons with summarising letters, and recipes
+    with several runs.
+    """
 
     n: int
     arms: tuple[Arm, ...]
@@ -195,11 +214,11 @@ class Analysis:
     recipes: tuple[Recipe, ...] = ()
 
     def arm(self, checkpoint: str) -> Arm:
-        """That of a checkpoint."""
+        """Return the arm of a checkpoint."""
         return next(arm for arm in self.arms if arm.checkpoint == checkpoint)
 
     def comparison_of(self, first: str, second: str) -> Comparison | None:
-        """Their comparison, whichever way round it was made; None where there is none."""
+        """Return the comparison of two checkpoints in either order, or None."""
         return next((c for c in self.comparisons if {c.first, c.second} == {first, second}), None)
 
 
@@ -215,22 +234,25 @@ def analyse(
     whole: bool = False,
     recipes: Mapping[str, str] | None = None,
 ) -> Analysis:
-    """All of it; `planned` comparisons are made in their direction, others the better one first.
+    """Return the complete analysis of these outcomes.
 
-    Of planned ones the design has the word: letters tell apart what it did, and while it has not decided there are
-    none, nor is there anything else that could be taken for a decision.
+    The design alone decides planned comparisons: letters separate what it separated, and while it is undecided there
+    are neither letters nor anything else that could pass for a decision.
 
-    Without `in_pairs` blocks are no pairs: a block has trials of whichever checkpoint was drawn. `whole`: these are all
-    trials of a plan, its blocks numbered from 0. Evidence then ends before the first of them that lacks a trial, as the
-    plan's design does: who chooses what is made next could else choose what it says.
-
-    `limits` [s] are those of the evaluation's scenes that have one: the smallest is the horizon of times to success;
-    without any, the longest run.
-
-    `recipes`: of checkpoints, what each is a training run of.
-
-    `interruptions` count for how often a checkpoint needs an operator, and for nothing else. `checkpoints` are those of
-    the evaluation, in the order in which they have their colours, whichever of them are chosen.
+    Args:
+        outcomes: Trials that count.
+        interruptions: Interrupted runs; they only count for the rate of interventions.
+        alpha: Error probability of all comparisons together.
+        planned: Verdicts by planned comparison, in their direction; for others the better checkpoint is first.
+        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there are
+            no pairs.
+        limits: Time limits [s] of the scenes that have one. The smallest is the horizon of times to success;
+            without any, the longest run.
+        checkpoints: All checkpoints of the evaluation in the order of their colours, whichever were selected.
+        whole: Whether these are all trials of a plan, with blocks numbered from 0. Evidence then ends before the
+            first incomplete block, as in the plan's design: otherwise the choice of the next trial could influence
+            it.
+        recipes: Recipe of each checkpoint that is one of its training runs.
     """
     by_design = planned or {}
     arms, timing = by_checkpoint(outcomes), _TimeHorizon.of(outcomes, limits or {})
@@ -274,11 +296,11 @@ def analyse(
     )
 
 
-_FEWEST_RUNS = 3  # of a recipe, for an interval of what another run of it would do
+_FEWEST_RUNS = 3  # runs of a recipe for an interval
 
 
 def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) -> Iterator[Recipe]:
-    """Those of which several runs were tried."""
+    """Yield the recipes of which several runs were tried."""
     runs: dict[str, dict[str, float]] = defaultdict(dict)
     for name in sorted(arms):
         if recipes.get(name):
@@ -292,7 +314,7 @@ def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) 
 
 @dataclass(frozen=True, slots=True)
 class _TimeHorizon:
-    """The horizon of times to success [s], 0 where nothing has a duration, and the limits of scenes [s]."""
+    """Horizon of times to success [s], 0 without any duration, and the time limits of scenes [s]."""
 
     until: float
     limits: Mapping[str, float]
@@ -303,17 +325,19 @@ class _TimeHorizon:
         return cls(min(limits.values(), default=longest), limits)
 
     def known(self, outcome: Outcome) -> bool:
-        """True where its time is."""
+        """Return True if the trial's duration is known."""
         return outcome.duration is not None and self.until > 0
 
     def time(self, outcome: Outcome) -> float | None:
-        """When it succeeded [s], None where it did not; a run ends a moment after the limit that stopped it."""
+        """Return the time to success [s], None for a failure; capped at the scene's limit, because a run ends
+        shortly after it.
+        """
         if not outcome.success or outcome.duration is None:
             return None
         return min(outcome.duration, self.limits.get(outcome.scene, outcome.duration))
 
     def time_within_horizon(self, outcome: Outcome) -> float:
-        """The same within the horizon, which is what a failure counts for."""
+        """Return the time to success within the horizon; a failure counts as the horizon."""
         time = self.time(outcome)
         return self.until if time is None else min(time, self.until)
 
@@ -338,7 +362,9 @@ def _share(
     planned: Collection[tuple[str, str]],
     couple: tuple[str, str],
 ) -> float:
-    """Alpha of the evidence: planned comparisons share all of it, each of the others has an equal share of all."""
+    """Return alpha of one comparison: planned comparisons share all of it; each other one has an equal share
+    among all.
+    """
     return alpha / (len(planned) if couple in planned else len(couples))
 
 
@@ -445,7 +471,7 @@ def _comparison(
 
 
 def _described(found: Comparison, evidence: str) -> Comparison:
-    """What describes the trials of a comparison that is open, and of the evidence that by which its design decides."""
+    """Return an open comparison without inference; only descriptions, and the evidence that is its design, remain."""
     kept = {"": (None, None), "success": (found.evidence, None), "score": (None, found.score_evidence)}
     own, own_score = kept[evidence]
     return replace(
@@ -478,7 +504,7 @@ def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.S
     ours, theirs = _grouped(first, lambda o: o.scene), _grouped(second, lambda o: o.scene)
     shared = sorted(set(ours) & set(theirs))
     if len(set(ours) | set(theirs)) < 2:
-        return None  # of one scene there is nothing to stratify
+        return None  # a single scene cannot be stratified
     return strata.mantel_haenszel(
         [strata.StratumTable(*_counts(ours[key]), *_counts(theirs[key])) for key in shared]
     )
@@ -495,7 +521,7 @@ STRATA: dict[str, Callable[[Outcome], str]] = {
 def _tables(
     first: Sequence[Outcome], second: Sequence[Outcome], key: Callable[[Outcome], str]
 ) -> dict[str, strata.StratumTable]:
-    """Those strata in which both were tried."""
+    """Return the tables of the strata in which both were tried."""
     ours, theirs = _grouped(first, key), _grouped(second, key)
     return {
         name: strata.StratumTable(*_counts(ours[name]), *_counts(theirs[name]))
@@ -548,7 +574,7 @@ def _later(pairs: int) -> str:
 
 
 def _imbalances(arms: dict[str, list[Outcome]]) -> list[str]:
-    """Initial conditions that not all checkpoints were tried from equally often: pooled rates mislead then."""
+    """Return notes on initial conditions that were not tried equally often: pooled rates are then misleading."""
     cells = {name: Counter(o.condition for o in trials) for name, trials in arms.items()}
     every = sorted({condition for counts in cells.values() for condition in counts})
     uneven = [key for key in every if len({counts[key] for counts in cells.values()}) > 1]
@@ -570,7 +596,7 @@ def _grouped(trials: Sequence[Outcome], key: Callable[[Outcome], str]) -> dict[s
 
 
 def _compute_or_note(notes: list[str], compute: Callable[[], T]) -> T | None:
-    """Result of `compute`, or None with the reason among the notes."""
+    """Return the result of `compute`, or None after adding the reason to `notes`."""
     try:
         return compute()
     except StatisticsError as error:

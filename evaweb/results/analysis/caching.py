@@ -1,7 +1,7 @@
-"""Analyses that are kept as long as nothing they were made from has changed, in each process of the web.
+"""Cache of analyses, in each web process, until their data change.
 
-Nothing is invalidated: what is kept carries a fingerprint of its rows, which is asked for again each time. A
-score, a correction or a void changes it, and so does the name of a checkpoint or of a scene.
+There is no invalidation: cached values carry a fingerprint of their rows, which is queried for each request. Scores,
+corrections and voids change it, and so do names of checkpoints and scenes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from evaweb.trials.models import Scene, Trial, TrialStatus
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """Runs of a plan: the trials that count, and those that were broken off."""
+    """Runs of a plan: the trials that count, and the interrupted ones."""
 
     outcomes: list[Outcome]
     interruptions: list[Interruption]
@@ -40,7 +40,7 @@ _pages: FingerprintCache[dict[str, Any]] = FingerprintCache()
 
 
 def fingerprint(plan: Plan) -> Hashable:
-    """Changes whenever an analysis of the plan would."""
+    """Return a value that changes whenever an analysis of the plan would."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     counted: dict[str, Any] = trials.aggregate(
         n=Count("pk"),
@@ -59,7 +59,7 @@ def fingerprint(plan: Plan) -> Hashable:
 
 
 def cached_runs(plan: Plan, at: Hashable = None) -> Runs:
-    """All runs of the plan; `at` is its fingerprint where that is known already."""
+    """Return all runs of the plan; pass its fingerprint as `at` if it is known."""
     now = at or fingerprint(plan)
     return _runs.get(
         (plan.pk, plan.digest), now, lambda: Runs(load_plan_outcomes(plan), load_plan_interruptions(plan))
@@ -67,7 +67,7 @@ def cached_runs(plan: Plan, at: Hashable = None) -> Runs:
 
 
 def corrected_of(plan: Plan, only: TrialFilter) -> dict[str, Proportion]:
-    """Successes by checkpoint with the scores of now, where those of a revealed plan were corrected since."""
+    """Return the current successes by checkpoint, for checkpoints with scores corrected since the reveal; else {}."""
     if not plan.at_reveal:
         return {}
     at = fingerprint(plan)
@@ -83,7 +83,7 @@ def corrected_of(plan: Plan, only: TrialFilter) -> dict[str, Proportion]:
 
 
 def cached_analysis(plan: Plan, only: TrialFilter | None = None, at: Hashable = None) -> Analysis:
-    """Analysis of the plan's trials, or of those that are chosen."""
+    """Return the analysis of the plan's trials, or of those that the filter selects."""
     now = at or fingerprint(plan)
     runs, which = cached_runs(plan, now), only or TrialFilter()
 
@@ -104,7 +104,9 @@ def cached_analysis(plan: Plan, only: TrialFilter | None = None, at: Hashable = 
 
 
 def recipes_of(plan: Plan) -> dict[str, str]:
-    """Of each training run of a recipe which one; the same weights served in several ways are no runs of it."""
+    """Return the recipe by checkpoint, for training runs only: the same weights served in several ways are
+    not separate runs.
+    """
     rows = (plan.document or {}).get("checkpoints", ())
     weights = Counter(row["digest"] for row in rows if row.get("digest"))
     return {
@@ -115,7 +117,7 @@ def recipes_of(plan: Plan) -> dict[str, str]:
 
 
 def verdicts_of(plan: Plan) -> dict[tuple[str, str], Verdict]:
-    """What its design says of each comparison of a plan; those of a draft are open."""
+    """Return the design's verdict on each comparison of a plan; those of a draft are open."""
     found, design = findings_of(plan), frozen_design(plan.document) if plan.document else None
     if found is None or design is None:
         return dict.fromkeys(planned(plan), Verdict())
@@ -131,7 +133,7 @@ def verdicts_of(plan: Plan) -> dict[tuple[str, str], Verdict]:
 
 
 def limits_of(plan: Plan) -> dict[str, float]:
-    """Time limits [s] of the frozen plan's scenes, of those that have one."""
+    """Return the time limits [s] of the frozen plan's scenes, for those that have one."""
     scenes = (plan.document or {}).get("scenes", [])
     return {scene["name"]: scene["time_limit_s"] for scene in scenes if scene["time_limit_s"] is not None}
 
@@ -139,12 +141,12 @@ def limits_of(plan: Plan) -> dict[str, float]:
 def cached_page(
     plan: Plan, name: Hashable, at: Hashable, make: Callable[[], dict[str, Any]]
 ) -> dict[str, Any]:
-    """Contents of the plan's page of that name, figures included."""
+    """Return the cached contents of one of the plan's pages, figures included; `make` builds them."""
     return _pages.get((plan.pk, plan.digest, name), at, make)
 
 
 def clear_caches() -> None:
-    """Drop what is kept: the next callers wait for it to be made."""
+    """Clear all caches."""
     _runs.clear()
     _corrected.clear()
     _analyses.clear()

@@ -1,6 +1,6 @@
-"""How an evaluation was carried out: everything in its record by which a reader can doubt it.
+"""Conduct of an evaluation: everything in its record that may give a reader reason for doubt.
 
-Plain values throughout, times of the database included: pages, REST and reports show the same.
+All values are plain, and times are those of the database, so that pages, REST and reports show the same.
 """
 
 from __future__ import annotations
@@ -37,16 +37,17 @@ DELAYS = {
     "latency": "policy's latency, median of the run",
     "gap": "since the trial before at the station",
 }
-"""What is compared between the checkpoints, all in s."""
+"""Delays that are compared between the checkpoints [s]."""
 _DAY = timedelta(days=1)
 _delays: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 
 
 @dataclass(frozen=True, slots=True)
 class AttemptRecord:
-    """An attempt as it was handed out; delays are in s, None where they are not known.
+    """Attempt in the order of allocation; delays in s, None if unknown.
 
-    `match` is the least of its bench when last looked at before the run, `override` the reason that was given then.
+    `match` is the smallest match of its bench at the last check before the run, `override` the reason for which a low
+    one was accepted.
     """
 
     number: int
@@ -74,19 +75,19 @@ class AttemptRecord:
 
     @property
     def counts(self) -> bool:
-        """Whether its score is the one that counts."""
+        """Whether its score counts."""
         return self.status == TrialStatus.SCORED
 
     @property
     def wait(self) -> float | None:
-        """From hand-out to run [s]."""
+        """Time from allocation to run [s]."""
         return _seconds(self.handed_at, self.started_at)
 
 
 def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Look]) -> dict[str, Any]:
-    """All of it, `runs` being all attempts and `looks` all looks at their bench.
+    """Return the conduct of a plan; `runs` are all attempts, `looks` all camera checks of their bench.
 
-    One query more for each version of the plan before this one.
+    It takes one more query per earlier version of the plan.
     """
     given_back = plan.events.filter(what="given back").order_by("pk")
     return {
@@ -112,7 +113,9 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Look
 
 
 def looked_behind(plan: Plan) -> list[dict[str, Any]]:
-    """Looks behind the blind: of this version, of earlier ones and of plans beside; `before`: it was frozen later."""
+    """Return the unblindings of this version, earlier versions and related plans; `before`: this plan was
+    frozen later.
+    """
     of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(plan__in=plans_beside(plan))
     rows = Behind.objects.filter(of_the_same).order_by("at", "pk")
     named = {"by_name": F("user__username"), "name": F("plan__name"), "version": F("plan__version")}
@@ -125,7 +128,7 @@ def looked_behind(plan: Plan) -> list[dict[str, Any]]:
 
 
 def all_attempts(plan: Plan, looks: Iterable[Look]) -> list[AttemptRecord]:
-    """Every attempt in the order in which it was handed out; one query."""
+    """Return every attempt in the order of allocation; one query."""
     fields = (
         "number",
         "code",
@@ -155,9 +158,10 @@ def all_attempts(plan: Plan, looks: Iterable[Look]) -> list[AttemptRecord]:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """A camera at the bench before a run: its least match, None without a reference, and why that was accepted.
+    """Camera image of the bench before a run: smallest match (None without a reference), and why a low one was
+    accepted.
 
-    Where the reference has regions they count, not the whole picture: that is what the gate looks at.
+    If the reference has regions, their matches count instead of the whole image: they are what the match gate uses.
     """
 
     trial: int
@@ -168,12 +172,12 @@ class Look:
 
     @property
     def camera(self) -> str:
-        """Its name."""
+        """Name of the camera."""
         return self.place[-1]
 
 
 def looks_of(plan: Plan) -> list[Look]:
-    """All of them in the order in which they were made; one query."""
+    """Return all looks at the bench in the order in which they were made; one query."""
     rows = Achieved.objects.filter(trial__handout__plan=plan).order_by("pk")
     place = ("trial__station__name", "trial__scene__name", "trial__position__number", "camera")
     return [
@@ -191,7 +195,7 @@ def looks_of(plan: Plan) -> list[Look]:
 
 
 def _accepted(looks: Iterable[Look]) -> dict[int, tuple[float | None, str]]:
-    """The least match of each trial's last look at its bench, and why it was accepted."""
+    """Return by trial the smallest match of its last look at the bench, and why it was accepted."""
     newest: dict[int, dict[str, Look]] = defaultdict(dict)
     for look in looks:
         newest[look.trial][look.camera] = look
@@ -205,10 +209,10 @@ def _accepted(looks: Iterable[Look]) -> dict[int, tuple[float | None, str]]:
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Trials that count of each operator or station with each checkpoint.
+    """Return the trials that count by operator or station and checkpoint.
 
-    `uneven`: the most trials by which one of them is off its share of a checkpoint's. Checkpoints that were dropped, or
-    are in random order, have unlike numbers of trials without that.
+    `uneven` is the largest number of trials by which one of them differs from its proportional share of a checkpoint's
+    trials. Dropped checkpoints and random order alone do not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -242,7 +246,7 @@ def _checkpoints(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 
 
 def _voids(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    """Every void with what became of it: those that were asked for, then those that needed one operator alone."""
+    """Return every void with its outcome: requested voids first, then voids that needed only one operator."""
     known = {run.trial: run for run in runs}
     asked = VoidRequest.objects.filter(trial__handout__plan=plan).order_by("pk")
     fields = ("trial_id", "reason", "at", "answer", "answer_reason", "answered_at")
@@ -272,7 +276,7 @@ def _voids(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
 
 
 def _broken_off(runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    """Attempts that the e-stop or an interruption ended, or that never ran, and why."""
+    """Return the attempts that were ended by e-stop or interruption, or never ran, with the reason."""
     return [
         {
             "trial_id": run.trial,
@@ -292,9 +296,9 @@ def _broken_off(runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
 
 
 def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, Any]]:
-    """Every score but the first of its trial, and first scores that came after the reveal; `late`: after it.
+    """Return every correction of a score, and first scores given after the reveal (`late`).
 
-    `changed`: the "verdict", or with the verdict as it was the "category" of a failure or the "note" alone.
+    `changed` is "verdict", or "category" (of a failure) or "note" if the verdict is unchanged.
     """
     known, found = {run.trial: run for run in runs}, []
     scores = Score.objects.filter(trial__handout__plan=plan)
@@ -319,7 +323,7 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
 
 
 def _amendments(plan: Plan) -> list[dict[str, Any]]:
-    """The versions before this one, the newest first, and the one after it."""
+    """Return the earlier versions, newest first, preceded by the next version if there is one."""
     found, version = [], plan
     while version.amends is not None:
         found.append(
@@ -333,8 +337,9 @@ def _amendments(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _edits(plan: Plan) -> list[dict[str, Any]]:
-    """Changes of the plan's scenes and checkpoints from when it was frozen to when what counts was kept, as the
-    administration and the scene editor have logged them, also those that were taken back.
+    """Return changes of the plan's scenes and checkpoints between freezing and reveal, including reverted ones.
+
+    Source is the log of the administration and the scene editor.
     """
     if plan.frozen_at is None:
         return []
@@ -364,7 +369,7 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _deviations(runs: Sequence[AttemptRecord], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """From the schedule: what a block should have had in common, and the turn in which trials come."""
+    """Return deviations from the schedule: differences within blocks, and the order of trials."""
     blocks: dict[int, list[AttemptRecord]] = defaultdict(list)
     for run in runs:
         if run.status != TrialStatus.ABANDONED:
@@ -388,19 +393,19 @@ def _deviations(runs: Sequence[AttemptRecord], given_back: Sequence[dict[str, An
 
 
 def _span(rows: Iterable[AttemptRecord]) -> float | None:
-    """Between the first and the last start of the trials of a block that count [s]."""
+    """Return the time between the first and the last start of a block's trials that count [s]."""
     starts = [run.started_at for run in rows if run.counts and run.started_at is not None]
     return (max(starts) - min(starts)).total_seconds() if len(starts) > 1 else None
 
 
 def _is_out_of_order(rows: Iterable[AttemptRecord]) -> bool:
-    """True if the trials that count were not run in the order that was drawn."""
+    """Return True if the trials that count were not run in the drawn order."""
     slots = [run.slot for run in rows if run.counts]
     return slots != sorted(slots)
 
 
 def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
-    """Codes of first attempts that came after a later one of the schedule at the same station."""
+    """Return the codes of first attempts that came after a later slot at the same station."""
     reached: dict[str, int] = {}
     begun: set[int] = set()
     found = []
@@ -413,7 +418,7 @@ def _out_of_order_codes(runs: Iterable[AttemptRecord]) -> list[str]:
 
 
 def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
-    """When somebody confirmed them at the plan's stations while its trials were made, and trials without that."""
+    """Return the camera checks at the plan's stations during its trials, and trials without one."""
     handed = [run.handed_at for run in runs]
     if not handed:
         return {"checks": [], "unchecked": []}
@@ -442,7 +447,7 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
 
 
 def _bench(plan: Plan, runs: Iterable[AttemptRecord], looks: Iterable[Look]) -> dict[str, Any]:
-    """The plan's least match, trials that ran below it, those of which no match is known, and changed references."""
+    """Return the match gate of the plan, trials below it, trials without a known match, and replaced references."""
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []
     references: dict[tuple[str, str, int, str], set[int]] = defaultdict(set)
@@ -475,7 +480,9 @@ def _bench(plan: Plan, runs: Iterable[AttemptRecord], looks: Iterable[Look]) -> 
 
 
 def _compared(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
-    """Each delay of each checkpoint, and of the compared ones a test within pairs, corrected for how many there are."""
+    """Return the delays of each checkpoint, with paired tests of the planned comparisons, Holm-corrected for
+    their number.
+    """
     names = compared(plan.document or {})
     gaps = _idle_gaps(runs)
     values = tuple(
@@ -531,7 +538,7 @@ def _tested(
 
 
 def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
-    """The first minus the second, in the blocks that have both."""
+    """Return the test of first minus second, over the blocks that have both."""
     first, second = names
     pairs = [found[first] - found[second] for found in blocks if first in found and second in found]
     widest = max(map(abs, pairs), default=0.0)
@@ -546,7 +553,9 @@ def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
 
 
 def _idle_gaps(runs: Iterable[AttemptRecord]) -> dict[int, float]:
-    """Of each attempt that ran, by its number, the time since the one before at its station ended [s]."""
+    """Return by attempt number the time between the end of the previous attempt at the same station and its
+    start [s].
+    """
     ended: dict[str, datetime] = {}
     found = {}
     begun = [(run.started_at, run.number, run) for run in runs if run.started_at is not None]
@@ -560,14 +569,14 @@ def _idle_gaps(runs: Iterable[AttemptRecord]) -> dict[int, float]:
 
 
 def _seconds(since: datetime | None, until: datetime | None) -> float | None:
-    """None where either is not known, or clocks ran apart."""
+    """Return the time between two instants [s]; None if one is unknown, or they are reversed (clocks differ)."""
     if since is None or until is None or until < since:
         return None
     return (until - since).total_seconds()
 
 
 def _number(table: Any, *names: str) -> float | None:
-    """A number within tables that came from a station; None where there is none."""
+    """Return a number from nested tables of a station; None if it is missing."""
     for name in names:
         table = table.get(name) if isinstance(table, dict) else None
     return float(table) if isinstance(table, (int, float)) and not isinstance(table, bool) else None

@@ -1,4 +1,4 @@
-"""Anchors: checkpoints that are tried again in plan after plan, so that it shows when a bench or its scoring drifts."""
+"""Anchors: checkpoints that are tried again in every plan, to detect drift of a bench or of its scoring."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ class _Tried(NamedTuple):
 
 
 def anchors_of(plan: Plan) -> list[dict[str, Any]]:
-    """Of each anchor of a frozen plan its successes in this and in earlier plans, and two probabilities: that this plan
-    differs from those before it, and its own second half from its first, by chance alone as much as they do.
+    """Return for each anchor of a frozen plan its successes by plan, and two tests for drift.
 
-    Each is within station, scene and position; None where nothing is to be compared. Earlier plans are those frozen
-    before it that were revealed or never blind, as far as they had the anchor and a scene as this one has them.
+    `against_earlier` is the probability of a difference from the earlier plans as large as observed by chance,
+    `within` that of a difference between the first and the second half of this plan. Both are stratified by station,
+    scene and position; None if nothing can be compared. Earlier plans were frozen before this one, are revealed or
+    were never blind, and have the anchor and identical scenes.
     """
     found = []
     for row in (plan.document or {}).get("checkpoints", ()):
@@ -48,7 +49,7 @@ def anchors_of(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _earlier(plan: Plan, row: dict[str, Any]) -> list[Plan]:
-    """Those that had it, reached and asked in the same way, and are not blind any more."""
+    """Return earlier plans with the same anchor, served in the same way, that are not blind any more."""
     told = Q(state=PlanState.REVEALED) | Q(blind=False, state=PlanState.CLOSED)
     rows = Plan.objects.filter(told, frozen_at__lt=plan.frozen_at).exclude(pk=plan.pk)
     served = _served(plan, row)
@@ -60,14 +61,14 @@ def _earlier(plan: Plan, row: dict[str, Any]) -> list[Plan]:
 
 
 def _served(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
-    """What its outcomes depend on: what it is called beside does not."""
+    """Return the properties of an anchor on which its outcomes depend; labels are excluded."""
     kept = {name: row.get(name) for name in ("name", "policy", "digest", "strategy")}
     document = plan.document or {}
     return {**kept, "of_plan": document.get("strategy"), "counts_as": document.get("counts_as")}
 
 
 def _same_scenes(one: Plan, other: Plan) -> set[str]:
-    """Names of the scenes that both have with the same words, milestones and time limits."""
+    """Return the names of scenes that are identical in both plans: texts, milestones and time limits."""
     ours, theirs = (
         {scene["name"]: {**scene, "positions": None} for scene in (plan.document or {})["scenes"]}
         for plan in (one, other)
@@ -76,7 +77,7 @@ def _same_scenes(one: Plan, other: Plan) -> set[str]:
 
 
 def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
-    """Trials of it that count, in the order in which they were handed out; as they were judged at a reveal."""
+    """Return the checkpoint's trials that count, in order of allocation; as judged at a reveal."""
     return [
         _Tried(plan, (each.station, each.scene, each.position), each.success)
         for each in load_plan_outcomes(plan)
@@ -99,7 +100,7 @@ def _by_plan(rows: Iterable[_Tried]) -> Iterator[dict[str, Any]]:
 
 
 def _differ(before: Sequence[_Tried], since: Sequence[_Tried]) -> float | None:
-    """Exact within each condition; two-sided."""
+    """Return the exact two-sided probability, stratified by condition; None if no condition has both."""
     conditions = sorted({each.condition for each in (*before, *since)})
     tables = []
     for condition in conditions:

@@ -1,4 +1,4 @@
-"""Which trials of an evaluation are meant; in addresses of pages and of REST."""
+"""Filters of an evaluation's trials, as used in addresses of pages and of REST."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Run = TypeVar("Run", Outcome, Interruption)
 
 @dataclass(frozen=True, slots=True)
 class TrialFilter:
-    """Scene, position, station and operator by name; "" where it does not matter."""
+    """Filter by scene, position, station and operator; "" matches all."""
 
     scene: str = ""
     position: str = ""
@@ -24,11 +24,11 @@ class TrialFilter:
 
     @property
     def query(self) -> str:
-        """As it stands in an address; "" where nothing is chosen."""
+        """Query string of the filter; "" if it matches all."""
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
     def apply(self, runs: Iterable[Run]) -> list[Run]:
-        """Those that fit."""
+        """Return the runs that match."""
         return [
             run
             for run in runs
@@ -40,7 +40,11 @@ class TrialFilter:
 
 
 def parse_filter(given: Mapping[str, str], runs: Iterable[Outcome]) -> TrialFilter:
-    """The filters of an address; EvaError says what there is where one names what the trials do not have."""
+    """Return the filter of an address.
+
+    Raises:
+        EvaError: If it names a value that the trials do not have.
+    """
     found = TrialFilter(
         **{name: given.get(name, "").strip() for name in ("scene", "position", "station", "operator")}
     )
@@ -52,7 +56,7 @@ def parse_filter(given: Mapping[str, str], runs: Iterable[Outcome]) -> TrialFilt
 
 
 def filter_choices(runs: Iterable[Outcome]) -> dict[str, list[str]]:
-    """Values that can be chosen of each field."""
+    """Return the values of each field that can be selected."""
     given = list(runs)
     positions = sorted({run.position for run in given})
     return {

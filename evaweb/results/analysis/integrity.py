@@ -1,4 +1,4 @@
-"""What was taken out, repeated or changed in an evaluation, by checkpoint."""
+"""Removed, repeated and changed trials of an evaluation, by checkpoint."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from evaweb.plans.models import CountsAs, Plan
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 
 VERDICT, CATEGORY, NOTE = "verdict", "category", "note"
-"""What a score changes of the one before it: success, score or milestones; else why it failed; else words alone."""
+"""What a score changes of the previous score: success, score or milestones; or only the failure's category;
+or only the note.
+"""
 
 
 @dataclass
 class CheckpointChanges:
-    """Of one checkpoint: attempts, and those that do not count.
+    """Attempts of one checkpoint, and those that do not count.
 
-    Voided trials are told apart by what their score said before (`voided_unscored`: there was none); of `asked`
-    the void waits for a second operator. Scores that were corrected: `to_success`, `to_failure`, and `late` those
-    after the reveal, without corrections of a failure's category alone. `estop`, `interruption` and `timeout`: runs
-    that these ended; `declared`: those that count and are failures by the plan, whatever was reached.
+    Voided trials are counted by their previous score (`voided_unscored`: there was none); for `asked` the void waits
+    for a second operator. `to_success` and `to_failure` are corrected scores; `late` are corrections after the reveal,
+    except those of a failure's category alone. `estop`, `interruption` and `timeout` are runs that ended so;
+    `declared` are trials that count as failures by the plan's rules, whatever was reached.
     """
 
     checkpoint: str
@@ -47,12 +49,12 @@ class CheckpointChanges:
 
     @property
     def voided(self) -> int:
-        """Voided trials, whatever was said of them before."""
+        """Number of voided trials."""
         return self.voided_successes + self.voided_failures + self.voided_unscored
 
 
 def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
-    """Those of each checkpoint, in the order of their names; as many queries whatever the number of trials."""
+    """Return the changes of each checkpoint by name; the number of queries does not depend on the number of trials."""
     found: dict[str, CheckpointChanges] = {}
     trials = Trial.objects.filter(handout__plan=plan).order_by("checkpoint__name")
     ends = ("ended_by", "status", "reason", "episode__status", "episode__frames")
@@ -88,10 +90,11 @@ def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
 
 
 def with_changes(scores: QuerySet[Score], **named: F) -> list[dict[str, Any]]:
-    """These scores in the order in which they were given, all of each trial among them, with what is `named`.
+    """Return the scores in the order in which they were given, with the fields in `named`.
 
-    `earlier` is the row of the one before on its trial, None of a first one; `changed` is what it changes of that, of a
-    first one its verdict. One query, and one more where a score says success and points of the one before again.
+    The queryset must contain all scores of each trial. `earlier` is the row of the trial's previous score, None for a
+    first score; `changed` is the kind of change, VERDICT for a first score. One query, and one more if a score repeats
+    success and points of the previous one.
     """
     fields = ("pk", "trial_id", "success", "score", "failure_phase", "failure")
     rows = list(scores.order_by("pk").values(*fields, **named))
@@ -115,7 +118,7 @@ def _same(row: dict[str, Any], fields: tuple[str, ...]) -> bool:
 
 
 def _outcomes(scores: QuerySet[Score]) -> dict[int, list[tuple[Any, ...]]]:
-    """The milestones as they were judged, by score, of trials that have more than one."""
+    """Return the milestone outcomes by score, for trials with more than one score."""
     corrected = scores.order_by().values("trial").annotate(n=Count("pk")).filter(n__gt=1).values("trial")
     rows = MilestoneOutcome.objects.filter(score__trial__in=corrected).order_by("order")
     found: dict[int, list[tuple[Any, ...]]] = defaultdict(list)

@@ -1,4 +1,4 @@
-"""Outcomes out of the database, in as many queries whatever their number."""
+"""Loading of outcomes from the database, with a constant number of queries."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 
-# What an outcome calls it, and where a trial has it.
+# Field of an outcome: field of a trial.
 _RUN = {
     "trial": "pk",
     "checkpoint": "checkpoint__name",
@@ -33,10 +33,10 @@ _FIELDS = _RUN | {
 
 
 def load_plan_outcomes(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
-    """Those of a plan that count, in the order in which they were handed out.
+    """Return the outcomes of a plan that count, in order of allocation.
 
-    Of a revealed plan as they were judged at the reveal; `corrected`: as they are now. Why a trial failed is what is
-    said of it now: no figure of a comparison has it.
+    For a revealed plan they are as judged at the reveal, or as of now with `corrected`. Causes of failure are always
+    the current ones, because no comparison uses them.
     """
     trials = Trial.objects.filter(handout__plan=plan)
     blocks = dict(plan.handouts.values_list("trial_id", "slot__block"))
@@ -46,16 +46,16 @@ def load_plan_outcomes(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
 
 
 def load_plan_interruptions(plan: Plan) -> list[Interruption]:
-    """Runs of a plan that were broken off and not scored."""
+    """Return the runs of a plan that were interrupted and not scored."""
     broken = Trial.objects.filter(handout__plan=plan, status=TrialStatus.INTERRUPTED).order_by("pk")
     rows = broken.values_list(*_RUN.values())
     return [Interruption(**dict(zip(_RUN, row, strict=True))) for row in rows]
 
 
 def load_outcomes(trials: QuerySet[Trial]) -> list[Outcome]:
-    """Those of any trials that count, in the order in which they were started.
+    """Return the outcomes of any trials that count, in the order of their start.
 
-    Trials of the same number at the same position met the same conditions as far as was meant.
+    Trials with the same number at the same position are assumed to have had the same conditions.
     """
     return _outcomes(trials, {}, {})
 
@@ -63,7 +63,7 @@ def load_outcomes(trials: QuerySet[Trial]) -> list[Outcome]:
 def _outcomes(
     trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int], until: datetime | None = None
 ) -> list[Outcome]:
-    """`until`: by the newest of the scores that were given before, without trials that had none yet."""
+    """Return the outcomes; with `until` by the newest scores given by then, without trials that had none."""
     scored = trials.filter(status=TrialStatus.SCORED).order_by("started_at", "pk")
     rows = list(scored.values_list("verdict_id", "number", *_FIELDS.values()))
     earlier = {} if until is None else _scores_before(until, trials)
@@ -76,7 +76,7 @@ def _outcomes(
             if said["trial"] not in earlier:
                 continue
             verdict, judged = earlier[said["trial"]]
-            same = said["success"] == judged["success"]  # then why it failed may be said better by now
+            same = said["success"] == judged["success"]  # the current cause may be more precise
             said |= {name: value for name, value in judged.items() if not (same and name in FIELDS)}
         reached = milestones.get(verdict, [])
         found.append(
@@ -92,7 +92,7 @@ def _outcomes(
 
 
 def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[int, dict[str, Any]]]:
-    """Of each trial the newest score that was given before then: its key, and what it says."""
+    """Return by trial the newest score given before `until`: its key and its values."""
     given = Score.objects.filter(trial__in=trials, scored_at__lte=until).order_by("pk")
     return {
         trial: (key, dict(zip(_JUDGED, said, strict=True)))
@@ -103,7 +103,7 @@ def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[
 def _milestones(
     trials: QuerySet[Trial], earlier: dict[int, tuple[int, dict[str, Any]]]
 ) -> dict[int, list[tuple[str, bool]]]:
-    """Of each score that counts its milestones in their order; where `earlier` ones count, of all scores."""
+    """Return the milestones of each score that counts, in order; of all scores if earlier ones count."""
     counting = (
         MilestoneOutcome.objects.filter(score__trial__in=trials)
         if earlier

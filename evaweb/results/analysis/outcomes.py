@@ -1,4 +1,4 @@
-"""One scored trial, as all analyses take it; no Django, so that a report outside of it counts the same."""
+"""Outcome of one scored trial, the input of all analyses; without Django, so that offline reports compute the same."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from evaweb.trials.failure_words import failure_text
 class Outcome:
     """Outcome of one trial that counts.
 
-    `order` is when it was run among those of its evaluation, `block` names the initial condition and its repetition:
-    trials of one block met the same one. `milestones` are those of its scene in their order. `duration` is in s.
+    `order` is its position among the runs of its evaluation. `block` names initial condition and repetition: trials of
+    one block had the same one. `milestones` are those of its scene, in order. `duration` is in s.
     """
 
     trial: int
@@ -30,25 +30,25 @@ class Outcome:
     failure: str = ""
     station: str = ""
     operator: str = ""
-    labels: tuple[str, ...] = field(default=())  # of the milestones
-    smoothness: float | None = None  # SPARC of the measured motion; None where there is no recording of it
-    commanded: float | None = None  # the same of what was sent
+    labels: tuple[str, ...] = field(default=())  # texts of the milestones
+    smoothness: float | None = None  # SPARC of the measured motion; None without a recording
+    commanded: float | None = None  # SPARC of the sent commands
     failure_phase: str = ""
 
     @property
     def why(self) -> str:
-        """Phase and cause of a failure, as far as they were said."""
+        """Phase and cause of a failure, as far as specified."""
         return failure_text(self.failure_phase, self.failure)
 
     @property
     def condition(self) -> str:
-        """The initial condition, without its repetition."""
+        """Initial condition without its repetition."""
         return f"{self.scene}/{self.position}"
 
 
 @dataclass(frozen=True, slots=True)
 class Interruption:
-    """A run that was broken off and is not scored: `duration` [s] where it is known."""
+    """Run that was interrupted and not scored; `duration` [s] if known."""
 
     trial: int
     checkpoint: str
@@ -60,7 +60,7 @@ class Interruption:
 
 
 def by_checkpoint(outcomes: Iterable[Outcome]) -> dict[str, list[Outcome]]:
-    """Each checkpoint's, in the order in which they were run."""
+    """Return the outcomes by checkpoint, in the order of running."""
     found: dict[str, list[Outcome]] = defaultdict(list)
     for outcome in sorted(outcomes, key=lambda o: o.order):
         found[outcome.checkpoint].append(outcome)
@@ -69,16 +69,16 @@ def by_checkpoint(outcomes: Iterable[Outcome]) -> dict[str, list[Outcome]]:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """The trials of two checkpoints in one block."""
+    """Trials of two checkpoints in one block."""
 
     first: Outcome
     second: Outcome
 
 
 def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
-    """Both checkpoints' trials, block by block: those of a plan as scheduled, others as they were completed.
+    """Return the pairs of both checkpoints' trials by block: as scheduled for a plan, else in the order of completion.
 
-    A block in which one of them is missing waits. Of several trials in one block, only the last ones count.
+    A block without one of them is skipped. Of several trials in one block only the last counts.
     """
     others = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
     ours = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
@@ -87,11 +87,13 @@ def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[P
 
 
 def unbroken(pairs: Sequence[Pair]) -> list[Pair]:
-    """Pairs of a whole plan, in their order, up to the first of its blocks that lacks one."""
+    """Return the pairs of a whole plan, in order, up to its first incomplete block."""
     return [pair for place, pair in enumerate(pairs) if _place(pair) == place]
 
 
 def _place(pair: Pair) -> int:
-    """Its place: the number of its block, which a plan's schedule gives; nobody's choice, whoever finishes first."""
+    """Return the pair's position: the block number from the schedule, which does not depend on which trial
+    finishes first.
+    """
     block = pair.first.block
     return int(block) if block.isdecimal() else max(pair.first.order, pair.second.order)

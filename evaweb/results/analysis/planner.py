@@ -1,4 +1,4 @@
-"""Trials and robot hours that a difference needs; what the trials there is time for miss."""
+"""Calculator of the trials and robot hours that a difference needs, and of what the available time can detect."""
 
 from __future__ import annotations
 
@@ -32,16 +32,17 @@ _RATE_BETTER_ALLOWED_DIFFERENCE_AT = Pattern(
     "rate = {rate!r} and better = {better!r}; allowed: a difference of at least {least:g}",
 )
 
-LEAST = 0.001  # difference of rates: some four million trials an arm
+LEAST = 0.001  # smallest difference of rates: some four million trials per arm
 _GAINS = (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Rates of the weaker and of the better checkpoint, alpha, power, time per trial [s], and what there is of it.
+    """Input of the calculator: assumed rates of the weaker and the better checkpoint, alpha, power, time per trial
+    [s], resources.
 
-    `checkpoints` are compared as a plan's `comparing` says, on `stations` at once; `hours` are those that there is time
-    for at each.
+    `checkpoints` are compared as in a plan's `comparing`, on `stations` in parallel; `hours` is the time available at
+    each station.
     """
 
     rate: float = 0.5
@@ -55,7 +56,7 @@ class Question:
     hours: float = 8.0
 
 
-COMPARISONS = {  # of so many checkpoints
+COMPARISONS = {  # number of comparisons of `checkpoints` checkpoints
     Comparing.ALL: lambda checkpoints: checkpoints * (checkpoints - 1) // 2,
     Comparing.CONTROL: lambda checkpoints: checkpoints - 1,
     Comparing.PAIR: lambda checkpoints: 1,
@@ -73,7 +74,11 @@ _ALLOWED: dict[str, tuple[float, float]] = {
 
 
 def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
-    """The question of an address; EvaError names what is not allowed. `alike`: both rates may be the same."""
+    """Return the input from an address; with `alike` both rates may be equal.
+
+    Raises:
+        EvaError: If a value is not allowed.
+    """
     found: dict[str, Any] = {}
     for field in fields(Question):
         text = given.get(field.name, "").strip()
@@ -105,9 +110,13 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
 
 
 def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, Any]:
-    """What each design needs for the question, what the time there is for finds, and the gains that it finds.
+    """Return what each design needs for the input, what the available time can detect, and power by gain.
 
-    Computed for `person`; Busy beyond what theirs may take, UnderWay where it is not known in time, or `soon`.
+    Computed on behalf of `person`, who has a limited share of the computation.
+
+    Raises:
+        Busy: If the person's share is used up.
+        UnderWay: If the result is not ready in time; with `soon` after a short wait.
     """
     comparisons = COMPARISONS[Comparing(q.comparing)](q.checkpoints)
     alpha = q.alpha / comparisons
@@ -135,13 +144,16 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
 
 
 def told(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
-    """A design that has the power: its trials at worst and on average, with hours at the robots; None: none has it."""
+    """Return a design that reaches the power, with its trials and robot hours at most and on average; without
+    one, `pairs` is None.
+    """
     if found is None:
         return {"rule": rule, "pairs": None}
     hour = q.checkpoints * q.cycle_s / 3600
     return {
         **asdict(found),
-        # Several comparisons go on until the last one has ended: at a few rates that is hardly before all are made.
+        # Several comparisons continue until the last one has ended, which at most rates is hardly before all trials
+        # are made.
         **({} if alone else {"mean": None, "median": None}),
         "total": found.pairs * q.checkpoints,
         "robot_hours": found.pairs * hour,

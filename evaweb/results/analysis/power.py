@@ -1,7 +1,7 @@
-"""Power of a draft's design at assumed rates, computed beside the page: what there is so far, until all is there.
+"""Power of a draft's design at assumed rates, computed in the background and shown as far as it is available.
 
-One thread of each process of the web has it computed, one number after the other. What nobody asks for any more is
-given up between two of them, and what was computed is known afterwards.
+One thread per web process computes it, value by value. A computation that nobody requests any more is abandoned
+between two values; computed values are cached.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from evaweb.statistics.score_courses import Scores, score_course, score_pairs_ne
 
 log = logging.getLogger(__name__)
 _STEPS = 12  # points of a curve
-_LEAST = 40  # trials of each to which a curve goes at least
-_GIVEN_UP_S = 10.0  # after it was last asked for
+_LEAST = 40  # least range of a curve [trials per arm]
+_GIVEN_UP_S = 10.0  # time after the last request
 _KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A design of so many pairs, at each comparison's share of alpha, and the rates that are assumed.
+    """Request for the power of a design with `pairs` pairs, at each comparison's share of alpha and at assumed rates.
 
-    `question` has rates, wanted power and times; its weaker rate is that of the control. `alone`: the plan has one
-    comparison. With `scores` these are compared, and the rates are their means.
+    `question` has rates, wanted power and times; its weaker rate is that of the control. `alone`: the plan has a
+    single comparison. With `scores` these are compared, and the rates are their means.
     """
 
     rule: str
@@ -50,7 +50,7 @@ class Asked:
 
     @property
     def rules(self) -> tuple[str, ...]:
-        """The designs that may be chosen for this question, the chosen one first."""
+        """Designs that may be selected for this request, the selected one first."""
         if self.scores is not None:
             return (self.rule, *(rule for rule in score_courses.RULES if rule != self.rule))
         others = (rule for rule in RULES if rule != self.rule and (self.margin is None or rule != ANYTIME))
@@ -58,13 +58,13 @@ class Asked:
 
     @property
     def numbers(self) -> list[int]:
-        """Trials of each at which curves are computed, the planned number among them."""
+        """Numbers of trials per arm at which curves are computed, including the planned number."""
         end = min(MOST, max(_LEAST, round(1.6 * self.pairs)))
         found = {max(2, round(end * step / _STEPS)) for step in range(1, _STEPS + 1)}
         return sorted(found | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
 
     def at(self, rule: str, pairs: int) -> DesignPower:
-        """Course of a design of so many pairs, its looks at the same shares of the trials."""
+        """Return the power of a design with `pairs` pairs, its looks at the same shares of the trials."""
         if self.scores is not None:
             return _computed(score_course, rule, pairs, self.scores, self.alpha)
         looks = self.looks if rule == self.rule else ()
@@ -75,7 +75,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """What is computed so far: courses by design in ascending numbers, and what each design needs."""
+    """Results so far: power by design in ascending numbers of pairs, and what each design needs."""
 
     curves: dict[str, tuple[DesignPower, ...]] = field(default_factory=dict)
     needs: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -85,17 +85,17 @@ class Figures:
 
     @property
     def whole(self) -> bool:
-        """Whether nothing more comes."""
+        """Whether the results are complete."""
         return bool(self.fault) or self.done == self.of
 
     def planned(self, asked: Asked) -> dict[str, DesignPower]:
-        """The courses at the planned number of trials, by design."""
+        """Return the power at the planned number of trials, by design."""
         found = ((rule, one) for rule, curve in self.curves.items() for one in curve)
         return {rule: one for rule, one in found if one.pairs == asked.pairs}
 
 
 def _computed(work: Callable[..., Any], *given: Any) -> Any:
-    """Beside the web; all drafts have one share, because they are computed one after the other."""
+    """Compute outside the web process; all drafts have one share, because they are computed one after the other."""
     return computing.questions.compute("drafts", work, *given)
 
 
@@ -103,7 +103,7 @@ _Step = Callable[[Figures], Figures]
 
 
 def _steps(asked: Asked) -> Iterator[_Step]:
-    """In the order in which they are shown: the chosen design, the planned number of all, what is needed, the rest."""
+    """Yield the steps in order of display: selected design, planned number of all designs, needs, remaining points."""
     planned = [asked.pairs] if asked.pairs in asked.numbers else []
     yield from (_point(asked, asked.rule, number) for number in [*planned, *asked.numbers])
     others = asked.rules[1:]
@@ -136,7 +136,7 @@ def _need(asked: Asked, rule: str) -> _Step:
 
 
 class _Desk:
-    """Work that is asked for; the newest of each person is done, and what they asked for before is given up."""
+    """Queue of requests; only the newest of each person is computed, earlier ones are abandoned."""
 
     def __init__(self) -> None:
         self._changed = Condition()
@@ -146,7 +146,7 @@ class _Desk:
         self._thread = ThreadPoolExecutor(1, "power")
 
     def ask(self, person: Hashable, asked: Asked, patience_s: float) -> Figures:
-        """What there is after `patience_s` at most, or as soon as all of it is there."""
+        """Return the results so far, after at most `patience_s` [s] or as soon as they are complete."""
         with self._changed:
             self._newest[person] = (asked, time.monotonic())
             if asked not in self._found:
@@ -173,7 +173,7 @@ class _Desk:
                 if so_far is None or not self._wanted(asked):
                     self._under_way.discard(asked)
                     return
-            if number <= so_far.done:  # known from before it was given up
+            if number <= so_far.done:  # computed before it was abandoned
                 continue
             try:
                 found = replace(step(so_far), done=number, of=len(steps))
@@ -195,5 +195,5 @@ _desk = _Desk()
 
 
 def figures(person: Hashable, asked: Asked, patience_s: float = 0.5) -> Figures:
-    """What there is so far of this design's power; it goes on being computed as long as the person asks."""
+    """Return the results so far; the computation continues as long as the person repeats the request."""
     return _desk.ask(person, asked, patience_s)

@@ -1,4 +1,4 @@
-"""Evaluations on simulated benches beside a real one of the same checkpoints."""
+"""Comparison of evaluations on simulated benches with a real one of the same checkpoints."""
 
 from __future__ import annotations
 
@@ -17,13 +17,17 @@ from evaweb.statistics.simulated_real import Powered, powered_difference, rank_c
 
 
 def is_simulated(plan: Plan) -> bool | None:
-    """Whether all of its trials were made on simulated benches, or all on real ones (False); None of both, or none."""
+    """Return whether all trials were made on simulated benches (True) or on real ones (False); None if mixed
+    or without trials.
+    """
     kinds = set(plan.handouts.order_by().values_list("trial__station__simulated", flat=True).distinct())
     return kinds.pop() if len(kinds) == 1 else None
 
 
 def simulated_plans(plan: Plan) -> list[Plan]:
-    """Plans of two of its checkpoints or more that were made on simulated benches, where this one is real."""
+    """Return related plans made on simulated benches that share two checkpoints or more; [] unless this plan
+    is real.
+    """
     if is_simulated(plan) is not False:
         return []
     there = Station.objects.filter(simulated=True)
@@ -32,10 +36,10 @@ def simulated_plans(plan: Plan) -> list[Plan]:
 
 
 def set_beside(real: Plan, simulated: Plan) -> dict[str, Any]:
-    """Rates of the checkpoints that both have, how far simulation orders them as the robot did, and the differences of
-    the real plan's comparisons with what simulation adds.
+    """Return rates of the shared checkpoints, agreement of their order, and differences that use the simulated trials
+    too.
 
-    Trials are matched by checkpoint, scene and position, the first with the first.
+    Trials are matched by checkpoint, scene and position, in order.
     """
     ours, theirs = (by_checkpoint(cached_runs(plan).outcomes) for plan in (real, simulated))
     shared = sorted(set(ours) & set(theirs))
@@ -74,7 +78,7 @@ def _matched(real: Sequence[Outcome], simulated: Sequence[Outcome]) -> Powered:
         for condition, rows in ours.items()
         for pair in zip(rows, theirs.get(condition, []), strict=False)
     ]
-    # Those beside them are of the same conditions in the same proportions: else an easy one would count for more.
+    # Unpaired trials have the same conditions in the same proportions: otherwise an easy condition would gain weight.
     times = min((len(theirs.get(condition, [])) // len(rows) for condition, rows in ours.items()), default=0)
     beside = [
         value

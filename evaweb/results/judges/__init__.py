@@ -1,6 +1,6 @@
-"""One file per automatic judge. Each declares `SEES`, `SERVED` and `build`; see base."""
+"""Automatic judges, one module each, with `SEES`, `SERVED` and `build`; see base."""
 
-# Each kind with its module, which is imported where a judge of that kind is asked.
+# Module by kind, imported when a judge of that kind is used.
 KINDS = {
     "bench": "evaweb.results.judges.bench",
     "chat": "evaweb.results.judges.chat",

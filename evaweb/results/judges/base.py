@@ -1,8 +1,8 @@
-"""What an automatic judge is given of a trial, and what it says of it.
+"""Interface of automatic judges: the case that a judge receives, and its judgement.
 
-A module of a judge has `SEES` ("pictures" or "truth": it is given that and not the other), `SERVED` (whether it sends
-what it sees to an address, which an administrator has to allow first) and `build(setup)`, a `Judge`. EvaError says what
-is wrong with a set-up.
+A judge's module has `SEES` ("pictures" or "truth": it receives only that), `SERVED` (whether it sends data to an
+address, which an administrator has to allow first) and `build(setup)`, which returns a `Judge` and raises EvaError for
+an invalid set-up.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-PATIENCE_S = 120.0  # for all that a judge does about one trial
+PATIENCE_S = 120.0  # time limit for one trial
 
 
 class NoVerdict(Exception):
-    """The judge said nothing that can be used; why, in words. The trial is not shown to it again."""
+    """The judge gave no usable verdict, with the reason as text. The trial is not shown to it again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What an administrator has said of a judge that has a server; `plain`: over http, to another machine too."""
+    """Set-up of a judge by an administrator; with `plain`, http to another machine is allowed."""
 
     address: str = ""
     model: str = ""
@@ -30,7 +30,7 @@ class Setup:
 
 @dataclass(frozen=True, slots=True)
 class MilestonePrompt:
-    """A milestone in its words, and until when it counts [s], None where it always does."""
+    """Milestone as text, and its time limit [s], None without one."""
 
     text: str
     limit_s: float | None = None
@@ -38,7 +38,7 @@ class MilestonePrompt:
 
 @dataclass(frozen=True, slots=True)
 class StillImage:
-    """A picture of `camera`, a number and no name, `at` [s] after the start of the run; a JPEG of pixels alone."""
+    """JPEG of `camera` (an anonymous number), `at` [s] after the start of the run, without metadata."""
 
     camera: str
     at: float
@@ -47,9 +47,9 @@ class StillImage:
 
 @dataclass(frozen=True, slots=True)
 class TrialCase:
-    """One trial as a judge is shown it; nothing here tells its code, checkpoint, score, plan, operator or files.
+    """Trial as shown to a judge, without code, checkpoint, score, plan, operator or file names.
 
-    `truth` has for each step whether the bench itself says that it was reached, None where it says nothing.
+    `truth` has for each step whether the bench reports it as reached, None if it reports nothing.
     """
 
     instruction: str
@@ -61,7 +61,7 @@ class TrialCase:
 
 @dataclass(frozen=True, slots=True)
 class MilestoneJudgement:
-    """Of one milestone: whether it was reached, and how probable that is, 0 to 1; both None for no verdict."""
+    """Judgement of one milestone: whether it was reached, and the probability (0 to 1); both None for no verdict."""
 
     reached: bool | None = None
     probability: float | None = None
@@ -71,7 +71,7 @@ class MilestoneJudgement:
             raise ValueError("a verdict and its probability stand together")
         if self.probability is None:
             return
-        if not 0 <= self.probability <= 1:  # nor NaN
+        if not 0 <= self.probability <= 1:  # excludes NaN too
             raise ValueError(f"probability = {self.probability}; allowed: 0 to 1")
         if self.reached != (self.probability >= 0.5) and self.probability != 0.5:
             raise ValueError(f"{self.probability} that it was reached contradicts the verdict")
@@ -79,21 +79,26 @@ class MilestoneJudgement:
 
 @dataclass(frozen=True, slots=True)
 class CaseJudgement:
-    """One word on each milestone, in their order; `model` is what the server says has answered."""
+    """Judgement of each milestone, in order; `model` is the model that the server reports."""
 
     milestones: tuple[MilestoneJudgement, ...]
     model: str = ""
 
 
 class Judge(Protocol):
-    """Says of each milestone of a trial whether it was reached; asked once about each."""
+    """Judge of whether a trial's milestones were reached; called once per trial."""
 
     @property
     def version(self) -> str:
-        """Another one where the same case could be judged otherwise."""
+        """Version; it changes whenever the same case could be judged differently."""
 
     def prompt_text(self, case: TrialCase) -> str:
-        """All that it is told in words, "" for nothing."""
+        """Return the complete text of the prompt, "" if there is none."""
 
     def judge(self, case: TrialCase) -> CaseJudgement:
-        """Raises NoVerdict; whatever else it raises is a fault of the judge, and the trial is shown to it again."""
+        """Return the judgement of a case.
+
+        Raises:
+            NoVerdict: If it has none. Any other exception is a fault of the judge, and the trial is shown to it
+                again.
+        """

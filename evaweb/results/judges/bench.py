@@ -1,4 +1,4 @@
-"""A simulated bench as a judge: what it says itself of how it was left."""
+"""Judge for simulated benches: reports the bench's own ground truth."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ SERVED = False
 
 
 class BenchTruth:
-    """Certain of all that the bench reports, and silent about the rest."""
+    """Judge that is certain of all that the bench reports, and gives no verdict on the rest."""
 
     version = "bench 1"
 
     def prompt_text(self, case: TrialCase) -> str:
-        """It is asked nothing."""
+        """Return "": it has no prompt."""
         return ""
 
     def judge(self, case: TrialCase) -> CaseJudgement:
-        """Whether the bench says that each was reached, within its time."""
+        """Return whether the bench reports each milestone as reached within its time."""
         if all(known is None for known in case.truth):
             raise NoVerdict("the bench reports none of its milestones")
         return CaseJudgement(
@@ -32,5 +32,5 @@ class BenchTruth:
 
 
 def build(setup: Setup) -> BenchTruth:
-    """It has no set-up."""
+    """Return the judge; it uses no set-up."""
     return BenchTruth()

@@ -1,7 +1,7 @@
-"""A judge behind an HTTP server of the OpenAI-compatible chat format, shown pictures and asked once about a trial.
+"""Judge behind an HTTP server with the OpenAI-compatible chat format, which is sent images once per trial.
 
-It is sent to the address that its set-up names and to no other: redirects are not followed and no proxy is used. What
-it answers is bounded in time and size, and either is exactly what was asked for or no verdict.
+Requests go only to the address in its set-up: redirects are not followed and proxies are not used. Time and size of
+the answer are limited, and an answer in any other than the requested format is no verdict.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _MODEL_CONTAINS_WHAT_VARIABLE_HOLDS = Pattern(
 
 SEES: Literal["pictures", "truth"] = "pictures"
 SERVED = True
-LARGEST_ANSWER = 256 * 1024  # bytes
+LARGEST_ANSWER = 256 * 1024  # [bytes]
 _CONNECT_S = 10.0
 _KEY = re.compile(r"EVA_JUDGE_[A-Z0-9_]{1,60}")
 _HOW = (
@@ -77,7 +77,7 @@ _HOW = (
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a judge is asked."""
+    """Address of a judge's server."""
 
     secure: bool
     host: str
@@ -86,7 +86,11 @@ class Endpoint:
 
 
 def endpoint_of(setup: Setup) -> Endpoint:
-    """The address of a set-up, to which /chat/completions is added; EvaError says what is allowed."""
+    """Return the endpoint of a set-up's address, with /chat/completions appended.
+
+    Raises:
+        EvaError: If the address is not allowed.
+    """
     given = setup.address
     allowed = "allowed: https://HOST[:PORT]/PATH, such as https://judge.example.org/v1"
     try:
@@ -144,7 +148,7 @@ class _Completion(BaseModel):
 
 
 class ChatJudge:
-    """Asks once, waits so long and no longer, and takes nothing but what was asked for."""
+    """Judge that sends one request per trial, with a time limit and a strict answer format."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
@@ -156,15 +160,20 @@ class ChatJudge:
 
     @property
     def version(self) -> str:
-        """With the model that is asked."""
+        """Version with the name of the model."""
         return f"chat 1, {self._setup.model}"
 
     def prompt_text(self, case: TrialCase) -> str:
-        """What stands around the pictures."""
+        """Return the texts around the images."""
         return json.dumps([_HOW, _question(case)], ensure_ascii=False)
 
     def judge(self, case: TrialCase) -> CaseJudgement:
-        """What the server says; NoVerdict with the reason otherwise, EvaError where its key is not there."""
+        """Return the server's judgement.
+
+        Raises:
+            NoVerdict: If there is no usable answer; with the reason.
+            EvaError: If the key is not available.
+        """
         key = self._key()
         content = self._post(json.dumps(_request(case, self._setup.model)).encode(), key)
         try:
@@ -180,7 +189,7 @@ class ChatJudge:
         key = os.environ.get(name, "").strip()
         if not re.fullmatch(r"[!-~]{1,4096}", key):
             raise EvaError(_VARIABLE_WORKER_ENVIRONMENT_NOT_SET(name=name))
-        if key in self._setup.model:  # which is kept, with every judgement
+        if key in self._setup.model:  # the name is stored with every judgement
             raise EvaError(_MODEL_CONTAINS_WHAT_VARIABLE_HOLDS(name=name))
         return key
 
@@ -188,7 +197,7 @@ class ChatJudge:
         at, wait = self._endpoint, self._setup.patience_s
         headers = {"Content-Type": "application/json", "Accept": "application/json", "Connection": "close"}
         headers |= {"Authorization": f"Bearer {key}"} if key else {}
-        # Of http.client and not of urllib: that follows redirects, and proxies of the environment.
+        # Not urllib: it follows redirects, and uses the proxies of the environment.
         connection = (http.client.HTTPSConnection if at.secure else http.client.HTTPConnection)(
             at.host, at.port
         )
@@ -200,7 +209,7 @@ class ChatJudge:
                 content = answer.read(LARGEST_ANSWER + 1) if answer.status == 200 else b""
             except (OSError, http.client.HTTPException, UnicodeError) as error:
                 raise NoVerdict(_no_answer(error, deadline)) from None
-            if deadline.over:  # what is cut off may look like an end
+            if deadline.over:  # a truncated answer may look complete
                 raise NoVerdict(_no_answer(TimeoutError(), deadline))
         if 300 <= answer.status < 400:
             raise NoVerdict(f"the server sends on to elsewhere (HTTP {answer.status}), which is not followed")
@@ -212,7 +221,7 @@ class ChatJudge:
 
 
 class _Deadline:
-    """Cuts a connection off when its time is over, whatever it is waiting for then."""
+    """Deadline that shuts down a connection when it is over, whatever the connection is waiting for."""
 
     def __init__(self, wait: float) -> None:
         self.wait, self.over = wait, False
@@ -230,7 +239,7 @@ class _Deadline:
             self._socket.close()
 
     def connected(self, at: Endpoint) -> socket.socket:
-        """A connection to there, with its certificate verified."""
+        """Return a connection to the endpoint, with its certificate verified."""
         made = socket.create_connection((at.host, at.port), min(self.wait, _CONNECT_S))
         made.settimeout(self.wait)
         self._socket = made
@@ -247,7 +256,9 @@ class _Deadline:
         self.over = True
         if self._socket is not None:
             with suppress(OSError):
-                socket.socket.shutdown(self._socket, socket.SHUT_RDWR)  # not TLS's own, which would wait
+                socket.socket.shutdown(
+                    self._socket, socket.SHUT_RDWR
+                )  # not the shutdown of TLS, which would wait
 
 
 def _no_answer(error: Exception, deadline: _Deadline) -> str:
@@ -293,7 +304,11 @@ def _parts(still: StillImage) -> list[dict[str, Any]]:
 
 
 def _read(content: bytes, n: int) -> CaseJudgement:
-    """The verdict on `n` milestones in what a server answered; NoVerdict."""
+    """Return the judgement of `n` milestones from a server's answer.
+
+    Raises:
+        NoVerdict: If it is not exactly in the requested format.
+    """
     try:
         completion = _Completion.model_validate_json(content)
     except ValidationError as error:
@@ -317,7 +332,7 @@ def _read(content: bytes, n: int) -> CaseJudgement:
 
 
 def _without(key: str, text: str) -> str:
-    """There are servers that quote the key, in any of the ways in which JSON writes a text."""
+    """Return the text without the key: some servers quote it in their answers."""
     return text.replace(key, "...") if key else text
 
 
@@ -330,12 +345,16 @@ def _said(line: _Line) -> MilestoneJudgement:
 
 
 def _wrong(error: ValidationError) -> str:
-    """The first fault, without what stood there."""
+    """Return the first validation error, without the invalid input."""
     first = error.errors(include_url=False, include_input=False)[0]
     place = ".".join(map(str, first["loc"]))
     return f"{place}: {first['msg']}" if place else str(first["msg"])
 
 
 def build(setup: Setup) -> ChatJudge:
-    """EvaError where address, model or the name of the key cannot be."""
+    """Return the judge.
+
+    Raises:
+        EvaError: If address, model or name of the key variable is invalid.
+    """
     return ChatJudge(setup)

@@ -1,4 +1,4 @@
-"""A judge by the name of its kind; one that cannot be used is told in a sentence that names it."""
+"""Lookup of judges by kind; all their errors name the judge."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _JUDGE_KIND_ALLOWED = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class UsableJudge:
-    """A judge that can be asked; `pictures` where it is shown these, else the bench's truth."""
+    """Judge that is ready for use; `pictures` is True if it is shown images, False if the bench's truth."""
 
     name: str
     version: str
@@ -33,12 +33,17 @@ class UsableJudge:
     served: bool
 
     def prompt_text(self, case: TrialCase) -> str:
-        """All that it is told in words; EvaError that names the judge."""
+        """Return the complete text of the prompt; EvaError names the judge."""
         with _named(self.name):
             return self.judge.prompt_text(case)
 
     def judge_case(self, case: TrialCase) -> CaseJudgement:
-        """Its verdict, one word for each milestone; NoVerdict, else EvaError that names the judge."""
+        """Return the judgement, with one entry per milestone.
+
+        Raises:
+            NoVerdict: If the judge has none.
+            EvaError: If its code fails; the message names the judge.
+        """
         with _named(self.name, NoVerdict):
             verdict = self.judge.judge(case)
         if len(verdict.milestones) != len(case.steps):
@@ -51,7 +56,11 @@ class UsableJudge:
 
 
 def build_judge(name: str, kind: str, setup: Setup) -> UsableJudge:
-    """The judge `name`, of that kind; EvaError where the kind or the set-up cannot be."""
+    """Return the judge `name` of that kind.
+
+    Raises:
+        EvaError: If kind or set-up is invalid.
+    """
     kinds = variants("evaweb.results.judges")
     if kind not in kinds:
         raise EvaError(_JUDGE_KIND_ALLOWED(name=name, kind=kind, kinds=", ".join(kinds)))
@@ -63,12 +72,12 @@ def build_judge(name: str, kind: str, setup: Setup) -> UsableJudge:
 
 @contextmanager
 def _named(name: str, *through: type[Exception]) -> Iterator[None]:
-    """Whatever a judge's own code raises, but `through`, as an EvaError that names the judge."""
+    """Convert exceptions of a judge's code, except `through`, to an EvaError that names the judge."""
     try:
         yield
     except through:
         raise
     except EvaError as fault:
         raise EvaError(f"judge {name}: {fault}") from fault
-    except Exception as fault:  # of anybody's code
+    except Exception as fault:  # a judge is third-party code and may raise anything
         raise EvaError(f"judge {name}: {type(fault).__name__}: {fault}") from fault

@@ -1,4 +1,4 @@
-"""Contents of the page of a draft: its steps, what is missing at each, the schedule's shape, and its power."""
+"""Contents of a draft's page: its steps, what is missing at each, example schedule, and power."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ STEPS = {
     "checks": "Checks",
     "freeze": "Freeze",
 }
-_BLOCKS = 6  # of a schedule that are shown
-_EXAMPLE = bytes(KEY_BYTES)  # draws the same example each time; the freeze draws a key of its own
+_BLOCKS = 6  # blocks of the example schedule
+_EXAMPLE = bytes(KEY_BYTES)  # fixed, so that the example stays the same; freezing draws a random key
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A step of the page; `done` where nothing of it is missing, else `words` say what is, and `blocks` whether a
-    freeze is refused for it.
+    """Step of the page; if it is not `done`, `words` name what is missing and `blocks` is whether that
+    prevents a freeze.
     """
 
     name: str
@@ -56,13 +56,13 @@ class Step:
 
     @property
     def tone(self) -> str:
-        """The colour of its state, by the name the style sheets have for it."""
+        """State colour, by its name in the style sheets."""
         return "warn" if self.blocks else "ok" if self.done else "neutral"
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """How large a plan is: positions, checkpoints, trials of each at all positions, trials together."""
+    """Size of a plan: positions, checkpoints, trials per checkpoint at all positions, trials in total."""
 
     positions: int
     checkpoints: int
@@ -71,7 +71,7 @@ class Size:
 
     @classmethod
     def of(cls, plan: Plan) -> Size:
-        """Of a draft."""
+        """Return the size of a draft."""
         positions, checkpoints = plan.positions.count(), plan.checkpoints.count()
         each = positions * plan.repetitions
         return cls(positions, checkpoints, each, each * checkpoints)
@@ -80,10 +80,14 @@ class Size:
 def state_page(
     plan: Plan, sight: Visibility, *, faults: Mapping[str, str], agreed: bool, cycle_s: float
 ) -> dict[str, Any]:
-    """What of the page follows from the draft: steps, schedule, checks, and whether it can be frozen.
+    """Return the contents that follow from the draft: steps, schedule, checks, and whether it can be frozen.
 
-    `faults` of what was typed and is not saved; `agreed`: the person has before them what is saved; `cycle_s`: the time
-    that a trial is assumed to take [s].
+    Args:
+        plan: The draft as it is saved.
+        sight: Visibility of the user.
+        faults: Messages by field for inputs that are not saved.
+        agreed: Whether the page shows exactly what is saved.
+        cycle_s: Assumed duration of a trial [s].
     """
     said = covered(plan, sight)
     inway = [Remark(row.step, said(row.text)) for row in problems(plan)]
@@ -154,7 +158,7 @@ def _step_of(field: str) -> str:
 
 
 def _summary(plan: Plan, size: Size, said: Callable[[str], str], cycle_s: float) -> Iterator[tuple[str, str]]:
-    """What a freeze asks about, once more in short."""
+    """Yield the properties of the plan that a freeze asks to confirm."""
     names = plan.checkpoints.order_by("name").values_list("name", flat=True)
     pairs = [f"{first} with {second}" for first, second in planned(plan)]
     scenes = plan.positions.values("scene").distinct().count()
@@ -175,7 +179,7 @@ def _summary(plan: Plan, size: Size, said: Callable[[str], str], cycle_s: float)
 
 
 def _preview(plan: Plan, size: Size) -> dict[str, Any]:
-    """The first blocks as they might come: which position comes when, and what runs in a block, the freeze draws."""
+    """Return an example of the first blocks; the actual order of positions and trials is drawn by the freeze."""
     conditions = [
         Condition(scene, number)
         for scene, number in plan.positions.order_by("scene__name", "number").values_list(
@@ -184,7 +188,7 @@ def _preview(plan: Plan, size: Size) -> dict[str, Any]:
     ]
     names = [
         str(number) for number in range(size.checkpoints)
-    ]  # a block's shape is the same whatever they are
+    ]  # the structure of a block does not depend on the names
     rounds = min(plan.repetitions, -(-_BLOCKS // len(conditions)))
     units = schedule(
         checkpoints=names, conditions=conditions, repetitions=rounds, key=_EXAMPLE, allocation=plan.allocation
@@ -205,7 +209,7 @@ def _preview(plan: Plan, size: Size) -> dict[str, Any]:
 
 
 def choices_page(plan: Plan, sight: Visibility, values: Values) -> dict[str, Any]:
-    """What can be chosen, and what of it is."""
+    """Return the available choices, and which of them are selected."""
     chosen = set(values["checkpoints"])
     offered = list(checkpoint_list(all_of_them=True, sight=sight))
     positions = Position.objects.select_related("scene").order_by("scene__title", "number")
@@ -242,7 +246,7 @@ def _end(name: str, value: str) -> tuple[str, str, Any, str]:
 
 
 def told(name: str, value: Any, sight: Visibility) -> str:
-    """A value of a draft in words."""
+    """Return a value of a draft as text."""
     if value in (None, "", []):
         return "nothing"
     if isinstance(value, list):
@@ -262,7 +266,7 @@ def told(name: str, value: Any, sight: Visibility) -> str:
 
 
 def _pictures(positions: Iterable[Position]) -> dict[int, str]:
-    """Of each position the newest reference picture of the first camera that has one."""
+    """Return for each position the newest reference image of the first camera that has one."""
     rows = Reference.objects.filter(position__in=list(positions)).order_by("camera", "-pk")
     found: dict[int, str] = {}
     for position, picture in rows.values_list("position", "picture"):
@@ -271,9 +275,9 @@ def _pictures(positions: Iterable[Position]) -> dict[int, str]:
 
 
 def asked_of(plan: Plan, question: Question, spread: float) -> Asked | None:
-    """What is computed of a draft's power; None where it compares nothing, or no trial is planned.
+    """Return the request for the draft's power; None if it compares nothing, or no trial is planned.
 
-    `spread` is the standard deviation that is assumed of scores, where these are compared.
+    `spread` is the assumed standard deviation of scores, if these are compared.
     """
     comparisons, size = len(planned(plan)), Size.of(plan)
     if not comparisons or not size.each:
@@ -287,14 +291,14 @@ def asked_of(plan: Plan, question: Question, spread: float) -> Asked | None:
 
 
 def _points(plan: Plan) -> int:
-    """Of how many points a score is a share, at the scene of the draft that has fewest; 1: success or failure."""
+    """Return the number of points of a score at the draft's scene with the fewest; 1 means success or failure only."""
     scenes = Scene.objects.filter(positions__in=plan.positions.all()).distinct()
     found = [sum(scene.milestones.values_list("points", flat=True)) or 1 for scene in scenes]
     return min([LARGEST, *found])
 
 
 def question_for(plan: Plan, given: Question) -> Question:
-    """The planner's question with what the draft says itself."""
+    """Return the calculator's input with the values that the draft defines itself."""
     size, stations = Size.of(plan), max(1, plan.stations.count())
     return Question(
         given.rate,
@@ -310,7 +314,7 @@ def question_for(plan: Plan, given: Question) -> Question:
 
 
 def power_page(plan: Plan, asked: Asked, found: Figures) -> dict[str, Any]:
-    """The figure and the table of designs, as far as they are computed."""
+    """Return the figure and the table of designs, as far as computed."""
     size, question = Size.of(plan), asked.question
     at = found.planned(asked)
     curves = [

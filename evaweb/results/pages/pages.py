@@ -1,4 +1,4 @@
-"""Contents of a plan's pages, computed here so that templates only place them."""
+"""Contents of a plan's pages, computed here so that templates only lay them out."""
 
 from __future__ import annotations
 
@@ -53,9 +53,13 @@ VIEWS = ("table", "grid")
 
 
 def summary_page(plan: Plan, only: TrialFilter) -> dict[str, Any]:
-    """Everything that the plan's page shows of its results."""
+    """Return the contents of the plan's page."""
     at, order = caching.fingerprint(plan), ordered_terms()
-    name = ("summary", only, *order.values())  # the lab's order of words is in no fingerprint of trials
+    name = (
+        "summary",
+        only,
+        *order.values(),
+    )  # the lab's order of failure terms is not part of the trials' fingerprint
     return caching.cached_page(plan, name, at, lambda: _summary(plan, only, at, order))
 
 
@@ -93,7 +97,11 @@ def _summary(
 
 
 def comparison_page(plan: Plan, only: TrialFilter, first: str, second: str) -> dict[str, Any]:
-    """Two checkpoints side by side, condition by condition; EvaError says which there are."""
+    """Return the comparison of two checkpoints, condition by condition.
+
+    Raises:
+        EvaError: If there is no such comparison; the message names the checkpoints.
+    """
     at = caching.fingerprint(plan)
     return caching.cached_page(
         plan, ("comparison", only, first, second), at, lambda: _compared(plan, only, first, second, at)
@@ -145,14 +153,18 @@ def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashab
 
 @dataclass(frozen=True, slots=True)
 class PairView:
-    """How the pairs of a comparison are shown: those alone that `differs`, as a table or in a grid."""
+    """Display of a comparison's pairs: all or only those that differ, as a table or a grid."""
 
     differs: bool = False
     view: str = "table"
 
 
 def pair_view(given: Mapping[str, str]) -> PairView:
-    """As the address has it; EvaError says what is allowed."""
+    """Return the display options of an address.
+
+    Raises:
+        EvaError: If a value is not allowed.
+    """
     only, view = given.get("differs", ""), given.get("view", "") or "table"
     if only not in ("", "1"):
         raise EvaError(_DIFFERS_ALLOWED_1_NOTHING(only=only))
@@ -162,7 +174,7 @@ def pair_view(given: Mapping[str, str]) -> PairView:
 
 
 def pairs_shown(page: Mapping[str, Any], how: PairView) -> dict[str, Any]:
-    """The pairs of a comparison's page with what is on the disk of them now."""
+    """Return the pairs of a comparison's page with the current state of their recordings."""
     differing = [row for row in page["paired"] if differs(row[1])]
     fitting = differing if how.differs else page["paired"]
     return {
@@ -175,7 +187,7 @@ def pairs_shown(page: Mapping[str, Any], how: PairView) -> dict[str, Any]:
 
 
 def evidence_page(plan: Plan) -> dict[str, Any]:
-    """The meter of the plan's comparison, whether its rule says to stop, and what would be gained by going on."""
+    """Return the evidence of the plan's comparisons, whether it suffices to stop, and what the trials cannot detect."""
     at = caching.fingerprint(plan)
     return caching.cached_page(plan, "evidence", at, lambda: _evidence(plan, at))
 

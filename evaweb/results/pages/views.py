@@ -1,4 +1,4 @@
-"""The pages of a plan: what its trials say, comparison, evidence, the trials themselves, what its owner does."""
+"""Pages of a plan: results, comparison, evidence, trials, and its owner's actions."""
 
 from __future__ import annotations
 
@@ -45,14 +45,16 @@ from evaweb.trials.voids import open_void_requests
 
 PER_PAGE = 50
 PLANS_PER_PAGE = 25
-MOST_LINES = 200  # of a list on the page of integrity; REST and the report have all
+MOST_LINES = 200  # lines per list on the integrity page; REST and the report have all
 _FORMS = {"txt": "text/plain", "tex": "application/x-tex", "svg": "image/svg+xml"}
-MOST_PICTURES = 32_000_000  # bytes of a report that is packed in memory; the command has no such limit
+MOST_PICTURES = (
+    32_000_000  # [bytes] of images in a report that is packed in memory; the command has no such limit
+)
 
 
 @require_GET
 def plans(request: HttpRequest) -> HttpResponseBase:
-    """All plans with their progress."""
+    """Render all plans with their progress."""
     listing = Listing(request.GET, listings.PLAN_COLUMNS, listings.PLAN_FILTERS)
     found = selectors.plan_list(**listing.chosen)
     if listing.wants_file:
@@ -70,13 +72,13 @@ def plans(request: HttpRequest) -> HttpResponseBase:
 
 @require_GET
 def plan(request: HttpRequest, name: str, version: int | None = None) -> HttpResponse:
-    """Results of the plan; where they are sealed, or not there yet, its progress."""
+    """Render the plan's results, or its progress if they are sealed or do not exist yet."""
     return _plan_page(request, _get_plan(name, version))
 
 
 @require_GET
 def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Two checkpoints of it side by side."""
+    """Render the comparison of two checkpoints."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -94,7 +96,7 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """The evidence so far, for users who may look; with HX-Request the meter alone, to be put into the page."""
+    """Render the evidence so far, for users who may see it; with HX-Request only the meter as a fragment."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -106,7 +108,7 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
-    """The trials that a number was made from."""
+    """Render the trials behind a number."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -132,7 +134,7 @@ def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
 
 @require_GET
 def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """The offline report as one archive."""
+    """Return the offline report as a zip archive."""
     found = _get_plan(name, version)
     require_visible_results(found, request.user)
     title = f"{found.name}-v{found.version}"
@@ -149,7 +151,7 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """How its trials were made, and what the headline would be under each doubt."""
+    """Render how the trials were made, and the headline under each reason for doubt."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -167,7 +169,7 @@ def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Evaluations of its checkpoints on simulated benches, beside it."""
+    """Render related evaluations on simulated benches next to this plan."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -183,7 +185,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """The result as it is copied; of a revealed plan at the address that stays."""
+    """Render the citation; that of a revealed plan is at its permanent address."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -198,7 +200,7 @@ def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def frozen(request: HttpRequest, digest: str) -> HttpResponse:
-    """The result as its reveal kept it: whatever is corrected later, nothing here changes."""
+    """Render the result as recorded at its reveal; later corrections do not change it."""
     found = selectors.plan_at_reveal(digest)
     sealed = _sealed_page(request, found)
     return sealed or _citation_page(request, citation(found))
@@ -206,7 +208,7 @@ def frozen(request: HttpRequest, digest: str) -> HttpResponse:
 
 @require_GET
 def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
-    """The same as a file: "txt", "tex" or "svg"."""
+    """Return the recorded result as a file: "txt", "tex" or "svg"."""
     found = selectors.plan_at_reveal(digest)
     require_visible_results(found, request.user)
     title = f"{found.name}-v{found.version}-{digest[:8]}.{form}"
@@ -219,7 +221,7 @@ def frozen_file(request: HttpRequest, digest: str, form: str) -> HttpResponse:
 
 @require_POST
 def plan_action(request: HttpRequest, name: str, version: int, what: str) -> HttpResponse:
-    """Freeze, amend, close or reveal it, look behind the blind, or have it judged: by its owner, with what is due."""
+    """Freeze, amend, close, reveal or unblind a plan, or have it judged; `what` names the action."""
     found = _get_plan(name, version)
     user: Any = request.user
     reason = request.POST.get("reason", "")
@@ -296,7 +298,7 @@ def _plan_page(
 def _sealed_page(
     request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse | None:
-    """Page in place of results that this user does not see, or that there cannot be; None where they do."""
+    """Return the page shown if results are sealed for this user or do not exist yet, else None."""
     why = sealed_reason(found, request.user, visibility_for_request(request)) if has_results(found) else ""
     if has_results(found) and not why:
         return None

@@ -1,4 +1,4 @@
-"""The page on which a plan is drafted, step by step, and frozen."""
+"""Page on which a plan is drafted, step by step, and frozen."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ _ALLOWED_WHAT_PAGE_SHOWN_BY = fixed(
     "was: allowed is what the page was shown, by field",
 )
 
-_SPREAD = 0.35  # of scores, until somebody says another one: between points reached alone and all or none
-_LARGEST = 64 * 1024  # of what a page was shown
-_FAULTY = (  # fields whose faults the page has a place for
+_SPREAD = 0.35  # default standard deviation of scores: between independent points and all or none
+_LARGEST = 64 * 1024  # [bytes] limit of the values that a page was shown
+_FAULTY = (  # fields for whose faults the page has a place
     *(
         "title",
         "question",
@@ -52,12 +52,12 @@ _FAULTY = (  # fields whose faults the page has a place for
     *("second_rater_share", "match_gate"),
     *("on_estop", "on_interruption", "on_timeout"),
 )
-_CARRIED = ("rate", "better", "power", "cycle_s")  # of the planner's question: assumptions, no part of a plan
+_CARRIED = ("rate", "better", "power", "cycle_s")  # assumptions of the calculator's input, not part of a plan
 
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def new(request: HttpRequest) -> HttpResponse:
-    """A title and a question, of which a draft is made; an address of the planner brings its numbers."""
+    """Create a draft from a title and a question; an address from the calculator brings its numbers."""
     user: Any = request.user
     require_drafter(user)
     given = request.POST if request.method == "POST" else request.GET
@@ -81,7 +81,7 @@ def new(request: HttpRequest) -> HttpResponse:
 
 
 def _design(numbers: dict[str, str], assumed: Question) -> dict[str, Any]:
-    """The fields of a plan that the planner's numbers say."""
+    """Return the plan's fields that follow from the calculator's numbers."""
     found: dict[str, Any] = {"alpha": assumed.alpha} if "alpha" in numbers else {}
     if "comparing" in numbers:
         found["comparing"] = Comparing(assumed.comparing)
@@ -96,7 +96,9 @@ def _design(numbers: dict[str, str], assumed: Question) -> dict[str, Any]:
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """All steps of a draft; what is posted is saved as far as it can be, and answered with what follows from it."""
+    """Render all steps of a draft; posted changes are saved as far as they are valid, and answered with their
+    effects.
+    """
     plan = plan_get(name=name, version=version, user=request.user)
     if request.method == "POST":
         return _saved(request, plan)
@@ -152,7 +154,7 @@ def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
     }
     answer = render(request, "results/draft/saved.html", context)
     if changed.now != before:
-        answer.headers["HX-Trigger"] = "draft-saved"  # figures are computed anew
+        answer.headers["HX-Trigger"] = "draft-saved"  # the figures are recomputed
     return answer
 
 
@@ -167,12 +169,12 @@ def _was(request: HttpRequest) -> dict[str, Any]:
 
 
 def _shown(now: Values, seen: Values, faults: dict[str, str]) -> dict[str, Any]:
-    """What the next change is held against, and by which digest the draft is frozen."""
+    """Return the values with which the next change is compared, and the digest by which the draft is frozen."""
     return {"was": json.dumps(seen), "seen": digest_of(now), "faults": faults}
 
 
 def _assumed(given: QueryDict) -> Question:
-    """The planner's question as far as it is given with a page; the usual one where that says what is not allowed."""
+    """Return the calculator's input of a page; the default input if a value is not allowed."""
     try:
         return question_of({name: given.get(name, "") for name in _CARRIED}, alike=True)
     except EvaError:
@@ -180,7 +182,11 @@ def _assumed(given: QueryDict) -> Question:
 
 
 def _spread(given: QueryDict) -> float:
-    """The standard deviation that is assumed of a score; EvaError."""
+    """Return the assumed standard deviation of a score.
+
+    Raises:
+        EvaError: If it is not within 0.01 to 0.5.
+    """
     text = given.get("spread", "").strip() or str(_SPREAD)
     try:
         value = float(text)
@@ -193,9 +199,9 @@ def _spread(given: QueryDict) -> float:
 
 @require_GET
 def power(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """The power of the draft as it is saved, at the rates of the address, as far as it is computed."""
+    """Render the power of the saved draft at the rates of the address, as far as computed."""
     plan = plan_get(name=name, version=version, user=request.user)
-    if plan.state != PlanState.DRAFT:  # frozen while its page was still asking: it asks no more
+    if plan.state != PlanState.DRAFT:  # frozen while its page was still polling: 204 ends the polling
         return HttpResponse(status=204)
     require_editor(plan, request.user)  # type: ignore[arg-type]
     context: dict[str, Any] = {"plan": plan, "size": draft.Size.of(plan)}

@@ -1,4 +1,4 @@
-"""Pages of raters, who do not know what they see in a video: a trial rated again, one of two preferred."""
+"""Pages of blind raters: rating a trial again, and preferring one of two trials."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _ANSWERS = {"yes": True, "no": False}
 
 @require_http_methods(["GET", "POST"])
 def rate(request: HttpRequest) -> HttpResponse:
-    """The next trial to be rated again, by its code only."""
+    """Render the next trial to be rated, identified only by its code, or save a rating."""
     fault = None
     if request.method == "POST":
         try:
@@ -67,7 +67,7 @@ def rate(request: HttpRequest) -> HttpResponse:
 
 @require_http_methods(["GET", "POST"])
 def prefer(request: HttpRequest) -> HttpResponse:
-    """The next two trials of one initial condition: which was the better one, and why?"""
+    """Render the next two trials of one initial condition for a preference, or save one."""
     fault = None
     if request.method == "POST":
         try:
@@ -129,7 +129,7 @@ def _version(request: HttpRequest) -> int:
 
 
 def _view(handout: Handout | None) -> dict[str, Any] | None:
-    """A recording as it is shown to a rater, who must not know what it is of."""
+    """Return a recording as shown to a blind rater."""
     episode: Episode | None = handout.trial.episode if handout else None
     if handout is None or episode is None:
         return None
@@ -138,7 +138,7 @@ def _view(handout: Handout | None) -> dict[str, Any] | None:
 
 
 def _unable(user: Any, views: Sequence[dict[str, Any] | None]) -> str:
-    """Why nothing can be saved now; "" where it can."""
+    """Return the reason for which nothing can be saved now, "" if it can."""
     if role_of(user) is Role.VIEWER:
         return "operators judge: you may look"
     unseen = [view["code"] for view in views if view is not None and not view["seen"]]

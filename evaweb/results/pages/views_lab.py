@@ -1,4 +1,4 @@
-"""The lab at one look: what runs where, how far evaluations are, what was tried last; and the planner."""
+"""Overview of the lab: activity of stations, progress of evaluations, recent trials; and the calculator."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.ratings.unblinding import sealed_reason
 from evaweb.roles import Role, role_of
 
-RUNNING = 12  # plans on one page; all of them are in the list
+RUNNING = 12  # plans on one page; the list has all
 RECENT = 12
 
 
 @require_GET
 def dashboard(request: HttpRequest) -> HttpResponse:
-    """Evaluations that run, stations, recent trials; with HX-Request that alone, to be put into the page."""
+    """Render running evaluations, stations and recent trials; with HX-Request only that fragment."""
     fragment = bool(request.headers.get("HX-Request"))
     return render(request, "results/lab_body.html" if fragment else "results/lab.html", _lab(request))
 
 
 @require_GET
 def wall(request: HttpRequest) -> HttpResponse:
-    """The same for a big screen: large, without anything to press."""
+    """Render the overview for a big screen: large, without controls."""
     fragment = bool(request.headers.get("HX-Request"))
     return render(request, "results/wall_body.html" if fragment else "results/wall.html", _lab(request))
 
 
 @require_GET
 def planner(request: HttpRequest) -> HttpResponse:
-    """Trials and robot hours for a wanted difference, and what cannot be detected."""
+    """Render the calculator of trials and robot hours for a difference, and of what cannot be detected."""
     fault = table = None
     waiting = False
     question = Question()

@@ -1,1 +1,1 @@
-"""Words, lists and drawings of results, on pages and in reports."""
+"""Texts, lists and drawings of results, on pages and in reports."""

@@ -1,4 +1,4 @@
-"""Addresses of the trials behind a figure, of a comparison and of two recordings."""
+"""Addresses of the trials behind a figure, of a comparison, and of two recordings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evaweb.results.selectors import TrialQuery
 
 
 def trials_address(plan: Plan, only: TrialFilter, **more: str) -> str:
-    """Address of the list of those trials."""
+    """Return the address of the list of these trials."""
     question = TrialQuery(
         scene=only.scene, position=only.position, station=only.station, operator=only.operator
     )
@@ -24,14 +24,14 @@ def trials_address(plan: Plan, only: TrialFilter, **more: str) -> str:
 
 
 def compare_address(plan: Plan, found: Comparison, only: TrialFilter) -> str:
-    """Address of the page with both side by side."""
+    """Return the address of the page that compares both checkpoints."""
     query = urlencode({"first": found.first, "second": found.second})
     address = reverse("result-compare", args=[plan.name, plan.version])
     return f"{address}?{query}" + (f"&{only.query}" if only.query else "")
 
 
 def beside_address(episodes: Sequence[object]) -> str:
-    """Address that plays recordings on one clock; "" where there are not two."""
+    """Return the address that plays recordings synchronously; "" for fewer than two."""
     if len(episodes) < 2:
         return ""
     return reverse("side-by-side") + "?" + urlencode([("show", str(uuid)) for uuid in episodes])

@@ -8,7 +8,7 @@ from evaweb.results.presentation.integrity import delays_banner, integrity_docum
 
 
 def caveats_of(plan: Plan) -> list[str]:
-    """What else the headline could be, then how the trials were made; none without a comparison."""
+    """Return the alternative headlines, then remarks on how the trials were made; [] without a comparison."""
     said = headline(plan)
     if said is None:
         return []

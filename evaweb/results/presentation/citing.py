@@ -1,4 +1,4 @@
-"""A result that travels: one sentence, one table and one figure, with the design named, as text, LaTeX and SVG."""
+"""Citation of a result: one sentence, table and figure with the design, as text, LaTeX and SVG."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ _RESULT_CITED_ONCE_PLAN_CLOSED = Pattern(
 )
 
 HEAD = ("Checkpoint", "n", "Successes", "Rate, 95 % Wilson", "Mean score")
-_AXIS = 40  # letters of it, in text
+_AXIS = 40  # [characters] of the axis in text
 _NAMES_MM, _AXIS_MM, _STEP_MM = 45, 60, 6
 
 
 @dataclass(frozen=True, slots=True)
 class CitedRow:
-    """A row of the table; `success` and `score` (0 to 1) are None where the reveal did not keep them."""
+    """Row of the table; `success` and `score` (0 to 1) are None if the reveal did not record them."""
 
     checkpoint: str
     n: int
@@ -56,7 +56,7 @@ class CitedRow:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """Name, n, successes, rate with interval, mean score, in words."""
+        """Name, n, successes, rate with interval, and mean score, as text."""
         known = self.success
         rate = "not kept"
         if known is not None:
@@ -76,7 +76,7 @@ class CitedRow:
 
 @dataclass(frozen=True)
 class Citation:
-    """The result of a plan: `kept` at its reveal, or as it is now; `digest` is empty without a reveal."""
+    """Result of a plan: `kept` is the record of its reveal, or the current one; `digest` is "" without a reveal."""
 
     plan: Plan
     found: Design
@@ -85,31 +85,31 @@ class Citation:
 
     @property
     def address(self) -> str:
-        """Path of its page, where it stands for good after a reveal; without a host, for a lab has several names."""
+        """Path of its page, permanent after a reveal; without a host, because a lab may have several names."""
         if self.digest:
             return reverse("result-frozen", args=[self.digest])
         return reverse("result-cite", args=[self.plan.name, self.plan.version])
 
     @property
     def commitment(self) -> str:
-        """That of the reveal; one from before it was kept has the plan's own, as it has its key and who revealed."""
+        """Commitment of the reveal; reveals that did not record it use the plan's, as do key and account."""
         return str(self.kept.get("commitment") or self.plan.commitment)
 
     @property
     def key(self) -> str:
-        """Of the commitment, in hex; "" before the reveal."""
+        """Key of the commitment in hex; "" before the reveal."""
         own = bytes(self.plan.key or b"").hex()
         return str(self.kept.get("key") or own) if self.digest else ""
 
     @property
     def revealed_by(self) -> str:
-        """The account, by the name that it had then."""
+        """Name of the account that revealed the plan, as it was then."""
         own = self.plan.revealed_by.get_username() if self.plan.revealed_by else ""
         return str(self.kept.get("by") or own)
 
     @cached_property
     def sentence(self) -> str:
-        """The headline."""
+        """Headline, with the groups of checkpoints that share a letter."""
         letters = letters_of(self.plan, self.found, self.blocks)
         said = ", ".join(f"{name} {of}" for name, of in letters)
         told = f" No significant difference between checkpoints that share a letter: {said}." if said else ""
@@ -117,12 +117,12 @@ class Citation:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        """Those that count."""
+        """Blocks that count."""
         return blocks_kept(self.kept)
 
     @cached_property
     def design(self) -> str:
-        """What was foreseen: rule, looks, pairs, alpha, question, outcome."""
+        """Design as planned: rule, looks, pairs, alpha, question, outcome."""
         document = self.plan.document or {}
         found = self.found
         asks = " and ".join(_question(found, *names) for names in compared(document))
@@ -137,13 +137,13 @@ class Citation:
 
     @cached_property
     def setting(self) -> str:
-        """On what robot, in which scenes, when and who scored; "" of a reveal from before it kept that."""
+        """Robot, scenes, dates and scorers; "" for a reveal that did not record them."""
         said = str(self.kept.get("setting", "")) if self.digest else setting_now(self.plan)
         return f"{said}." if said else ""
 
     @cached_property
     def source(self) -> str:
-        """Where it is from: plan, version, digests, address."""
+        """Source: plan, version, digests, address."""
         document = self.plan.document or {}
         said = f"EVA Web, plan {document['name']} v{document['version']}, plan digest {self.plan.digest}"
         where = (
@@ -155,12 +155,12 @@ class Citation:
 
     @property
     def caveats(self) -> list[str]:
-        """Reasons for doubt as the reveal kept them; one from before it kept them has none."""
+        """Reasons for doubt as recorded at the reveal; [] for a reveal that did not record them."""
         return list(self.kept.get("caveats", ()))
 
     @property
     def doubts(self) -> list[str]:
-        """The same as lines of text."""
+        """Reasons for doubt as lines of text."""
         return [f"Reason for doubt: {said}." for said in self.caveats]
 
     @property
@@ -172,7 +172,7 @@ class Citation:
 
     @cached_property
     def rows(self) -> list[CitedRow]:
-        """The table, in the order of the frozen plan."""
+        """Rows of the table, in the order of the frozen plan."""
         if "arms" in self.kept:
             return [
                 CitedRow(row["checkpoint"], row["n"], proportion(row["successes"], row["n"]), row["score"])
@@ -181,7 +181,7 @@ class Citation:
         return [self._of_pairs(i, name) for i, name in enumerate(arms_of(compared(self.plan.document or {})))]
 
     def _of_pairs(self, i: int, name: str) -> CitedRow:
-        """Of a reveal that kept the pairs alone."""
+        """Return the row of a checkpoint from a reveal that recorded only the pairs."""
         values = [value for block in self.blocks for arm, value in block if arm == i]
         n = len(values)
         if self.found.outcome != SUCCESS:
@@ -190,12 +190,12 @@ class Citation:
 
     @cached_property
     def known(self) -> list[tuple[str, Proportion]]:
-        """The rows of the figure."""
+        """Rows of the figure."""
         return [(row.checkpoint, row.success) for row in self.rows if row.success is not None]
 
     @property
     def corrected(self) -> bool:
-        """Whether scores were corrected, or came, after the reveal."""
+        """Whether scores were corrected or added after the reveal."""
         now = counted_now(self.plan)
         arms = self.kept.get("arms", now["arms"])
         return not same_blocks(blocks_kept(now), self.blocks) or now["arms"] != arms
@@ -211,25 +211,25 @@ class Citation:
 
     @cached_property
     def latex(self) -> dict[str, str]:
-        """The same as LaTeX that needs no package."""
+        """Sentence, table and figure as LaTeX that needs no package."""
         rows = [row.cells for row in self.rows]
         sentence = "\n".join(map(escaped, self.lines)) + "\n"
         return {"sentence": sentence, "table": _latex_table(rows), "figure": _latex_figure(self.known)}
 
     @cached_property
     def figure_html(self) -> Drawing:
-        """The figure as a page shows it."""
+        """Figure for a page."""
         names = [row["name"] for row in (self.plan.document or {})["checkpoints"]]
         order = {name: i for i, name in enumerate(names)}
         return rates.draw_intervals("Success rates", [(name, found, "") for name, found in self.known], order)
 
     @cached_property
     def svg(self) -> str:
-        """Figure with sentence, design and source, black on white, needing nothing beside it."""
+        """Standalone figure with sentence, design and source, black on white."""
         return printable(self.figure_html, above=[self.sentence], below=self.lines[1:])
 
     def render(self, form: str) -> str:
-        """All of it as a file: "txt", "tex" or "svg"."""
+        """Return the complete citation as a file: "txt", "tex" or "svg"."""
         if form == "svg":
             return '<?xml version="1.0" encoding="UTF-8"?>\n' + self.svg
         if form == "txt":
@@ -240,7 +240,7 @@ class Citation:
 
     @property
     def document(self) -> dict[str, Any]:
-        """All of it as plain JSON."""
+        """Complete citation as JSON."""
         document = self.plan.document or {}
         return {
             "plan": document["name"],
@@ -289,9 +289,10 @@ class Citation:
 
 
 def citation(plan: Plan) -> Citation:
-    """That of a revealed plan as its reveal kept it, else of one that is closed as it is now.
+    """Return the citation of a plan: as recorded if revealed, as of now if closed.
 
-    Conflict where trials are still made, or no comparison was planned.
+    Raises:
+        Conflict: If trials are still being made, or no comparison was planned.
     """
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
@@ -303,7 +304,7 @@ def citation(plan: Plan) -> Citation:
 
 
 def _declared(document: Mapping[str, Any]) -> str:
-    """What runs count as that did not end by themselves, where the plan left that to nobody."""
+    """Return what runs with an abnormal end count as, for those ends that the plan decides in advance."""
     counts = {"failure": "a failure", "repeated": "no trial, and is repeated"}
     said = document.get("counts_as", {})
     return "".join(f"; {ENDS[name]} makes {counts[said[name]]}" for name in ENDS if said.get(name) in counts)
@@ -356,7 +357,7 @@ def _latex_table(rows: list[tuple[str, ...]]) -> str:
 
 
 def _latex_figure(rows: list[tuple[str, Proportion]]) -> str:
-    """As a picture of LaTeX's own, in mm."""
+    """Return the figure as a LaTeX picture environment, in mm."""
     high = _STEP_MM * (len(rows) + 1)
     lines = [
         r"\begingroup\setlength{\unitlength}{1mm}%",

@@ -1,4 +1,4 @@
-"""What a comparison of two checkpoints answers: each question with its method, all of it in one sentence."""
+"""Answers of a comparison of two checkpoints: each question with its method, and one summarising sentence."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from evaweb.results.presentation.wording import (
 _DIFFERENCE = "How much better?"
 _ANYTIME = "How much better, at any time?"
 _SCORE_ANYTIME = "With partial credit, how much at any time?"
-# A small p may come of another spread around the same mean, too.
+# A small p may also come from different spreads around the same mean.
 _EXCHANGEABLE = "sign flips within pairs, exact: are both exchangeable?"
 
 
 @dataclass(frozen=True, slots=True)
 class ComparisonFact:
-    """A question that a comparison answers: how, and what came out. `own`: by the plan's own interval."""
+    """Question that a comparison answers, with method and answer; `own` if it is the interval of the plan's design."""
 
     question: str
     method: str
@@ -41,19 +41,19 @@ class ComparisonFact:
 
 
 def primaries_of(plan: Plan, analysis: Analysis) -> list[Comparison]:
-    """The comparisons that the plan is about, as far as both have trials."""
+    """Return the planned comparisons for which both checkpoints have trials."""
     found = (analysis.comparison_of(*names) for names in compared(plan.document or {}))
     return [one for one in found if one is not None]
 
 
 def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
-    """It in one sentence."""
+    """Return the comparison as one sentence."""
     one, other = analysis.arm(found.first).success, analysis.arm(found.second).success
     return difference_sentence(found, one, other, analysis.alpha)
 
 
 def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
-    """The sentence, and each question that a comparison answers; of the planned one its design says the sentence."""
+    """Return sentence and facts of a comparison; the sentence of a planned one comes from its design."""
     names = compared(plan.document or {})
     planned = headline(plan) if (found.first, found.second) in names else None
     own = _own_interval(plan) if planned else ""
@@ -81,7 +81,9 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
 
 
 def _own_interval(plan: Plan) -> str:
-    """The question that the interval of the plan's design answers; that of a boundary stands below the headline."""
+    """Return the question that the interval of the plan's design answers; a boundary's is shown below the
+    headline instead.
+    """
     by_score = (plan.document or {}).get("stopping", {}).get("outcome") == PrimaryOutcome.SCORE
     if plan.stopping == StoppingRule.EVIDENCE:
         return _SCORE_ANYTIME if by_score else _ANYTIME
@@ -167,7 +169,7 @@ def _later_facts(found: Comparison) -> Iterator[ComparisonFact]:
 
 
 def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> str:
-    """What these trials could not have detected, at a planned comparison's share of alpha."""
+    """Return what these trials could not have detected, at a planned comparison's share of alpha."""
     arms = [arm for arm in analysis.arms if found is None or arm.checkpoint in (found.first, found.second)]
     n = min(arm.success.n for arm in arms)
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)

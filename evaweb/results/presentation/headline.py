@@ -1,4 +1,4 @@
-"""The headline of an evaluation: what the design of its plan says, and nothing else."""
+"""Headline of an evaluation: the conclusion of its plan's design, and nothing else."""
 
 from __future__ import annotations
 
@@ -37,22 +37,28 @@ from evaweb.statistics.designs import (
 from evaweb.statistics.difference import newcombe
 from evaweb.statistics.many import letters
 
-# From this format of plans on. Flipping signs within pairs tests whether two checkpoints can be exchanged: scores that
-# spread differently around one mean cannot, either.
+# Plan format from which sign-flip tests of scores are worded as "differ": they test exchangeability, which scores with
+# different spreads around one mean violate too.
 _DIFFER = 6
-_BEST = 6  # and which is the best of several is said
-_UNDECIDED = 6  # and that so few trials cannot tell two apart
+_BEST = 6  # format from which the best of several is named
+_UNDECIDED = 6  # format from which too few trials are reported as undecided
 
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """A sentence of each planned comparison, how it was decided, and what else it could be.
+    """Headline: a sentence per planned comparison, how it was decided, and alternative headlines.
 
-    `corrected`: with the scores that were corrected after the reveal. `at_first`: as trials were first scored, had none
-    been voided. `worst`: of differences, had each attempt that was thrown away unscored been against them. Each is
-    empty where it is made of the same blocks. `estimates`: of comparisons that stopped early, how much they differ.
-    `letters` and `best`, where all checkpoints were compared with each other: two share a letter if they were not told
-    apart, and which one is best if one is. `setting`: on what robot, in which scenes, when, and who scored.
+    Alternatives are "" if they have the same blocks.
+
+    Attributes:
+        corrected: With the scores corrected after the reveal.
+        at_first: With every first score and no voids.
+        worst: With every attempt that was discarded unscored counted against the result.
+        estimates: Corrected differences of comparisons that stopped early.
+        versions: Headlines of earlier versions of the plan.
+        letters: If all checkpoints were compared with each other: two share a letter if they were not separated.
+        best: Which checkpoint is best, if all were compared with each other and one is.
+        setting: Robot, scenes, dates and scorers.
     """
 
     sentences: tuple[str, ...]
@@ -68,17 +74,17 @@ class Headline:
 
     @property
     def said(self) -> tuple[str, ...]:
-        """Which is best, then each comparison."""
+        """Sentence on the best checkpoint, if any, then one per comparison."""
         return (self.best, *self.sentences) if self.best else self.sentences
 
     @property
     def sentence(self) -> str:
-        """All of them."""
+        """All sentences as one text."""
         return ". ".join(self.said)
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """What else it could be, a sentence each, without what came after the reveal."""
+        """Alternative headlines, one sentence each, without corrections after the reveal."""
         found = [*self.estimates]
         if self.at_first:
             found.append(
@@ -99,7 +105,7 @@ class Headline:
 
 
 def headline(plan: Plan) -> Headline | None:
-    """That of a frozen plan; None where it has no comparison."""
+    """Return the headline of a frozen plan; None if it has no comparison."""
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return None
@@ -121,22 +127,22 @@ def headline(plan: Plan) -> Headline | None:
 
 
 def headline_document(plan: Plan) -> dict[str, Any] | None:
-    """It in plain values; None where the plan has no comparison."""
+    """Return the headline as JSON; None if the plan has no comparison."""
     said = headline(plan)
     return said and {**asdict(said), "letters": dict(said.letters), "caveats": list(said.caveats)}
 
 
 def alpha_words(found: Design) -> str:
-    """Alpha, and how many comparisons share it."""
+    """Return alpha, and how many comparisons share it."""
     several = len(found.comparisons)
     how = "Holm over" if found.holm and found.rule == FIXED and found.margin is None else "shared by"
     return f"alpha {found.alpha:g}" + (f", {how} {several} comparisons" if several > 1 else "")
 
 
 def with_planned_letters(plan: Plan, analysis: Analysis) -> Analysis:
-    """The analysis with the letters of the plan's own comparisons, where it compared all with each other.
+    """Return the analysis with the letters of the plan's design, if it compared all checkpoints with each other.
 
-    Those of checkpoints whose trials were filtered out are left out.
+    Letters of checkpoints whose trials are filtered out are omitted.
     """
     said = headline(plan) if len(compared(plan.document or {})) > 2 else None
     if said is None or not said.letters:
@@ -146,17 +152,19 @@ def with_planned_letters(plan: Plan, analysis: Analysis) -> Analysis:
 
 
 def rule_words(plan: Plan) -> str:
-    """The rule of its design in one or two words."""
+    """Return the stopping rule of the design in one or two words."""
     return str(plan.get_stopping_display()).partition(":")[0]
 
 
 def sentence_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """What the design says of these blocks: which is best, where that was asked, and a sentence of each comparison."""
+    """Return the design's conclusion from these blocks: the best checkpoint, if asked for, and one sentence
+    per comparison.
+    """
     return ". ".join(filter(None, (best_of(plan, found, blocks), *sentences_of(plan, found, blocks))))
 
 
 def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[str, ...]:
-    """The same, one by one."""
+    """Return one sentence per comparison."""
     names = compared(plan.document or {})
     said = findings(found, blocks).each
     return tuple(
@@ -166,7 +174,9 @@ def sentences_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[st
 
 
 def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tuple[str, str], ...]:
-    """Of checkpoints that were all compared with each other, the best first; none where they were not, or not yet."""
+    """Return the letters of checkpoints that were all compared with each other, best first; () otherwise, or
+    if not ended.
+    """
     names = compared(plan.document or {})
     arms = arms_of(names)
     said = findings(found, blocks)
@@ -179,14 +189,15 @@ def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tupl
 
 
 def _ranks(found: Design, arms: Sequence[str], said: Findings) -> bool:
-    """Whether it compared three or more with each other, and has ended."""
+    """Return True if three or more were compared with each other, and all comparisons have ended."""
     of_all = len(arms) > 2 and len(found.comparisons) == len(arms) * (len(arms) - 1) // 2
     return of_all and found.margin is None and bool(said.ended)
 
 
 def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """Which of three or more that were compared with each other is best, or which are left; empty where that was not
-    asked, is not decided yet, or the test says of scores alone that they differ.
+    """Return the sentence on the best of three or more checkpoints, or on the remaining ones.
+
+    "" if it was not asked for or is not decided, or if a test of scores only shows that they differ.
     """
     document = plan.document or {}
     arms, said = arms_of(compared(document)), findings(found, blocks)
@@ -222,11 +233,11 @@ def _sentence(
         made = f"{one.blocks} of {found.blocks} {found.unit}"
         if plan.state == PlanState.FROZEN:
             return f"{first} and {second} are not compared yet: {made} are made, and the design goes on"
-        if visible_close_reason(plan, sealed=True):  # the design had ended, with other scores than these
+        if visible_close_reason(plan, sealed=True):  # the design had ended with other scores
             return f"{first} and {second} would not be compared yet after {made}: the design would go on"
         return f"{first} and {second} were not compared: closed after {made}, before the design ended"
     sides = [[v for block in blocks[: one.ended_at_pair] for arm, v in block if arm == side] for side in pair]
-    if one.winner == "second":  # the better one is named first
+    if one.winner == "second":  # the better checkpoint is named first
         sides.reverse()
     counts = _counts(found, one, *sides)
     if found.margin is not None:
@@ -246,7 +257,7 @@ def _sentence(
 
 
 def _could_tell(plan: Plan, found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
-    """Whether any outcomes of so many trials would have told these two apart."""
+    """Return True if some outcomes of this many trials could have separated these two."""
     if (plan.document or {}).get("format", 1) < _UNDECIDED:
         return True
     apart = [tuple((arm, float(arm == pair[0])) for arm, _ in block) for block in blocks]
@@ -259,7 +270,7 @@ def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Seque
         chance = "" if one.p is None else f", {p_words(one.p)},"
         return f"mean scores {sum(ours) / n:.2f} and {sum(theirs) / m:.2f}{chance} after {n} pairs"
     words = f"{sum(ours):.0f}/{n} against {sum(theirs):.0f}/{m}"
-    if one.p is not None:  # of a fixed number: an interval of the difference means what it says
+    if one.p is not None:  # fixed number: an interval of the difference has its nominal coverage
         if n and m:
             words += f", difference {format_points(newcombe(int(sum(ours)), n, int(sum(theirs)), m))}"
         words += f", {p_words(one.p)}"
@@ -267,12 +278,14 @@ def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Seque
 
 
 def _other(plan: Plan, found: Design, blocks: Sequence[Block], at_reveal: Sequence[Block]) -> str:
-    """What it would be of these; empty where they are the same."""
+    """Return the sentence from these blocks; "" if they are the same."""
     return "" if same_blocks(blocks, at_reveal) else sentence_of(plan, found, blocks)
 
 
 def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[str]:
-    """Of each comparison that a boundary stopped: the raw difference is on average too large."""
+    """Yield the corrected estimate of each comparison that stopped at a boundary: its raw difference is too
+    large on average.
+    """
     each = zip(compared(plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True)
     for (first, second), pair, one in each:
         said = estimated(found, blocks, pair, one) if one.ended == "boundary" and one.winner else None
@@ -289,21 +302,22 @@ def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[s
 
 @dataclass(frozen=True, slots=True)
 class WorstCase:
-    """A comparison with what was thrown away unscored counted against its winner; `same`: that is the winner still."""
+    """Comparison with discarded, unscored attempts counted against its winner; `same` if it still wins."""
 
     sentence: str
     same: bool
 
 
 def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: Tried) -> list[WorstCase]:
-    """Of each comparison that has a winner, and whose trials had attempts that were thrown away."""
+    """Return the worst case of each comparison that has a winner and discarded attempts."""
     told = []
     now = _as_decided(now, decided)
     for number, one in enumerate(findings(found, decided).each):
         pair = found.comparisons[number]
         blocks = now.against(*(pair if one.winner == "first" else pair[::-1])) if one.winner else now.counted
         if blocks != now.counted:
-            # Other outcomes would have dropped others, of which there are no trials: by itself, as it was decided.
+            # Other outcomes would have dropped other arms, whose trials do not exist: each comparison counts on its
+            # own, up to its end.
             single, both = alone(found, pair, blocks[: one.ended_at_pair]) if found.drops else (found, blocks)
             sentence, other = told_alone(plan, single, number, both)
             told.append(WorstCase(sentence, other.winner == one.winner))
@@ -311,7 +325,7 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
 
 
 def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
-    """The trials that there are now with the outcomes that decided, where these are of the same trials."""
+    """Return the current trials with the outcomes that decided; unchanged if these are not from the same trials."""
     if len(now.counted) != len(decided):
         return now
     outcomes: list[Block] = []
@@ -330,7 +344,7 @@ def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
 
 
 def told_alone(plan: Plan, single: Design, number: int, blocks: Sequence[Block]) -> tuple[str, Conclusion]:
-    """What the comparison of this number says by itself of these blocks, by the design `single`."""
+    """Return sentence and conclusion of comparison `number` from these blocks by the design `single`."""
     names = compared(plan.document or {})[number]
     pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
     one = evaluate_design(single, blocks, pair)
@@ -338,7 +352,7 @@ def told_alone(plan: Plan, single: Design, number: int, blocks: Sequence[Block])
 
 
 def _versions(plan: Plan) -> tuple[str, ...]:
-    """What each version before this one came to, the newest first: each had all of its alpha."""
+    """Return the headline of each earlier version, newest first: each had its own full alpha."""
     told, version = [], plan.amends
     while version is not None:
         found = frozen_design(version.document) if version.document else None

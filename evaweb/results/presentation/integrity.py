@@ -1,4 +1,4 @@
-"""The record of how an evaluation was made, in one document and in a few sentences."""
+"""Record of how an evaluation was made, as a document and in a few sentences."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from evaweb.results.presentation.wording import p_words
 from evaweb.results.presentation.would_be import headline_alternatives
 from evaweb.trials.endings import ENDINGS, ESTOP, INTERRUPTION
 
-_RARE = 0.05  # probability at or below which an anchor is said to drift
+_RARE = 0.05  # probability at or below which an anchor counts as drifting
 
 
 def integrity_document(plan: Plan) -> dict[str, Any]:
-    """What the record says, what the headline would be under each doubt, and `remarks` that sum both up."""
+    """Return the conduct of the plan, its alternative headlines, and `remarks` that summarise both."""
     looks = looks_of(plan)
     runs = all_attempts(plan, looks)
     matches = {run.trial: run.match for run in runs if run.match is not None}
@@ -26,7 +26,7 @@ def integrity_document(plan: Plan) -> dict[str, Any]:
 
 
 def delays_banner(found: Mapping[str, Any]) -> str:
-    """A sentence where delays of the compared checkpoints differ, "" where none does."""
+    """Return a sentence on differing delays of the compared checkpoints, "" if there are none."""
     delays = found["delays"]
     differing: dict[tuple[str, str], list[str]] = defaultdict(list)
     for row in delays["rows"]:
@@ -47,11 +47,11 @@ def delays_banner(found: Mapping[str, Any]) -> str:
 
 
 def too_few_words(found: Mapping[str, Any]) -> str:
-    """A sentence where the pairs are so few that no test of delays could say anything; "" where one could."""
+    """Return a sentence if the pairs are too few for any test of delays to be significant, else ""."""
     delays = found["delays"]
     pairs = [test["pairs"] for row in delays["rows"] for test in row["tests"] if test["p"] is not None]
     most = max(pairs, default=0)
-    if not most or 2.0 ** (1 - most) <= delays["alpha"]:  # the smallest p of sign flips
+    if not most or 2.0 ** (1 - most) <= delays["alpha"]:  # the smallest possible p of sign flips
         return ""
     return f"{_of(most, 'pair')} {'is' if most == 1 else 'are'} too few for any of these tests"
 
@@ -86,7 +86,7 @@ def _remarks(found: Mapping[str, Any]) -> Iterator[str]:
         if any(row[what] for row in rows):
             counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
             yield f"Attempts {words}: {counts}"
-    for what in (ESTOP, INTERRUPTION):  # most runs that fail end by their time limit
+    for what in (ESTOP, INTERRUPTION):  # not time limits: most failing runs end by them
         if any(row[what] for row in rows):
             counts = ", ".join(f"{row['checkpoint']} {row[what]} of {row['attempts']}" for row in rows)
             yield f"Runs ended by {ENDINGS[what]}: {counts}"

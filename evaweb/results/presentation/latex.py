@@ -1,4 +1,4 @@
-"""Words of people as LaTeX that compiles: names of checkpoints have underscores, titles whatever was typed."""
+"""User text as valid LaTeX: names of checkpoints contain underscores, titles anything."""
 
 from __future__ import annotations
 
@@ -70,16 +70,16 @@ _GREEK = re.compile(
 
 
 def escaped(text: str) -> str:
-    """`text` as LaTeX prints it letter by letter, without a package.
+    """Return `text` as LaTeX prints it character by character, without packages.
 
-    Letters that have no command there stay as they are: LuaLaTeX and XeLaTeX print them. Line breaks are blanks.
+    Characters without a command are unchanged: LuaLaTeX and XeLaTeX print them. Line breaks become blanks.
     """
     said = "".join(_letter(letter) for letter in unicodedata.normalize("NFC", text))
-    return re.sub(r"-(?=-)", "-{}", said)  # two would be a dash
+    return re.sub(r"-(?=-)", "-{}", said)  # two hyphens would become a dash
 
 
 def foreign(text: str) -> list[str]:
-    """The letters of it that pdfLaTeX does not print."""
+    """Return the characters that pdfLaTeX does not print."""
     return sorted({letter for letter in unicodedata.normalize("NFC", text) if not _letter(letter).isascii()})
 
 

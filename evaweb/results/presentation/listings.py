@@ -1,4 +1,4 @@
-"""The tables of result pages: checkpoints, pairs, scenes and single trials."""
+"""Tables of the result pages: checkpoints, pairs, scenes and single trials."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MOST_PAIRS = 200
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of a table: what it is of, x of n, and where its trials are."""
+    """Row of a table: name, x of n, and the address of the trials."""
 
     name: str
     found: Proportion
@@ -40,7 +40,7 @@ class Row:
 
 
 def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str, Any]]:
-    """The table of checkpoints, best first, each with what scores that were corrected after the reveal make of it."""
+    """Return the table of checkpoints, best first, each with its result after later corrections of scores."""
     corrected = caching.corrected_of(plan, only)
     return [
         {
@@ -64,7 +64,7 @@ def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str
 
 
 def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> list[Row]:
-    """Each checkpoint on one scene."""
+    """Return the rows of the checkpoints on one scene."""
     return [
         Row(
             arm.checkpoint,
@@ -78,7 +78,7 @@ def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) ->
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """How many trials, and where they are."""
+    """Number of trials, and the address of their list."""
 
     count: int
     address: str
@@ -87,10 +87,10 @@ class Cell:
 def failure_tables(
     analysis: Analysis, order: Mapping[str, Sequence[str]], address: Callable[..., str]
 ) -> list[dict[str, Any]]:
-    """Of each checkpoint that failed a Pareto chart, and a table of causes by phase with its sums.
+    """Return for each checkpoint with failures a Pareto chart, and a table of causes by phase with sums.
 
-    `order`: the lab's words by field; others follow, what was not said comes last. `address` of trials by their
-    checkpoint, failure_phase and failure, of which any may be left out.
+    `order` has the lab's terms by field; other terms follow, unspecified ones come last. `address` returns the list of
+    trials by checkpoint, failure_phase and failure, each optional.
     """
     return [_failure_table(arm, order, address) for arm in analysis.arms if arm.failures]
 
@@ -102,7 +102,7 @@ def _failure_table(
     causes = _ordered({mode.cause for mode in arm.failures}, order["failure"])
 
     def cell(phase: str | None, cause: str | None) -> Cell:
-        """Of one phase and cause; None for all."""
+        """Return the cell of a phase and a cause; None for all."""
         chosen = [m for m in arm.failures if phase in (None, m.phase) and cause in (None, m.cause)]
         named = {"failure_phase": phase, "failure": cause}
         where = {field: words or UNSPECIFIED for field, words in named.items() if words is not None}
@@ -126,33 +126,33 @@ def _ordered(found: set[str], order: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One trial of a pair, with its recording where it has one."""
+    """Trial of a pair, with its recording if there is one."""
 
     run: Outcome
     episode: Episode | None
 
     @property
     def video(self) -> str:
-        """Address of the first camera's; "" where there are no pictures on this machine."""
+        """Address of the first camera's video; "" if this machine has no images."""
         if not is_watchable(self.episode):
             return ""
         return reverse("episode-video", args=[self.episode.uuid, self.episode.cameras[0]])
 
     @property
     def still(self) -> float:
-        """When the last picture is shown [s]."""
+        """Time of the last image [s]."""
         if self.episode is None or not self.episode.fps:
             return 0.0
         return max(0.0, round((self.episode.frames - 0.5) / self.episode.fps, 3))
 
 
 def differs(pair: Pair) -> bool:
-    """True if they did not come equally far: one succeeded, or reached a milestone, that the other did not."""
+    """Return True if one trial succeeded or reached a milestone that the other did not."""
     return (pair.first.success, pair.first.milestones) != (pair.second.success, pair.second.milestones)
 
 
 def pair_rows(pairs: Sequence[tuple[int, Pair]]) -> list[dict[str, Any]]:
-    """Both trials of each numbered block with their recordings, and where they are played side by side."""
+    """Return both trials of each numbered block with their recordings, and the address of synchronous playback."""
     wanted = [run.trial for _, pair in pairs for run in (pair.first, pair.second)]
     episodes = {row.trial.pk: row for row in Episode.objects.filter(trial__in=wanted).select_related("trial")}
     rows = []
@@ -164,7 +164,7 @@ def pair_rows(pairs: Sequence[tuple[int, Pair]]) -> list[dict[str, Any]]:
 
 
 def trial_row(trial: Trial) -> dict[str, Any]:
-    """A trial of a list, and from which second on its recording shows what went wrong."""
+    """Return a trial of a list, and the time in its recording after which the failure occurred."""
     outcomes = list(trial.verdict.outcomes.all()) if trial.verdict else []
     times = [at for row in outcomes if row.reached and (at := getattr(row, "at_s", None)) is not None]
     failed = bool(trial.verdict and not trial.verdict.success)
@@ -180,7 +180,7 @@ def trial_row(trial: Trial) -> dict[str, Any]:
 
 
 def trial_filters(plan: Plan) -> list[Filter]:
-    """What the list of its trials is narrowed by; Question says what it does not know."""
+    """Return the filters of the list of trials; `TrialQuery` rejects unknown values."""
     runs = caching.cached_runs(plan).outcomes
     failed = [run for run in runs if not run.success]
     values = {
@@ -211,7 +211,7 @@ def trial_filters(plan: Plan) -> list[Filter]:
 
 
 def question_of(chosen: Mapping[str, str]) -> TrialQuery:
-    """The trials that are meant by what is chosen: those that count where no status is."""
+    """Return the query for the selected filters; without a status, trials that count."""
     status = chosen["status"] or TrialStatus.SCORED.value
     return TrialQuery(**{**chosen, "status": "" if status == EVERY else status})
 

@@ -1,4 +1,4 @@
-"""Where a result is from: on what robot, simulated or real, in which scenes, when, and who scored it."""
+"""Setting of a result: robot, simulated or real, scenes, dates, and scorers."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from evaweb.trials.models import Score, TrialStatus
 
 
 def setting_of(plan: Plan) -> str:
-    """A sentence on the trials that count, as the reveal kept it, else as it is now; "" where there are none."""
+    """Return a sentence on the trials that count, as recorded at the reveal or as of now; "" without trials."""
     kept = (plan.at_reveal or {}).get("setting")
     return setting_now(plan) if kept is None else str(kept)
 
 
 def setting_now(plan: Plan) -> str:
-    """The same as it is now, its days in UTC."""
+    """Return the sentence as of now, with dates in UTC."""
     station, verdict = "trial__station__", "trial__verdict__"
     groups = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by()
     rows = list(

@@ -1,4 +1,4 @@
-"""Wording of results: a percentage with its n and interval, a comparison in one sentence."""
+"""Wording of results: percentages with n and interval, comparisons in one sentence."""
 
 from __future__ import annotations
 
@@ -11,36 +11,37 @@ from evaweb.statistics.sequential import Evidence
 
 
 def rate_words(found: Proportion) -> str:
-    """ "46/50, 92 % [81, 97]"; a percentage never stands without n and interval."""
+    """Return for example "46/50, 92 % [81, 97]"; a percentage is never shown without n and interval."""
     if found.rate is None or found.interval is None:
         return "no trial"
     return f"{found.successes}/{found.n}, {100 * found.rate:.0f} % [{format_interval(found.interval)}]"
 
 
 def format_interval(interval: Interval, factor: float = 100) -> str:
-    """Both ends in percent."""
+    """Return both ends in percent."""
     return f"{_signed(factor * interval.low)}, {_signed(factor * interval.high)}"
 
 
 def format_points(found: Difference) -> str:
-    """ "36 points [19, 51]"."""
+    """Return for example "36 points [19, 51]"."""
     return f"{_signed(100 * found.value)} points [{format_interval(found.interval)}]"
 
 
 def probability(p: float) -> str:
-    """A probability as papers write it."""
+    """Return a probability in the format of papers."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def p_words(p: float) -> str:
-    """ "p = 0.03" or "p < 0.001"."""
+    """Return "p = 0.03" or "p < 0.001"."""
     return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
 
 
 def difference_sentence(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
-    """The comparison in one sentence, with its evidence; says only what the corrected exact test says.
+    """Return the comparison as one sentence that states only the result of the corrected exact test.
 
-    One that is planned is not decided here: ValueError.
+    Raises:
+        ValueError: If the comparison is planned and still open: its design decides.
     """
     if found.corrected is None:
         raise ValueError(f"{found.first} and {found.second}: their design decides, which has not ended")
@@ -58,7 +59,7 @@ def difference_sentence(found: Comparison, one: Proportion, other: Proportion, a
 
 
 def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
-    """Sentence on the gain that so many trials of each arm could not have detected, from that rate."""
+    """Return a sentence on the gain over `rate` that `n` trials per arm could not have detected."""
     if rate is None or n < 1:
         return "Without trials nothing could be detected."
     gain = detectable(n, min(rate, 0.999), POWER, alpha)
@@ -73,7 +74,7 @@ def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
 
 
 def evidence_words(found: Evidence) -> str:
-    """State of the evidence, and if it suffices, in words."""
+    """Return the state of the evidence as text, and whether it suffices."""
     if found.stop is not None:
         return f"suffices since pair {found.stop}"
     if not found.pairs:
@@ -83,7 +84,7 @@ def evidence_words(found: Evidence) -> str:
 
 
 def anytime_words(found: Interval | None, pairs: int) -> str:
-    """ "[−3, 55] points, of 40 pairs"."""
+    """Return for example "[−3, 55] points, of 40 pairs"."""
     return (
         f"[{format_interval(found)}] points, of {pairs} pairs"
         if found

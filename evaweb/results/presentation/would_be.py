@@ -1,4 +1,4 @@
-"""What the headline of a plan would be without a part of its trials."""
+"""Alternative headlines: the conclusion of a plan without a part of its trials."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _kept: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 
 
 def headline_alternatives(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
-    """As it was decided, then each other way to count: what, the blocks that it leaves, the sentence, and whether the
-    same checkpoints are ahead by the design. None without a comparison.
+    """Return the headline as decided, then each alternative: description, pairs left, sentence, and whether the
+    conclusion is the same.
 
-    A part is left out by whole blocks. What is left is judged by the rule of the design, each comparison by itself, as
-    if it had foreseen so many (at its step of Holm's procedure, where the design takes them), or, of checkpoints in
-    random order, by one test of all of it; where the design did not end nothing is left out, for nothing was concluded.
-    `matches` is the least match of each trial's bench, where known.
+    [] without a comparison. Parts are left out by whole blocks. The remaining blocks are judged by the design's rule,
+    each comparison on its own, as if it had been planned for this many (at its step of Holm's procedure, if used);
+    with checkpoints in random order by one test of all. If the design has not ended, nothing is left out, because
+    nothing was concluded. `matches` is the smallest bench match by trial, if known.
     """
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
@@ -85,7 +85,7 @@ def _alternatives(
 
     def without(what: str, part: Callable[[Attempt], bool]) -> dict[str, Any]:
         left = [at for at in range(len(base)) if not any(map(part, counting[at]))]
-        if not left or len(left) == len(base):  # then it is what was decided
+        if not left or len(left) == len(base):  # nothing was removed: the decided result
             return said(what, [base[at] for at in left])
         told: list[str] = []
         ways: list[Conclusion] = []
@@ -128,7 +128,7 @@ def _concluded(each: Iterable[Conclusion]) -> list[tuple[str | None, bool]]:
 def _of_these(
     found: Design, pair: tuple[int, int], left: Sequence[int], base: Sequence[Block]
 ) -> tuple[Design, list[Block]]:
-    """The design of one comparison as if it had foreseen these blocks alone, and those of them that it is about."""
+    """Return the design of one comparison as if planned for these blocks alone, and its blocks."""
     blocks = [base[at] for at in left]
     if found.counts is None:
         single, both = alone(found, pair, blocks)
@@ -140,17 +140,19 @@ def _of_these(
             sum(each) for each in zip(total, found.counts[at], (-before[0], -before[1]), strict=True)
         )
         counts.append(total)
-    if not min(total):  # of one checkpoint alone nothing can be said
+    if not min(total):  # trials of one checkpoint alone allow no conclusion
         return replace(found, rule=FIXED, blocks=len(left), boundary=None, counts=tuple(counts)), blocks
     made = design(rule=FIXED, blocks=len(left), alpha=found.alpha, margin=found.margin, counts=counts)
     return made, blocks
 
 
-_Left = list[tuple[Design, list[Block]]]  # of each comparison the design by itself, and what is left of it
+_Left = list[tuple[Design, list[Block]]]  # by comparison: its own design, and the remaining blocks
 
 
 def _stepped(found: Design, left: _Left) -> _Left:
-    """Each at its share of alpha; of a design by Holm at the share of its step, those with nothing left counted too."""
+    """Return the designs at their shares of alpha; with Holm at the share of their step, counting empty
+    comparisons too.
+    """
     if not found.holm:
         return left
     stepped, count = list(left), len(left)

@@ -1,1 +1,1 @@
-"""Second ratings and preferences, and the judges' blindness."""
+"""Second ratings, preferences and automatic judgements, and the blinding of raters."""

@@ -1,8 +1,8 @@
-"""Automatic judges: allowed, asked for, shown one trial after the other, and what they said kept.
+"""Automatic judges: permission, requests, and recording of their judgements.
 
-What they say is never a score and never a rating. A trial is shown to one version of a judge once, whatever it says:
-a judge that is asked until it answers would be chosen by its answers. Where a worker ends before it has heard, nothing
-is kept, and the trial is shown again.
+Judgements are never scores or ratings. Each version of a judge judges a trial once, whatever the result: repeating
+until there is an answer would select answers. If a worker ends before the answer, nothing is recorded and the trial is
+shown again.
 """
 
 from __future__ import annotations
@@ -56,15 +56,15 @@ _JUDGE_ADDRESS_NOT_ALLOWED_ADMINISTRATOR = Pattern(
     "judge {judge}: its address is not allowed: an administrator allows it under Administration, Judges",
 )
 
-KIND = "judge"  # of the job
-LONGEST_REASON, LONGEST_MODEL = 300, 200  # characters of what a server may have said
+KIND = "judge"  # kind of the job
+LONGEST_REASON, LONGEST_MODEL = 300, 200  # [characters] of a server's reason and model name
 
 
 # --- administrators ----------------------------------------------------------------------------------------
 
 
 def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
-    """Let it be sent pictures at the address that it has now; who allowed it is kept."""
+    """Allow images to be sent to the judge's current address; the administrator is recorded."""
     require_role(user, Role.ADMIN)
     if not judge.address:
         raise Conflict(_JUDGE_HAS_NO_ADDRESS_THERE(judge=judge))
@@ -75,18 +75,18 @@ def judge_allow(*, user: User, judge: AutomaticJudge) -> None:
 
 
 def judge_forbid(*, user: User, judge: AutomaticJudge) -> None:
-    """Send nothing to it any more; what it is being asked just now is still answered."""
+    """Withdraw the permission: nothing more is sent. A request in progress is still completed."""
     require_role(user, Role.ADMIN)
     judge.allowed_address, judge.allowed_by, judge.allowed_at = "", None, None
     judge.save(update_fields=["allowed_address", "allowed_by", "allowed_at"])
     log.info("judge %s: %a allows it no longer", judge, user.get_username())
 
 
-# --- asking ------------------------------------------------------------------------------------------------
+# --- requests ----------------------------------------------------------------------------------------------
 
 
 def judges_ready() -> list[AutomaticJudge]:
-    """Those that could be asked now."""
+    """Return the judges that could be used now."""
     found = []
     for judge in AutomaticJudge.objects.all():
         try:
@@ -98,9 +98,9 @@ def judges_ready() -> list[AutomaticJudge]:
 
 
 def request_judging(*, user: User, plan: Plan, name: str) -> Job:
-    """Have the worker show all scored trials of the plan to a judge; its owner, or an administrator.
+    """Enqueue a job that shows all scored trials of the plan to a judge; for its owner or an administrator.
 
-    Before the reveal too: what it says is hidden until then.
+    Allowed before the reveal too: judgements are hidden until then.
     """
     role = require_role(user, Role.OPERATOR)
     if role is not Role.ADMIN and plan.owner_id != user.pk:
@@ -117,7 +117,7 @@ def request_judging(*, user: User, plan: Plan, name: str) -> Job:
 
 
 def enqueue_judging(*, plan: Plan, judge: str) -> Job:
-    """The job that shows its trials to a judge, where there is none yet."""
+    """Enqueue the job that shows the plan's trials to a judge, unless there is one already."""
     return enqueue(kind=KIND, key=f"{KIND}:{plan.pk}:{judge}", args={"plan": plan.pk, "judge": judge})
 
 
@@ -130,22 +130,29 @@ def _judge(name: str) -> AutomaticJudge:
 
 
 def _ready(judge: AutomaticJudge) -> UsableJudge:
-    """The judge, to be asked; EvaError where it cannot be, or must not: its address was never allowed."""
+    """Return the judge ready for use.
+
+    Raises:
+        EvaError: If its set-up is invalid, or its address is not allowed.
+    """
     found = build_judge(judge.name, judge.kind, judge.setup)
     if found.served and judge.allowed_address != judge.address:
         raise NotAllowed(_JUDGE_ADDRESS_NOT_ALLOWED_ADMINISTRATOR(judge=judge))
     return found
 
 
-# --- being judged ------------------------------------------------------------------------------------------
+# --- judging -----------------------------------------------------------------------------------------------
 
 
 def judge_next_trial(*, plan: Plan, name: str) -> bool:
-    """Show the next trial to the judge and keep what it says; False where there is none that can be shown.
+    """Show the next trial to the judge and record its judgement; return False if no trial can be shown.
 
-    Nothing is held while it is asked. EvaError where the judge itself fails, and nothing is kept.
+    No database lock is held while the judge works.
+
+    Raises:
+        EvaError: If the judge itself fails; nothing is recorded.
     """
-    found = _ready(_judge(name))  # anew for each trial: it may have been forbidden since
+    found = _ready(_judge(name))  # checked again for each trial: the permission may have been withdrawn
     handout = next(_showable(plan, found), None)
     if handout is None:
         return False
@@ -177,19 +184,21 @@ def judge_next_trial(*, plan: Plan, name: str) -> bool:
 
 
 def _short(said: str, longest: int) -> str:
-    """Words of others, on one line, as both databases can keep them."""
+    """Return a third party's text on one line, with characters that both databases accept, and truncated."""
     return " ".join(said.replace("\x00", "").encode("utf-8", "replace").decode().split())[:longest]
 
 
 def unjudged_trials(*, plan: Plan, name: str) -> tuple[int, list[str]]:
-    """How many scored trials the judge has not been shown, and the codes of those without pictures on this machine."""
+    """Return the number of scored trials not shown to the judge, and the codes of those without images on
+    this machine.
+    """
     found = _ready(_judge(name))
     waiting = list(_waiting(plan, found))
     return len(waiting), [row.code for row in waiting if not _has_evidence(row, found)]
 
 
 def _waiting(plan: Plan, found: UsableJudge) -> Iterator[Handout]:
-    """Those that count, have milestones, and were not shown to it, in the order in which they were handed out."""
+    """Yield the trials that count, have milestones and were not shown to the judge, in order of allocation."""
     shown = Judgement.objects.filter(trial=OuterRef("trial"), judge=found.name, version=found.version)
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).exclude(Exists(shown))
     rows = rows.filter(Exists(Milestone.objects.filter(scene=OuterRef("trial__scene"))))
@@ -205,7 +214,7 @@ def _has_evidence(handout: Handout, found: UsableJudge) -> bool:
 
 
 def _case(trial: Trial, milestones: Sequence[Milestone], found: UsableJudge) -> TrialCase:
-    """What the judge may know of a trial."""
+    """Return the information about a trial that the judge may have."""
     return TrialCase(
         trial.instruction,
         trial.scene.criterion,
@@ -217,7 +226,9 @@ def _case(trial: Trial, milestones: Sequence[Milestone], found: UsableJudge) -> 
 
 @transaction.atomic
 def _store_judgement(judgement: Judgement) -> None:
-    """On the disk, then as a row, unless another worker was sooner or the trial counts no longer."""
+    """Write the judgement to the journal, then to the database, unless another worker was faster or the trial
+    no longer counts.
+    """
     trial = Trial.objects.select_for_update().get(pk=judgement.trial_id)
     named = {name: getattr(judgement, name) for name in ("trial_id", "judge", "version")}
     if trial.status != TrialStatus.SCORED or Judgement.objects.filter(**named).exists():

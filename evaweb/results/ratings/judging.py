@@ -1,4 +1,4 @@
-"""Choice of the trial to rate again, and of two to compare, for each rater: never knowing the checkpoint."""
+"""Selection of trials to rate again, and of pairs to compare, for each rater, without revealing checkpoints."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
 
 
 T = TypeVar("T")
-_NAMED = 200  # pairs in one question to the database
+_NAMED = 200  # pairs per database query
 
 
 class NextItem(NamedTuple, Generic[T]):
-    """Next item for one rater, None for nothing; `left` for this rater in all.
+    """Next item for one rater, None if there is none; `left` is the number of items for this rater.
 
-    `passed`: codes of trials that come before it, of which there are no pictures on this machine.
+    `passed` are codes of earlier trials that were skipped, because this machine has no images of them.
     """
 
     found: T | None
@@ -90,7 +90,7 @@ class NextItem(NamedTuple, Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two trials that were run one after the other at the same initial condition, in that order."""
+    """Two trials that were run consecutively from the same initial condition, in that order."""
 
     plan: Plan
     first: Handout
@@ -98,14 +98,14 @@ class Pair:
 
 
 def rating_sample(plan: Plan) -> list[int]:
-    """The places in the schedule whose trials are rated again, in the order in which they are; drawn by the key."""
+    """Return the schedule positions of the trials to rate again, in their order; drawn by the plan's key."""
     n = plan.slots.count()
     drawn = SeededDraws(bytes(plan.key or b""), "second rater").shuffled(range(n))
     return drawn[: math.ceil(plan.second_rater_share * n)]
 
 
 def next_to_rate(user: User) -> NextItem[Handout]:
-    """The next trial that this user may rate again, of those of which there are pictures."""
+    """Return the next trial with images that this user may rate again."""
     mine: list[Handout] = []
     for plan in Plan.objects.filter(state__in=_STATES, second_rater_share__gt=0).order_by("pk"):
         if has_looked_at_the_same(plan, user):
@@ -116,9 +116,10 @@ def next_to_rate(user: User) -> NextItem[Handout]:
 
 
 def _rated_first(what: str, trial: Trial, user: User) -> None:
-    """Before the words of a score alone are corrected: whoever may be asked to rate the trial again does so first.
+    """Check, before the wording of a score is corrected, that the user is not a potential second rater of the trial.
 
-    They would be its rater no more, and it is failures that would lose theirs; nor has a rater to know what was said.
+    Correcting first would disqualify them as a rater, and mostly for failures; and a rater must not know the score's
+    wording.
     """
     if what != "reworded":
         return
@@ -131,7 +132,7 @@ register_check(_rated_first)
 
 @still_judges
 def _may_be_asked(user: User, episode: Episode) -> bool:
-    """Whether this user may be asked to rate the trial of an episode a second time."""
+    """Return True if this user may be asked to rate the trial of an episode a second time."""
     trial = getattr(episode, "trial", None)
     if trial is None or role_of(user) is Role.VIEWER:
         return False
@@ -143,14 +144,14 @@ def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
         return False
     handout = _unrated(plan, user).filter(trial=trial).first()
     if handout is None or not handout.trial.episode.cameras or has_looked_at_the_same(plan, user):
-        return False  # nobody will ask this user
+        return False  # this user will not be asked
     return handout.slot.index in rating_sample(plan)
 
 
 def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> NextItem[T]:
-    """The first of which all pictures are there, else the first of which they may come; what lies before is passed.
+    """Return the first item with all images, else the first whose images may still arrive; earlier ones are `passed`.
 
-    No more of what is `waiting` is read than has to be.
+    `waiting` is read no further than necessary.
     """
     for there, each in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
         passed: list[str] = []
@@ -166,7 +167,7 @@ def _unrated(plan: Plan, user: User) -> QuerySet[Handout]:
     rated = Rating.objects.filter(trial=OuterRef("trial"))
     scored_by_me = Score.objects.filter(trial=OuterRef("trial"), rater=user)
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED, trial__episode__isnull=False)
-    rows = rows.exclude(trial__episode__status=EpisodeStatus.MISSING)  # it would be asked for ever
+    rows = rows.exclude(trial__episode__status=EpisodeStatus.MISSING)  # it would stay in the queue for ever
     rows = rows.exclude(trial__operator=user).exclude(Exists(rated)).exclude(Exists(scored_by_me))
     return rows.select_related("slot", "plan", "trial__scene", "trial__episode")
 
@@ -183,7 +184,12 @@ def save_rating(
     failure_phase: str = "",
     note: str = "",
 ) -> Rating:
-    """Keep what a rater, not the operator of the trial of that code, saw on its video: on the disk, then as a row."""
+    """Record a second rating of the trial with that code: in the journal, then in the database.
+
+    Raises:
+        Conflict: If the trial is not to be rated again, has no video, or the user has rated it differently before.
+        NotAllowed: If the user ran or scored the trial, or has seen results of the plan.
+    """
     require_role(user, Role.OPERATOR)
     handout = _handout(plan, code)
     trial = handout.trial
@@ -215,7 +221,7 @@ def save_rating(
 
 
 def next_to_compare(user: User, plans: Iterable[Plan] | None = None) -> NextItem[Pair]:
-    """The next two trials that this user has not compared, of those of which there are pictures."""
+    """Return the next pair with images that this user has not compared."""
     fresh: list[tuple[Plan, list[tuple[int, int]]]] = []
     for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
         if not has_looked_at_the_same(plan, user):
@@ -231,7 +237,7 @@ def next_to_compare(user: User, plans: Iterable[Plan] | None = None) -> NextItem
 
 
 def _pairs(plan: Plan) -> list[tuple[int, int]]:
-    """Trials that are next to each other in one block, both counting and recorded on this disk."""
+    """Return the pairs of consecutive trials in one block that both count and are recorded on this disk."""
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED, trial__episode__isnull=False)
     blocks: dict[int, list[tuple[int, str]]] = defaultdict(list)
     of_each = rows.order_by("number").values_list("slot__block", "trial", "trial__episode__status")
@@ -254,9 +260,12 @@ def _named(plan: Plan, pairs: Sequence[tuple[int, int]]) -> list[Pair]:
 
 @transaction.atomic
 def save_preference(*, user: User, plan: Plan, first: str, second: str, outcome: str, why: str) -> Preference:
-    """Keep which of the trials of these codes was the better one; the first is the one that was run first.
+    """Record which of two trials was better, in the journal, then in the database; `first` was run first.
 
-    On the disk, then as a row.
+    Raises:
+        Conflict: If they were not run consecutively, lack a video, or the user has compared them differently
+            before.
+        NotAllowed: If the user has seen results of the plan.
     """
     require_role(user, Role.OPERATOR)
     if outcome not in Preference.Outcome.values:
@@ -281,7 +290,9 @@ def save_preference(*, user: User, plan: Plan, first: str, second: str, outcome:
 
 
 def _handout(plan: Plan, code: str) -> Handout:
-    """That of a code, its trial's row kept from others until the transaction ends: one at a time writes its file."""
+    """Return the handout of a code with its trial's row locked for the transaction, so that only one process
+    writes its journal.
+    """
     rows = plan.handouts.select_related("slot", "trial__scene", "trial__episode")
     found = rows.filter(code=code).first()
     if found is None:
@@ -291,7 +302,11 @@ def _handout(plan: Plan, code: str) -> Handout:
 
 
 def _is_repeat(before: T, said: Mapping[str, Any], twice: str) -> T:
-    """The earlier answer, where it is given again word by word because the reply was lost; else Conflict."""
+    """Return the earlier answer if the same is sent again, as after a lost reply.
+
+    Raises:
+        Conflict: If the new answer differs.
+    """
     if any(getattr(before, name) != value for name, value in said.items()):
         raise Conflict(_OTHERWISE_WHAT_SAID_STANDS(twice=twice))
     return before

@@ -1,7 +1,7 @@
-"""Second ratings, preferences and what automatic judges said, as lines of an episode's own journal of verdicts.
+"""Second ratings, preferences and automatic judgements as lines of an episode's journal of scores.
 
-They lie beside its scores, DATA/scores/UUID.jsonl: a rating or judgement with the trial that it is of, a preference
-with the one that was run second, when the other one was there already. Nothing serves these files.
+They are in DATA/scores/UUID.jsonl: ratings and judgements in that of their trial, preferences in that of the trial
+that was run second. These files are never served.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from evaweb.trials.record import Name, TrialRecord
 
 
 class RatingLine(Line):
-    """A second rating."""
+    """Journal line of a second rating."""
 
     kind: Literal["rating"] = "rating"
     uuid: UUID
@@ -34,12 +34,12 @@ class RatingLine(Line):
 
     @classmethod
     def written(cls, row: Rating, **given: Any) -> dict[str, Any]:
-        """The line of a rating that is about to be saved."""
+        """Return the line of a rating that is about to be saved."""
         return super().written(row, trial=TrialRecord.for_manifest(row.trial), **given)
 
 
 class PreferenceLine(Line):
-    """A preference; `plan` and `version` name the plan that it is of."""
+    """Journal line of a preference; `plan` and `version` name its plan."""
 
     kind: Literal["preference"] = "preference"
     uuid: UUID
@@ -55,7 +55,7 @@ class PreferenceLine(Line):
 
     @classmethod
     def written(cls, row: Preference, **given: Any) -> dict[str, Any]:
-        """The line of a preference that is about to be saved."""
+        """Return the line of a preference that is about to be saved."""
         pair = {name: TrialRecord.for_manifest(getattr(row, name)) for name in ("first", "second")}
         return super().written(row, **pair, **given)
 
@@ -65,7 +65,7 @@ _Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
 class JudgementLine(Line):
-    """What an automatic judge said."""
+    """Journal line of an automatic judgement."""
 
     kind: Literal["judgement"] = "judgement"
     uuid: UUID
@@ -81,7 +81,7 @@ class JudgementLine(Line):
 
     @classmethod
     def written(cls, row: Judgement, **given: Any) -> dict[str, Any]:
-        """The line of a judgement that is about to be saved."""
+        """Return the line of a judgement that is about to be saved."""
         return super().written(row, trial=TrialRecord.for_manifest(row.trial), **given)
 
 

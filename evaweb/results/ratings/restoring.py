@@ -1,4 +1,4 @@
-"""Ratings, preferences and judgements that the database has lost, made again from the files of scores; see .record."""
+"""Restoring of ratings, preferences and judgements that the database lost from the journals of scores; see .record."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _JUDGEMENT_TRIAL_WHICH_NEITHER_DATABASE = Pattern(
 
 @register_restorer
 def restore(kept: RestorableRun) -> int:
-    """Make the rows that are not there; how many that were. The trials themselves were restored before."""
+    """Create the missing rows and return their number; the trials must have been restored before."""
     made = 0
     for line in kept.lines:
         try:
@@ -45,7 +45,7 @@ def _rating(line: RatingLine) -> bool:
         return False
     trial, said = _trial(line.trial), line.to_row_values()
     if Rating.objects.filter(trial=trial, rater=said["rater"]).exists():
-        return False  # written twice: the database took one of them
+        return False  # written twice, of which the database accepted one
     Rating.objects.create(trial=trial, **said)
     return True
 

@@ -1,4 +1,4 @@
-"""Pictures of a trial as an automatic judge is shown them: few, small, by numbers of cameras, nothing but pixels."""
+"""Images of a trial for an automatic judge: few, small, with anonymous cameras and without metadata."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from evaweb.episodes.videos import video_file
 from evaweb.results.judges.base import StillImage
 from runtime.datasets.pictures import VideoFrames
 
-CAMERAS = 4  # the first of the recording
-OF_EACH = 8  # evenly over the run, with the first and the last that there are
-WIDTH = 512  # pixels at most
+CAMERAS = 4  # first cameras of the recording
+OF_EACH = 8  # images per camera, evenly spaced, including first and last
+WIDTH = 512  # [pixels] largest width
 
 
 def trial_stills(episode: Episode) -> tuple[StillImage, ...]:
-    """Camera after camera in the order of time, of those that have a video; RecordingError where one is damaged."""
+    """Return the images by camera and time, for the cameras with a video.
+
+    Raises:
+        RecordingError: If a video is damaged.
+    """
     found = []
     for number, camera in enumerate(episode.cameras[:CAMERAS], 1):
         video = video_file(episode.uuid, camera)
-        if not video.exists():  # lost before its first picture
+        if not video.exists():  # the camera failed before its first image
             continue
         with VideoFrames(video) as pictures:
             times = pictures.times
@@ -30,7 +34,7 @@ def trial_stills(episode: Episode) -> tuple[StillImage, ...]:
 
 
 def sample(n: int, most: int = OF_EACH) -> list[int]:
-    """At most so many of 0 to n - 1, evenly, both ends among them."""
+    """Return at most `most` of the indices 0 to n - 1, evenly spaced, including both ends."""
     if n <= most:
         return list(range(n))
     return [round(k * (n - 1) / (most - 1)) for k in range(most)]

@@ -1,4 +1,4 @@
-"""Visibility of a plan's results for a user: the one place that all results ask."""
+"""Visibility of a plan's results for a user: the single place that decides it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from evaweb.plans.models import Plan, PlanState
 
 
 def sealed_reason(plan: Plan, user: Any, sight: Visibility | None = None) -> str:
-    """Why this user sees no result of the plan, "" where they do."""
+    """Return why this user may see no results of the plan, "" if they may."""
     if is_sealed_for(plan, user):
         return f"{plan} is blind until it is revealed"
     others = sealing_plans(plan, user, sight)
@@ -23,9 +23,10 @@ def sealed_reason(plan: Plan, user: Any, sight: Visibility | None = None) -> str
 
 
 def sealing_plans(plan: Plan, user: Any, sight: Visibility | None = None) -> list[Plan]:
-    """Other plans, blind for this user, because of which they see no result of this one; none where that is shown.
+    """Return other plans, blind for this user, because of which the results of this plan are hidden; [] if they are
+    visible.
 
-    All that are blind for them, not only those that share a checkpoint: which do would tell what those compare.
+    All blind plans are returned, not only those that share a checkpoint: the selection would reveal what they compare.
     """
     seen = sight or visibility_for_user(user)
     if is_sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=seen.checkpoints).exists():
@@ -34,12 +35,12 @@ def sealing_plans(plan: Plan, user: Any, sight: Visibility | None = None) -> lis
 
 
 def require_visible_results(plan: Plan, user: Any) -> None:
-    """NotAllowed where the user is not to see results of the plan, or where there cannot be any."""
+    """Raise NotAllowed if the user may not see results of the plan."""
     why = sealed_reason(plan, user)
     if why:
         raise NotAllowed(why)
 
 
 def has_results(plan: Plan) -> bool:
-    """True if trials of it can have been made at all."""
+    """Return True if the plan may have trials."""
     return plan.state != PlanState.DRAFT

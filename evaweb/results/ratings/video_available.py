@@ -1,4 +1,4 @@
-"""Availability of a trial's pictures on this machine: without them the trial cannot be judged."""
+"""Availability of a trial's video on this machine, which rating requires."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _WITHOUT_PICTURES_NOBODY_CAN_JUDGE = Pattern(
 
 
 def is_watchable(episode: Episode | None) -> bool:
-    """True if it can be watched now."""
+    """Return True if the episode can be watched now."""
     return (
         episode is not None
         and bool(episode.cameras)
@@ -26,7 +26,7 @@ def is_watchable(episode: Episode | None) -> bool:
 
 
 def may_become_watchable(episode: Episode | None) -> bool:
-    """True if pictures of it may be made yet: its folder is on this disk, or on its way."""
+    """Return True if the episode may become watchable: its folder is on this disk, or is being transferred."""
     return (
         episode is not None
         and bool(episode.cameras and episode.frames)
@@ -35,7 +35,7 @@ def may_become_watchable(episode: Episode | None) -> bool:
 
 
 def require_video(*handouts: Handout) -> None:
-    """Conflict names the trials of which there are no pictures, each with the reason."""
+    """Raise Conflict, with the reason for each trial, if trials have no video."""
     blind = [handout for handout in handouts if not is_watchable(handout.trial.episode)]
     if blind:
         told = "; ".join(f"{handout.code}: {_why(handout.trial.episode)}" for handout in blind)

@@ -1,1 +1,1 @@
-"""Exports of a plan's results: documents, tables, the program that recomputes them."""
+"""Exports of a plan's results: documents, tables, and the program that recomputes them."""

@@ -1,4 +1,4 @@
-"""Bench layouts of a plan's trials, for its report: what each camera showed, and the reference then."""
+"""Bench layouts of a plan's trials for its report: each camera's image, and the reference at that time."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _FIELDS = (
 
 
 def layout_rows(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    """A row for each camera of each attempt that was asked to run."""
+    """Yield rows, one for each camera of each attempt."""
     rows = Achieved.objects.filter(trial__evaluation=plan.evaluation_id).order_by("trial_id", "pk")
     yield [dict(zip(COLUMNS, row, strict=True)) for row in rows.values_list(*_FIELDS)]
 
 
 def with_json_regions(pages: Iterable[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
-    """The same with regions as JSON, "" where there are none."""
+    """Yield the rows with regions as JSON, "" without any."""
     for rows in pages:
         yield [{**row, "regions": json.dumps(row["regions"]) if row["regions"] else ""} for row in rows]
 
 
 def write_pictures(plan: Plan, folder: Path, most: int | None) -> int:
-    """Each picture once, by its SHA-256, at most so many bytes of them; how many were left out or are lost."""
+    """Write each image once, named by its SHA-256, up to `most` bytes; return the number of omitted or lost images."""
     rows = [row for page in layout_rows(plan) for row in page]
     names = dict.fromkeys(row[which] for row in rows for which in ("picture", "reference") if row[which])
     left, written = 0, 0

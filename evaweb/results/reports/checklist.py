@@ -1,4 +1,4 @@
-"""Reviewer's checklist of an evaluation, answered from the record: no answer is a person's claim."""
+"""Reviewer's checklist of an evaluation, answered from the record alone, never by a person's claim."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evaweb.trials.models import Score, Trial, TrialStatus
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A practice, whether it was kept to ("yes", "partly", "no"), and what the record says."""
+    """Practice, whether it was followed ("yes", "partly", "no"), and the evidence in the record."""
 
     practice: str
     kept: str
@@ -27,7 +27,7 @@ class Item:
 
 
 def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
-    """All of it."""
+    """Return all items of the checklist."""
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     return [
         _preregistration(plan, trials),

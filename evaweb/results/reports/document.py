@@ -1,7 +1,7 @@
-"""An analysis as plain JSON: what REST answers, what a report holds, and what its script computes again.
+"""Analysis as JSON, for REST, for reports, and for the program that recomputes them.
 
-Intervals are [low, high]; those under `gaffke` were drawn: a new draw gets them only nearly. A list of curve points
-is [time, share that has succeeded, low, high].
+Intervals are [low, high]; those under `gaffke` are from random draws and are reproduced only approximately. Points of
+a curve are [time, share of successes, low, high].
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from evaweb.statistics.sequential import Evidence
 
 
 def analysis_document(analysis: Analysis) -> dict[str, Any]:
-    """All of it."""
+    """Return the complete analysis."""
     return {
         "n": analysis.n,
         "alpha": analysis.alpha,
@@ -36,7 +36,7 @@ def _run(mean: Average) -> dict[str, Any]:
 
 
 def arm_document(arm: Arm) -> dict[str, Any]:
-    """One checkpoint."""
+    """Return the results of one checkpoint."""
     return {
         **proportion_document(arm.success),
         "clopper_pearson": _ends(arm.exact),
@@ -80,7 +80,7 @@ def arm_document(arm: Arm) -> dict[str, Any]:
 
 
 def comparison_document(found: Comparison) -> dict[str, Any]:
-    """Two checkpoints, the first minus the second."""
+    """Return the comparison of two checkpoints, the first minus the second."""
     return {
         "first": found.first,
         "second": found.second,
@@ -131,7 +131,7 @@ def comparison_document(found: Comparison) -> dict[str, Any]:
 
 
 def proportion_document(found: Proportion) -> dict[str, Any]:
-    """x of n with its Wilson interval; null where n is 0."""
+    """Return x of n with its Wilson interval; null if n is 0."""
     return {
         "successes": found.successes,
         "n": found.n,
@@ -157,7 +157,7 @@ def _clustered(found: Difference | None) -> dict[str, Any] | None:
 
 
 def _by_cause(arm: Arm) -> dict[str, int]:
-    """Each cause that was said, in any phase."""
+    """Return the number of failures by specified cause, over all phases."""
     found: Counter[str] = Counter()
     for mode in arm.failures:
         if mode.cause:

@@ -1,4 +1,4 @@
-"""A plan's report: pages, data, and the program that computes all of it again; needs neither us nor a network."""
+"""Report of a plan: pages, data, and the program that recomputes them; usable offline and without EVA Web."""
 
 from __future__ import annotations
 
@@ -55,14 +55,20 @@ _STYLES = (
     *("css/tokens.css", "css/base.css", "css/card.css", "css/table.css", "css/chip.css"),
     *("result/result.css", "result/figures.css", "result/plans.css"),
 )
-MOST_LINES = 1000  # of a list in the report's page; its data have all
+MOST_LINES = 1000  # lines per list on the report's page; its data are complete
 _PROGRAM = Path(__file__).parent / "recompute"
 
 
 def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> Path:
-    """Everything into the new folder `out`; its first page. EvaError where it exists and is not empty.
+    """Write the report to the new folder `out`, and return its first page.
 
-    `most_pictures`: bytes of pictures of benches, None for all that there are.
+    Args:
+        plan: A plan that is frozen or later.
+        out: Folder, created if it does not exist.
+        most_pictures: Limit of bench images [bytes]; None for all.
+
+    Raises:
+        EvaError: If the folder is not empty, or the plan is a draft.
     """
     if out.exists() and any(out.iterdir()):
         raise EvaError(_NOT_EMPTY_NAME_NEW_FOLDER(out=out))
@@ -97,7 +103,7 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
 
 
 def report_numbers(plan: Plan, analysis: Analysis) -> dict[str, Any]:
-    """Every number of the report, and only such as the program computes again."""
+    """Return every number of the report that the program recomputes."""
     preferred = preference_ranking(plan)
     words = ("reason", "groups")
     return {
@@ -110,7 +116,7 @@ def report_numbers(plan: Plan, analysis: Analysis) -> dict[str, Any]:
 
 
 def planned_document(plan: Plan) -> list[dict[str, Any]]:
-    """What the plan's design says of each of its comparisons."""
+    """Return the conclusion of the plan's design for each comparison."""
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return []
@@ -136,7 +142,7 @@ def _estimate(found: Difference | None) -> list[float] | None:
 
 
 def plan_seal(plan: Plan) -> dict[str, Any]:
-    """Digest and commitment, and the key once it was revealed."""
+    """Return digest and commitment, and the key if it was revealed."""
     shown = plan.state == PlanState.REVEALED or plan.at_reveal is not None
     return {
         "digest": plan.digest,
@@ -147,7 +153,7 @@ def plan_seal(plan: Plan) -> dict[str, Any]:
 
 
 def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
-    """Context of the report's page; its figures lead nowhere, because there is nothing behind them."""
+    """Return the context of the report's page; its figures have no links, because the report has no other pages."""
     arms = analysis.arms
     order = {arm.checkpoint: arm.series for arm in arms}
     primaries = facts.primaries_of(plan, analysis)
@@ -209,13 +215,13 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
 
 
 def _ends(document: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What a run that did not end by itself counts as, in words."""
+    """Return what runs with an abnormal end count as, as text."""
     said = document.get("counts_as", {})
     return [(words, CountsAs(said[name]).label) for name, words in ENDS.items() if name in said]
 
 
 def _bench_images(plan: Plan, folder: Path) -> dict[int, list[dict[str, Any]]]:
-    """Of each trial what its cameras showed, as far as the pictures are in the report."""
+    """Return by trial the images of its cameras that are in the report."""
     there = {path.stem for path in folder.glob("*.jpg")}
     found: dict[int, list[dict[str, Any]]] = defaultdict(list)
     for row in (row for page in laid_out.layout_rows(plan) for row in page):

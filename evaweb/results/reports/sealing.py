@@ -1,4 +1,4 @@
-"""What a reveal keeps beside the blocks that count, so that a report shows it if something of it is changed later."""
+"""Record of a reveal in addition to the blocks that count, so that reports show later changes."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from evaweb.results.reports.tables import JUDGED, SCORE_COLUMNS, outcome_pages, 
 from evaweb.tabular_export import plain
 from evaweb.trials.models import TrialStatus
 
-# Of an attempt, by the names of the report's table; recompute/record.py has the same.
+# Columns of an attempt in the report's table; recompute/record.py has the same.
 ATTEMPT = (
     *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
     *("attempt", "why_again", "station", "operator", "started_at", "ended_at"),
 )
 MEASURED = ("trial", "duration_s", "ended_by", "frames")
-STAYS = ("looks", "voids", "cameras")  # of the integrity page
-LOOKED_AT = ("smoothness", "smoothness_commanded")  # of a recording, by the worker
+STAYS = ("looks", "voids", "cameras")  # parts of the integrity document
+LOOKED_AT = ("smoothness", "smoothness_commanded")  # computed from a recording by the worker
 
 
 def kept_of(plan: Plan) -> dict[str, Any]:
-    """Headline, setting and caveats in words; the digest of each attempt and score with its reason and time."""
+    """Return headline, setting and caveats as texts, and digests of attempts, scores, measurements and judgements."""
     said = headline(plan)
     return {
         "headline": list(said.said) if said else [],
@@ -43,7 +43,7 @@ def kept_of(plan: Plan) -> dict[str, Any]:
 
 
 def _measured(plan: Plan) -> dict[str, Any]:
-    """The digest of what was measured of each run; `later`: the trials whose recording has not been looked at yet."""
+    """Return the digest of each run's measurements; `later` are trials whose recording has not been analysed yet."""
     rows = [row for page in outcome_pages(plan) for row in page]
     later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
     values = [
@@ -64,7 +64,7 @@ def _judged(plan: Plan) -> dict[str, list[list[str]]]:
 
 
 def _conduct(plan: Plan) -> dict[str, Any]:
-    """What of the integrity page no later correction changes, as its JSON says it."""
+    """Return the parts of the integrity document that later corrections do not change, as JSON."""
     record = integrity_document(plan)
     found: dict[str, Any] = json.loads(
         json.dumps({name: record[name] for name in STAYS}, default=datetime.isoformat)
@@ -73,7 +73,7 @@ def _conduct(plan: Plan) -> dict[str, Any]:
 
 
 def _attempts(plan: Plan) -> Iterator[list[str]]:
-    """Voids with their reason: other reasons may come to be others when an attempt is scored later."""
+    """Yield the attempts with the reasons of voids; other reasons may change when an attempt is scored later."""
     for page in outcome_pages(plan):
         for row in page:
             voided = row["status"] == TrialStatus.VOIDED

@@ -1,4 +1,4 @@
-"""The rows of a plan's exports: every attempt with its place in the schedule and the score that counts, flat."""
+"""Rows of a plan's exports: every attempt with its position in the schedule and its current score, flat."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from evaweb.trials.record import HINTS, TrialRecord
 
 
 def _flat(hint: Any) -> Any:
-    """A type as exports have it: numbers, times and whether something is so; all else in words."""
+    """Return a type as used in exports: numbers, times and booleans are kept, everything else is text."""
     kinds = set(get_args(hint)) or {hint}
     if kinds - {type(None)} <= {bool, int, float, datetime}:
         return hint
     return str | None if type(None) in kinds else str
 
 
-# Of the plan, with where a trial has it; `milestones` is JSON: [[text, reached], ...].
+# Column: type and field of a trial; `milestones` is JSON: [[text, reached], ...].
 _OF_PLAN: dict[str, tuple[Any, str]] = {
     "order": (int, "handout__number"),
     "slot": (int, "handout__slot__index"),
@@ -39,8 +39,8 @@ _OF_PLAN: dict[str, tuple[Any, str]] = {
     "smoothness": (float | None, "episode__smoothness"),
     "smoothness_commanded": (float | None, "episode__smoothness_commanded"),
 }
-_CALLED = {"id": "trial", "number": "repetition"}  # columns of the record that have other names here
-# In this order since there are exports; what came later follows.
+_CALLED = {"id": "trial", "number": "repetition"}  # columns of the record with another name here
+# Order of the first exports; later columns follow.
 _FIRST = (
     *("trial", "uuid", "order", "code", "slot", "block", "checkpoint", "scene", "position", "repetition"),
     *("attempt", "why_again", "station", "operator", "status", "reason", "success", "score", "milestones"),
@@ -58,12 +58,11 @@ COLUMNS: dict[str, Any] = {name: _ALL[name][0] for name in _ORDER} | {
     "ended_by": str,
     "frames": int | None,
 }
-"""The columns of an export with their types; those of the score are empty where there is none.
+"""Columns of an export with their types; those of the score are empty without one.
 
-`ended_by`: estop, interruption or timeout, empty where a run ended by itself or by the operator. `frames`: rows of its
-recording.
-`headline`, the same in each row, is what the plan's design says of its comparison: a table that is taken elsewhere
-keeps it.
+`ended_by` is estop, interruption or timeout, empty for a normal end or one by the operator. `frames` is the number of
+rows of its recording. `headline`, the same in each row, is the conclusion of the plan's design, so that it stays with
+a table that is passed on.
 """
 _FIELDS = [_ALL[name][1] for name in _ORDER]
 _TEXTS = [name for name, hint in COLUMNS.items() if hint in (str, str | None)]
@@ -71,14 +70,14 @@ SCORE_COLUMNS = (
     *("trial", "rater", "source", "success", "score", "milestones", "failure", "failure_phase", "note"),
     *("reason", "scored_at"),
 )
-"""The columns of every score."""
+"""Columns of every score."""
 PAGE = 1000
 
 
 def outcome_pages(
     plan: Plan, which: TrialFilter | None = None, size: int = PAGE
 ) -> Iterator[list[dict[str, Any]]]:
-    """All attempts that are meant, in the order in which they were handed out, a page at a time."""
+    """Yield the selected attempts in order of allocation, in pages."""
     rows, last, said = _attempts(plan, which), 0, _headline(plan)
     while page := _rows(said, rows.filter(handout__number__gt=last)[:size]):
         yield page
@@ -86,7 +85,7 @@ def outcome_pages(
 
 
 def outcome_page(plan: Plan, which: TrialFilter | None, offset: int, limit: int) -> dict[str, Any]:
-    """Some of them, and how many there are."""
+    """Return one page of the attempts, and their total number."""
     rows = _attempts(plan, which)
     return {
         "total": rows.count(),
@@ -130,7 +129,7 @@ def _rows(said: str, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
 
 
 def milestones_of(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
-    """Of each score, by its key, which milestones were reached, in their order."""
+    """Return by score the milestones and whether each was reached, in order."""
     found: dict[int, list[tuple[str, bool]]] = defaultdict(list)
     rows = MilestoneOutcome.objects.filter(score__in=scores).order_by("score_id", "order")
     for score, text, reached in rows.values_list("score_id", "text", "reached"):
@@ -139,7 +138,7 @@ def milestones_of(scores: list[int]) -> dict[int, list[tuple[str, bool]]]:
 
 
 def score_pages(plan: Plan) -> Iterator[list[dict[str, Any]]]:
-    """Every score of the plan's trials in the order in which they were given, a page at a time."""
+    """Yield every score of the plan's trials in the order in which they were given, in pages."""
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
     known = {"trial": "trial_id", "rater": "rater__username", "milestones": "pk"}
     fields = [known.get(name, name) for name in SCORE_COLUMNS]
@@ -207,4 +206,4 @@ JUDGED: dict[str, tuple[tuple[str, ...], Callable[[Plan], list[dict[str, Any]]]]
     "preferences": (_PREFERENCES, _preferences),
     "judgements": (_JUDGEMENTS, _judgements),
 }
-"""Tables of what raters and judges said, with their columns."""
+"""Tables of ratings, preferences and judgements, with their columns."""

@@ -1,4 +1,4 @@
-"""Formats of results on their pages."""
+"""Template filters and tags of the result pages."""
 
 from __future__ import annotations
 
@@ -31,74 +31,74 @@ _TONES = {
 
 @register.filter
 def plan_tone(plan: Plan) -> str:
-    """The colour of a plan's state, by the name the style sheets have for it."""
+    """Return the colour of a plan's state, by its name in the style sheets."""
     return _TONES[PlanState(plan.state)]
 
 
 @register.filter
 def design_words(rule: str) -> str:
-    """A design in one or two words."""
+    """Return a design in one or two words."""
     return str(StoppingRule(rule).label).partition(":")[0]
 
 
 @register.filter
 def rate_words(found: Proportion) -> str:
-    """x/n, percent and interval."""
+    """Return x/n, percent and interval."""
     return wording.rate_words(found)
 
 
 @register.filter
 def difference_words(found: Difference) -> str:
-    """Points with their interval."""
+    """Return percentage points with their interval."""
     return wording.format_points(found)
 
 
 @register.filter
 def probability(p: float) -> str:
-    """A probability as papers write it."""
+    """Return a probability in the format of papers."""
     return wording.probability(p)
 
 
 @register.filter
 def p_words(p: float) -> str:
-    """The same with its p."""
+    """Return "p = 0.03" or "p < 0.001"."""
     return wording.p_words(p)
 
 
 @register.filter
 def outcome_words(run: Outcome) -> str:
-    """Success or failure, and the score where that says more."""
+    """Return success or failure, and the score if it is neither 0 nor 1."""
     said = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
     return f"{said}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else said
 
 
 @register.filter
 def twice_over(alpha: float) -> str:
-    """At how large an e-value one of two directions may be believed."""
+    """Return the e-value at which one of two directions is significant."""
     return f"{2 / alpha:g}"
 
 
 @register.filter
 def chosen_items(only: TrialFilter) -> list[tuple[str, str]]:
-    """Chosen filters, name and value."""
+    """Return the selected filters as (name, value)."""
     return [(name, value) for name, value in asdict(only).items() if value]
 
 
 @register.filter
 def of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
-    """Those of one trial."""
+    """Return the rows of one trial."""
     return rows.get(trial, [])
 
 
 @register.simple_tag
 def closed_because(plan: Plan, sealed: bool) -> str:
-    """Why it was closed, as far as the reader may know."""
+    """Return why the plan was closed, as far as the reader may know it."""
     return visible_close_reason(plan, sealed)
 
 
 @register.simple_tag
 def export_links(plan: Plan, only: TrialFilter) -> SafeString:
-    """To the plan's trials as tables, and to its report."""
+    """Return links to the plan's trials as tables, and to its report."""
     address = reverse("api:plan-outcomes", args=[plan.name, plan.version])
     query = f"&{only.query}" if only.query else ""
     links = [(f"{address}?format={kind}{query}", label) for kind, label in _FORMATS]
@@ -111,7 +111,7 @@ _FORMATS = (("csv", "Trials as CSV"), ("parquet", "as Parquet"), ("json", "as JS
 
 @register.filter
 def listed(found: list[Any], what: str) -> str:
-    """How many, and the first of them by their names."""
+    """Return the number of items, and the names of the first of them."""
     if not found:
         return "none"
     names = ", ".join(str(each) for each in found[:_MOST_NAMED])
@@ -121,31 +121,31 @@ def listed(found: list[Any], what: str) -> str:
 
 @register.filter
 def points(share: float) -> str:
-    """A difference of shares as whole points."""
+    """Return a difference of shares in whole percentage points."""
     return f"{100 * share:.0f}"
 
 
 @register.filter
 def percent(share: float, digits: int = 3) -> str:
-    """A share as a number of percent, without zeros at its end."""
+    """Return a share in percent, without trailing zeros."""
     return f"{100 * share:.{digits}f}".rstrip("0").rstrip(".") if digits else f"{100 * share:.0f}"
 
 
 @register.filter
 def shared(total: float, among: int) -> float:
-    """A part of what is shared evenly."""
+    """Return one equal share of a value."""
     return total / among
 
 
 @register.filter
 def minus(count: int, shown: list[Any]) -> int:
-    """How many are not shown."""
+    """Return the number of items that are not shown."""
     return count - len(shown)
 
 
 @register.filter
 def field_words(name: str) -> str:
-    """A field of a draft, as its page calls it."""
+    """Return a draft's field by its name on the page."""
     return _FIELD_WORDS.get(name, name.replace("_", " ").capitalize())
 
 
@@ -167,7 +167,7 @@ _FIELD_WORDS = {
 
 @register.filter
 def same_words(found: dict[str, Any]) -> str:
-    """Agreement of two raters: how often they said the same, with n and interval."""
+    """Return how often two raters agreed, with n and interval."""
     low, high = found["wilson"]
     share = 100 * found["same"] / found["n"]
     return f"{found['same']}/{found['n']}, {share:.0f} % [{100 * low:.0f}, {100 * high:.0f}]"
@@ -175,7 +175,7 @@ def same_words(found: dict[str, Any]) -> str:
 
 @register.filter
 def contrast_words(found: dict[str, Any]) -> str:
-    """With what probability the first is preferred to the second."""
+    """Return the probability that the first is preferred to the second."""
     low, high = found["interval"]
     return (
         f"{found['first']} is preferred to {found['second']} with probability {found['win_probability']:.2f} "

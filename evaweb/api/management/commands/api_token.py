@@ -1,4 +1,4 @@
-"""Makes a token with which a program uses the REST interface."""
+"""Command that creates a token for the REST interface."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from evaweb.errors import EvaError
 
 
 class Command(BaseCommand):
-    """`manage.py api_token USER NAME` prints the token, once."""
+    """`manage.py api_token USER NAME`; prints the token, once."""
 
     help = "Make a token for the REST interface and print it; it cannot be shown again."
 
     def add_arguments(self, parser: CommandParser) -> None:
-        """Whose, and what for."""
+        """Declare user, purpose and duration."""
         parser.add_argument("user", help="the username whose rights the token has")
         parser.add_argument("name", help="what uses it, e.g. nightly-export")
         parser.add_argument(

@@ -1,4 +1,4 @@
-"""Writes docs/openapi.json, which a test compares with what the interface is."""
+"""Command that writes docs/openapi.json, which a test compares with the interface."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ PLACE = Path(settings.BASE_DIR) / "docs" / "openapi.json"
 
 
 class Command(BaseCommand):
-    """`manage.py openapi_snapshot` after a change of the interface."""
+    """`manage.py openapi_snapshot`, to be run after a change of the interface."""
 
     help = f"Write {PLACE.name} anew."
 
     def handle(self, *args: Any, **options: Any) -> None:
-        """Write the file and say where."""
+        """Write the file and print its path."""
         PLACE.write_text(openapi_snapshot(), encoding="utf-8")
         self.stdout.write(f"wrote {PLACE}")

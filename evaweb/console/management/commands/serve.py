@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 
 class Command(BaseCommand):
-    """Pages, REST, live stations, and the chronicle of what happens there."""
+    """Web process: pages, REST, live sockets, and event ingest."""
 
     help = "Serves pages, REST and live stations until it is told to end."
 
@@ -27,7 +27,7 @@ class Command(BaseCommand):
         parser.add_argument("--lifeline", action="store_true", help="end when standard input ends")
 
     def handle(self, *args: Any, host: str, port: int, nice: int, lifeline: bool, **options: Any) -> None:
-        from evaweb.asgi import application  # not before models are there
+        from evaweb.asgi import application  # imported here, after the models are loaded
         from evaweb.console import server
         from evaweb.console.event_ingest import EventIngest
         from evaweb.errors import EvaError

@@ -11,9 +11,9 @@ from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 
 class Command(BaseCommand):
-    """E-stop, stop and halt over REST, in a process that the pages cannot keep busy."""
+    """E-stop, stop and halt over REST, in a process that the pages cannot overload."""
 
-    requires_system_checks = (Tags.security, Tags.compatibility)  # those of addresses load every page
+    requires_system_checks = (Tags.security, Tags.compatibility)  # the checks of URLs would import every page
     help = "Answers e-stop, stop and halt beside the web process until it is told to end."
 
     def add_arguments(self, parser: CommandParser) -> None:
@@ -40,7 +40,7 @@ class Command(BaseCommand):
         lifeline: bool,
         **options: Any,
     ) -> None:
-        from evaweb.api.door import stop_application  # not before models are there
+        from evaweb.api.door import stop_application  # imported here, after the models are loaded
         from evaweb.console import server
         from evaweb.console.arrivals import StopRequest
         from evaweb.listening import PortTaken, open_listener
@@ -48,7 +48,7 @@ class Command(BaseCommand):
 
         beside = None
         try:
-            if descriptor is not None:  # whose lab says where it is
+            if descriptor is not None:  # the lab that passed the socket publishes its address itself
                 listener = socket.socket(fileno=descriptor)
             else:
                 listener = open_listener(host, port)

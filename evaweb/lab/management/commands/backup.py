@@ -1,4 +1,4 @@
-"""`manage.py backup FOLDER`: database and data folder of a lab that may be running."""
+"""`manage.py backup FOLDER`: backup of database and data folder, also of a running lab."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaweb.lab.backups.errors import BackupError
 
 
 class Command(BaseCommand):
-    """Print what was copied, and which folders changed meanwhile."""
+    """Command that prints what was copied, and which folders changed meanwhile."""
 
     help = "Copies database and data folder into a new folder in FOLDER, with a digest of every file."
 

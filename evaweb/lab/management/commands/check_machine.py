@@ -14,7 +14,7 @@ from evaweb.lab.machine_check import State
 
 
 class Command(BaseCommand):
-    """Print a line for each thing; the exit code is 1 where something will not work."""
+    """Command that prints each check; the exit code is 1 if something will not work."""
 
     help = "Real-time rights, cores, memory, disk, clock, GPU, sockets and ports of this machine."
 

@@ -34,9 +34,9 @@ from evaweb.roles import Role
 from evaweb.trials.models import Checkpoint
 
 _DEPLOYMENTS = settings.BASE_DIR / "deployments"
-_MOST = 2000  # trials of --evaluate: a day and more
+_MOST = 2000  # limit of --evaluate: more than a day
 _STATION, _ROBOT = "bench-1", "agilex_piper"
-_STEPS = 3  # beside those of any lab: bench, station, plan
+_STEPS = 3  # progress steps besides those of any lab: bench, station, plan
 _COLLECTS = (
     'collection.source="relay"',
     'collection.dataset="tabletop_demonstrations"',
@@ -45,7 +45,7 @@ _COLLECTS = (
 
 
 class Command(BaseCommand):
-    """Bring up the demo and stay until Ctrl-C, or run one trial with --once."""
+    """Command that runs the demo until Ctrl-C, or one trial with --once."""
 
     help = "A lab on this machine that needs no robot: web, worker, a simulated bench, two policy servers."
 
@@ -135,19 +135,19 @@ class Command(BaseCommand):
         return url, logins
 
     def _lockstep(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
-        """Bench, policies and station in one process on a virtual clock."""
+        """Start bench, policies and station in one process on a virtual clock."""
         robot, how = options["robot"], benches_of(options)
         policies = {name: (how.skill(name), known_port(name)) for name in POLICIES}
         assignments = [f'robot="{robot}"', f'data_dir="{settings.DATA_DIR}"', *options["set"]]
         assignments += _COLLECTS if options["collect"] else ()
-        paced = () if options["evaluate"] else ("--paced",)  # people see it as they see a real bench
+        paced = () if options["evaluate"] else ("--paced",)  # in real time for people who watch
         program = programs.lockstep(str(deployment), assignments, robot, policies, (*how.options, *paced))
         for name, url in lab.processes.start(program)["policies"].items():
             seed.demo_checkpoint(name=name, description=POLICIES[name][0], policy={"url": url})
         return Bench(deployment, assignments, runs=True)
 
     def _bench(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
-        """Bench, policies and station in processes of their own."""
+        """Start bench, policies and station in separate processes."""
         robot, how = options["robot"], benches_of(options)
         bench = lab.processes.begin(programs.tabletop(robot, how.options))
         servers = {
@@ -170,7 +170,7 @@ class Command(BaseCommand):
         return Bench(deployment, assignments)
 
     def _plan(self, name: str, title: str, use: str, repetitions: int, **design: str) -> Plan:
-        # What a blind plan hands out is hidden from operators: single trials keep theirs.
+        # The checkpoints of a blind plan are hidden from operators: single trials have their own.
         served = [Checkpoint.objects.get(name=policy) for policy in (SKILLED, CLUMSY)]
         checkpoints = [
             seed.demo_checkpoint(name=f"{row.name}-{use}", description=row.description, policy=row.policy)
@@ -232,7 +232,7 @@ class Command(BaseCommand):
 
 
 def told(found: Analysis) -> Iterator[str]:
-    """Each rate with n and interval, and the difference with its interval: what is found is the headline's to say."""
+    """Yield each rate with n and interval, and differences with intervals; the conclusion is the headline's."""
     for arm in found.arms:
         yield f"{arm.checkpoint}: {arm.success.successes}/{arm.success.n} {_percent(arm.success.interval)}"
     for one in found.comparisons:
@@ -265,7 +265,11 @@ def _check(options: Mapping[str, Any]) -> None:
 
 
 def _deployment(robot: str) -> Path:
-    """The tabletop's deployment for that robot, else the one for any; CommandError lists the robots."""
+    """Return the tabletop's deployment for that robot, else the generic one.
+
+    Raises:
+        CommandError: If the robot does not exist.
+    """
     if robot not in robots.robot_names():
         raise CommandError(f"--robot {robot}: allowed: {', '.join(robots.robot_names())}")
     own = _DEPLOYMENTS / f"tabletop_{robot}.toml"
@@ -273,7 +277,7 @@ def _deployment(robot: str) -> Path:
 
 
 def _announce(path: Path, url: str, logins: list[DemoLogin], pids: Mapping[str, int]) -> None:
-    """Whole or not at all, and readable by its user alone."""
+    """Write address, passwords and process ids atomically, readable only by this account."""
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     passwords = {login.username: login.password for login in logins}
     with os.fdopen(

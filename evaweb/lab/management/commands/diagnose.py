@@ -1,4 +1,4 @@
-"""`manage.py diagnose --out FILE.zip`: the diagnostic bundle, without a web or a worker."""
+"""`manage.py diagnose --out FILE.zip`: the diagnostic bundle, without web and worker."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from evaweb.lab.diagnosis import bundle
 
 
 class Command(BaseCommand):
-    """Write the bundle; who reads it may be blind, so that it tells nothing of blind plans unless it is to."""
+    """Command that writes the bundle; without --unblinded nothing about blind plans, because its reader may
+    be blind.
+    """
 
     help = "Versions, settings, machine, deployments, stations, jobs and logs of this lab in one file, without secrets."
 

@@ -22,7 +22,7 @@ _FIRST_ACCOUNT = "Nobody can log in yet. Open {url}/first-account/ and type this
 
 
 class Command(BaseCommand):
-    """Bring up a lab and stay until Ctrl-C."""
+    """Command that runs a lab until Ctrl-C."""
 
     help = "Start web, worker and the stations of the given deployments; Ctrl-C ends all of them."
 

@@ -11,7 +11,7 @@ from evaweb.lab.backups.command import BackupCommand
 
 
 class Command(BackupCommand):
-    """Put it back, bring the database up to this program's migrations, and up to what the files say."""
+    """Command that restores a backup, applies this program's migrations, and reconciles database and files."""
 
     help = "Puts a backup back into the data folder and database of the settings, which have to be empty."
 

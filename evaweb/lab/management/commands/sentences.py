@@ -13,7 +13,7 @@ from evaweb.languages import parse
 
 
 class Command(BaseCommand):
-    """Prints JSON."""
+    """Command that prints the catalogue or the comparison as JSON."""
 
     help = (
         "Prints id, English pattern and arguments of every sentence as JSON. With the FILE of a language it prints "
@@ -21,13 +21,13 @@ class Command(BaseCommand):
     )
 
     def add_arguments(self, parser: CommandParser) -> None:
-        """The file of a language, where one is to be looked at."""
+        """Declare the file of a language."""
         parser.add_argument(
             "file", nargs="?", type=Path, help="of a language, such as static/languages/de.json"
         )
 
     def handle(self, *args: Any, file: Path | None = None, **options: Any) -> None:
-        """Print the one or the other."""
+        """Print the catalogue, or compare a language with it."""
         entries = {
             "sentences": sentences.once(
                 [*sentences.of_python(), *sentences.of_labels(), *sentences.of_scripts()]

@@ -1,4 +1,4 @@
-"""`manage.py verify BACKUP`: whether a backup is as it was written."""
+"""`manage.py verify BACKUP`: check of a backup against its digests."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evaweb.lab.backups.errors import BackupError
 
 
 class Command(BackupCommand):
-    """Read every byte of it; the exit code is 1 where something is amiss, each on a line."""
+    """Command that reads a complete backup; the exit code is 1 if there are differences, each on a line."""
 
     help = "Compares a backup's database and files with their digests; needs no lab."
 

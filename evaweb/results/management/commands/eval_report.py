@@ -1,4 +1,4 @@
-"""Writes a plan's offline report: pages, data, and the program that computes all of it again."""
+"""Command that writes a plan's offline report: pages, data, and the program that recomputes all numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Command(BaseCommand):
     help = "Write the offline report of a plan, with its data and a program that computes every number again."
 
     def add_arguments(self, parser: ArgumentParser) -> None:
-        """Which plan, and where to."""
+        """Declare the plan and the folder."""
         parser.add_argument("plan", help="its name; with /VERSION where it is not the newest one")
         parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
         parser.add_argument(
@@ -29,7 +29,7 @@ class Command(BaseCommand):
         )
 
     def handle(self, *args: Any, **options: Any) -> None:
-        """Write it and say where it begins."""
+        """Write the report and print its first page."""
         name, _, version = options["plan"].partition("/")
         if version and not version.isdecimal():
             raise CommandError(f"version {version!r}; allowed: a number, as in {name}/2")

@@ -1,5 +1,5 @@
-"""Figures of an evaluation as SVG, drawn on the server: the same on a page, on paper and in a report without a server.
+"""Figures of an evaluation as SVG, drawn on the server: identical on pages, on paper and in offline reports.
 
-Pure: numbers in, `svg.Drawing` out. Every figure has a title and a description that say the same in words. Series are
-told apart by colour, dash and mark, and named beside what they are of; colours are those of the style sheet.
+Pure functions from numbers to `svg.Drawing`. Every figure has a title and a description with the same content as text.
+Series differ in colour, dash and mark, and are named in the figure; colours come from the style sheet.
 """

@@ -1,4 +1,4 @@
-"""Plots of failures: a grid of initial conditions and checkpoints, Pareto charts of phases and causes."""
+"""Plots of failures: grid of initial conditions by checkpoint, Pareto charts of phases and causes."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from evaweb.results.presentation.drawings.svg import (
 from evaweb.results.presentation.wording import format_interval, rate_words
 
 _LABELS = 180
-_LETTERS = 22  # of a condition or a failure in a line
+_LETTERS = 22  # characters per line of a condition or failure
 _CELL = 30
 
 
 def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Drawing | None:
-    """A row per initial condition, a column per checkpoint: x/n, the darker the more often it succeeded.
+    """Draw x/n by initial condition (rows) and checkpoint (columns), darker for more successes.
 
-    `links` by checkpoint and condition lead to those trials.
+    `links` by checkpoint and condition lead to the trials.
     """
     conditions = sorted({name for arm in arms for name in arm.cells}, key=_natural)
     if not conditions or not arms:
@@ -75,14 +75,14 @@ def draw_grid(arms: Sequence[Arm], links: Mapping[tuple[str, str], str]) -> Draw
 
 
 def draw_pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
-    """Failures of one checkpoint by phase and cause, the most frequent first.
+    """Draw the failures of one checkpoint by phase and cause, most frequent first.
 
-    Bars are shares of all its trials, with their intervals as lines. `links` by phase and cause lead to those trials.
+    Bars are shares of all its trials, with intervals as lines. `links` by phase and cause lead to the trials.
     """
     total, so_far = sum(mode.count for mode in arm.failures), 0
     width, row = 600.0, 34
     height = row * len(arm.failures) + 30
-    # Of whole percents, so that the longest interval has room.
+    # Rounded up to 10 %, so that the longest interval fits.
     most = min(1.0, math.ceil(10 * max((mode.interval.high for mode in arm.failures), default=1.0)) / 10)
     scale = Scale(0, most, _LABELS, width - 165)
     parts, said = [_percents(scale, height - 26)], []
@@ -110,7 +110,7 @@ def draw_pareto(arm: Arm, links: Mapping[tuple[str, str], str]) -> Drawing:
 
 
 def _percents(scale: Scale, y: float) -> str:
-    """An axis of shares that need not reach 100 %."""
+    """Return an axis of shares that may end below 100 %."""
     shares = ticks(0, 100 * scale.high, 4)
     return "".join(
         line([(scale(share / 100), 0.0), (scale(share / 100), y)], "grid")

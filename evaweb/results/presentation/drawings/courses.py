@@ -1,4 +1,4 @@
-"""Plots of the course of trials: milestones as a funnel, time to success as a curve, evidence by pairs."""
+"""Plots over time: milestones as a funnel, time to success as a curve, evidence and power by pairs."""
 
 from __future__ import annotations
 
@@ -32,18 +32,19 @@ from evaweb.statistics.sequential import Evidence
 
 WIDTH = 600
 _LABELS = 180
-_LETTERS = 22  # of a milestone or a name in a line
-_LEGEND = 190  # right of a curve
+_LETTERS = 22  # characters per line of a milestone or name
+_LEGEND = 190  # space to the right of a curve
 
 
 def draw_funnel(
     scene: str, found: Sequence[tuple[int, str, Funnel]], links: Mapping[tuple[str, int], str]
 ) -> Drawing:
-    """Of each milestone a bar per checkpoint, each (series, name, its milestones), with its interval as a line.
+    """Draw for each milestone one bar per checkpoint with its interval; `found` has (series, name, funnel) per
+    checkpoint.
 
-    `links` by checkpoint and place of the milestone lead to the trials that did not reach it.
+    `links` by checkpoint and index of the milestone lead to the trials that did not reach it.
     """
-    found = sorted(found, key=lambda one: one[0])  # as every other legend has them
+    found = sorted(found, key=lambda one: one[0])  # the order of every other legend
     steps = len(found[0][2].steps) if found else 0
     bar, gap = 16, 16
     whose, y = legend([(i, name) for i, name, _ in found], WIDTH)
@@ -92,7 +93,7 @@ def draw_funnel(
 
 
 def draw_success_times(arms: Sequence[Arm]) -> Drawing | None:
-    """Share that has succeeded over time, up to the horizon, with pointwise bands."""
+    """Draw the share of successes over time up to the horizon, with pointwise bands."""
     drawn = [(arm.series, arm, arm.curve) for arm in arms if arm.curve is not None]
     if not drawn:
         return None
@@ -108,7 +109,7 @@ def draw_success_times(arms: Sequence[Arm]) -> Drawing | None:
     said = []
     labels: list[tuple[float, int, str]] = []
     for i, arm, curve in drawn:
-        # Before the first success the band is that of none of n.
+        # Before the first success the band is that of 0 of n.
         bands = wilson(0, curve.n)
         low, high = (
             _steps(curve.times, side, start, end)
@@ -140,9 +141,9 @@ def draw_success_times(arms: Sequence[Arm]) -> Drawing | None:
 def draw_evidence(
     found: Evidence, first: str, second: str, foreseen: int | None = None, drawn: tuple[int, int] = (0, 1)
 ) -> Drawing:
-    """The e-processes of both directions pair by pair, on a scale of powers, with the line at which they suffice.
+    """Draw the e-processes of both directions by pair on a logarithmic scale, with the threshold.
 
-    `drawn`: as which series the first and the second are.
+    `drawn` are the series of the first and the second checkpoint.
     """
     wanted = math.log10(2 / found.alpha)
     paths = [[value / math.log(10) for value in path] for path in (found.first, found.second)]
@@ -190,7 +191,10 @@ def draw_evidence(
 def power(
     curves: Sequence[tuple[int, str, Sequence[tuple[int, float]]]], planned: int, wanted: float, end: int
 ) -> Drawing:
-    """Power by trials of each checkpoint: each (series, design, its points), lines at what is planned and wanted."""
+    """Draw power by trials per checkpoint, with lines at the planned number and the wanted power.
+
+    `curves` has (series, design, points) per design.
+    """
     bottom = 230
     x, y = Scale(0, max(end, planned), 60, WIDTH - _LEGEND), Scale(0, 1, bottom, 14)
     parts = []
@@ -226,7 +230,7 @@ def power(
 def _steps(
     times: Sequence[float], values: Sequence[float], start: float, end: float
 ) -> list[tuple[float, float]]:
-    """A curve from time 0 to `end` that keeps its value, `start` at first, until the next time."""
+    """Return the points of a step curve from time 0 to `end` that begins at `start`."""
     points, before = [(0.0, start)], start
     for t, value in zip(times, values, strict=True):
         points += [(t, before), (t, value)]
@@ -239,7 +243,9 @@ def _area(upper: Sequence[tuple[float, float]], lower: Sequence[tuple[float, flo
 
 
 def _names(labels: Sequence[tuple[float, int, str]], x: float, lowest: float) -> list[str]:
-    """Marks and names beside the ends of curves, each (height, series, name); a series below zero keeps its place."""
+    """Return marks and names at the ends of curves, each label (height, series, name); a negative series only
+    takes space.
+    """
     gap = 20 + LINE * (max(len(wrapped(name, _LETTERS)) for _, _, name in labels) - 1)
     return [
         mark(i, x + 14, at) + label(x + 26, at + 5, name, _LETTERS)
@@ -251,7 +257,7 @@ def _names(labels: Sequence[tuple[float, int, str]], x: float, lowest: float) ->
 def _apart(
     labels: Sequence[tuple[float, int, str]], gap: float, lowest: float
 ) -> list[tuple[float, int, str]]:
-    """Labels moved down until none covers another, and up again where they would leave the figure."""
+    """Return the labels moved down until none overlaps, and up again if they would leave the figure."""
     placed: list[tuple[float, int, str]] = []
     for y, i, name in sorted(labels):
         placed.append((max(y, placed[-1][0] + gap) if placed else y, i, name))

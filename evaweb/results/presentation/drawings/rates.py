@@ -1,4 +1,4 @@
-"""Plots of success rates: intervals in rows, posteriors as violins, one difference on its axis."""
+"""Plots of success rates: intervals, posteriors as violins, and one difference."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from evaweb.statistics.proportions import Proportion
 
 WIDTH = 600
 _NAMES = 180
-_LETTERS = 22  # of a name in a line
-_POINTS = 120  # of a violin's outline
+_LETTERS = 22  # characters per line of a name
+_POINTS = 120  # points of a violin's outline
 
 
 def draw_intervals(
     title: str, rows: Sequence[tuple[str, Proportion, str]], order: Mapping[str, int]
 ) -> Drawing:
-    """A row each of (name, x of n, address): mark at the rate, band over its 95 % interval, the numbers beside.
+    """Draw one row per (name, x of n, address): mark at the rate, band over its 95 % interval, and the numbers.
 
-    `order` says as which series a name is drawn; names without one share the first.
+    `order` is the series of each name; names without one share the first series.
     """
     step = 36
     height = step * len(rows) + 44
@@ -62,7 +62,7 @@ def draw_intervals(
 
 
 def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
-    """Violins of each checkpoint's rate: the Beta posterior of a uniform prior, all of the same area."""
+    """Draw the posterior of each checkpoint's rate with a uniform prior as violins with a common scale."""
     row = 64
     height = row * len(arms) + 40
     scale = Scale(0, 1, _NAMES, WIDTH - 60)
@@ -74,7 +74,7 @@ def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
         y = 8 + row * (i + 0.5)
         half = Scale(
             0, math.sqrt(highest), 0, row * 0.46
-        )  # by the root: flat ones stay visible beside sharp ones
+        )  # square root, so that wide posteriors stay visible next to narrow ones
         dense = [(p, d) for p, d in zip(shares, density, strict=True) if d > 1e-3 * highest]
         upper = [(scale(p), y - half(math.sqrt(d))) for p, d in dense]
         lower = [(x, 2 * y - top) for x, top in reversed(upper)]
@@ -109,7 +109,7 @@ def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
 
 
 def draw_difference(found: Comparison) -> Drawing:
-    """The first minus the second in percentage points, with Newcombe's interval, on an axis around nothing."""
+    """Draw the first minus the second in percentage points, with Newcombe's interval, on an axis centred at 0."""
     height = 114
     scale = Scale(-1, 1, 30, WIDTH - 30)
     interval = found.difference.interval

@@ -1,4 +1,4 @@
-"""A small language for SVG: elements with escaped text, scales, axes."""
+"""SVG building blocks: elements with escaped text, scales, axes."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from itertools import count
 from evaweb.statistics.proportions import Proportion
 from evaweb.tabular_export import iter_csv
 
-SERIES = 8  # how many the style sheet tells apart; further ones begin again
-LINE = 15.0  # from one line of a label to the next
-_LETTER = 7.6  # about as wide as one letter of a label is
+SERIES = 8  # series with a style of their own; further ones start again
+LINE = 15.0  # line spacing of a label
+_LETTER = 7.6  # approximate width of a character
 PROPORTION = ("successes", "trials", "rate", "low", "high")  # columns of x of n with its interval
 _numbers = count(1)
 _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 def escape(text: str) -> str:
-    """A text as XML has it; U+FFFD stands for what it has no character for, which names of before may have."""
+    """Return the text escaped for XML; characters that XML cannot represent, as in some old names, become U+FFFD."""
     return html_escape(_NOT_XML.sub("\ufffd", text))
 
 
 class Drawing(str):
-    """A finished figure as markup, its data in it as CSV; templates put it into the page as it is."""
+    """Finished figure as markup with its data as CSV inside; templates insert it unescaped."""
 
     heading: str
     words: str
 
     def __html__(self) -> str:
-        """Django's and Jinja's way to ask for markup that is safe."""
+        """Return the markup; Django and Jinja call this for safe strings."""
         return self
 
 
@@ -46,15 +46,15 @@ def drawing(
     columns: Sequence[str],
     rows: Iterable[Sequence[object]],
 ) -> Drawing:
-    """A figure of `width` x `height` user units that shrinks with its page; `words` say what it shows.
+    """Return a figure of `width` x `height` user units that shrinks with its page; `words` is its description.
 
-    `rows` of `columns` are the numbers that it was drawn from.
+    `rows` of `columns` are the numbers from which it was drawn.
     """
     name = f"drawing-{next(_numbers)}"
     inner = "".join(parts)
-    role = "group" if "<a " in inner else "img"  # what is one picture has nothing to press in it
+    role = "group" if "<a " in inner else "img"  # an image may not contain links
     data = "".join(iter_csv(columns, [[dict(zip(columns, row, strict=True)) for row in rows]]))
-    role = "group" if "<a " in inner else "img"  # what is in a picture cannot be pressed
+    role = "group" if "<a " in inner else "img"  # an image may not contain links
     text = (
         f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" width="{_n(width)}" '
         f'role="{role}" aria-labelledby="{name}-t {name}-d">'
@@ -76,8 +76,10 @@ _PRINTED = {
 
 
 def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> str:
-    """A figure of rates as a file of its own: black on white, each look written at its element, with lines of text
-    above and below it. The same figure gives the same bytes.
+    """Return a figure of rates as a standalone file: black on white, with inline styles and lines of text above and
+    below.
+
+    Equal figures give equal bytes.
     """
     size = re.search(r'viewBox="0 0 (\S+) (\S+)"', figure)
     inner = re.search(r"</metadata>(.*)</svg>", figure, re.DOTALL)
@@ -109,13 +111,13 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
 
 
 def counted(found: Proportion) -> tuple[object, ...]:
-    """The cells of PROPORTION."""
+    """Return the cells of the columns PROPORTION."""
     interval = found.interval
     return (found.successes, found.n, found.rate, interval and interval.low, interval and interval.high)
 
 
 def element(tag: str, content: str = "", /, **attributes: object) -> str:
-    """One element; `class_` is class, underscores become hyphens, `content` is markup already."""
+    """Return one element; `class_` becomes class, underscores become hyphens, `content` is markup."""
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{escape(_n(value) if isinstance(value, float) else str(value))}"'
         for name, value in attributes.items()
@@ -125,33 +127,33 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def words(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> str:
-    """A line of text."""
+    """Return a line of text."""
     return element("text", escape(text), x=float(x), y=float(y), text_anchor=anchor, class_=class_ or None)
 
 
 def line(points: Sequence[tuple[float, float]], class_: str) -> str:
-    """Straight lines from point to point."""
+    """Return straight lines between points."""
     return element("path", d=path(points), class_=class_)
 
 
 def path(points: Sequence[tuple[float, float]]) -> str:
-    """Attribute `d` of a path."""
+    """Return the attribute `d` of a path."""
     return "".join(f"{'L' if i else 'M'}{_n(x)} {_n(y)}" for i, (x, y) in enumerate(points))
 
 
 def link(address: str, title: str, content: str) -> str:
-    """Link to where its number was made from; without an address only the content, with its title."""
+    """Return the content as a link to the trials behind it; without an address only with its title."""
     inner = element("title", escape(title)) + content
     return element("a", inner, href=address) if address else element("g", inner)
 
 
 def series(i: int | None) -> str:
-    """The class of the i-th series; None: of no checkpoint."""
+    """Return the class of the i-th series; None for no checkpoint."""
     return "series-none" if i is None else f"series-{i % SERIES + 1}"
 
 
 def mark(i: int | None, x: float, y: float, r: float = 5) -> str:
-    """The mark of the i-th series: a shape of its own, because colour alone does not reach every reader."""
+    """Return the mark of the i-th series, with its own shape because not every reader can distinguish the colours."""
     shapes = (
         f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
         path([(x - r, y - r), (x + r, y - r), (x + r, y + r), (x - r, y + r)]) + "Z",
@@ -164,7 +166,7 @@ def mark(i: int | None, x: float, y: float, r: float = 5) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """From values `low` to `high` to places `start` to `end`."""
+    """Linear scale from values `low` to `high` to positions `start` to `end`."""
 
     low: float
     high: float
@@ -172,7 +174,7 @@ class Scale:
     end: float
 
     def __call__(self, value: float) -> float:
-        """The place of a value; what lies outside stands at the end."""
+        """Return the position of a value, clamped to the ends."""
         span = self.high - self.low
         share = (
             (min(max(value, min(self.low, self.high)), max(self.low, self.high)) - self.low) / span
@@ -183,7 +185,7 @@ class Scale:
 
 
 def ticks(low: float, high: float, wanted: int = 5) -> list[float]:
-    """Round values from `low` to `high`, about as many as wanted."""
+    """Return round values from `low` to `high`, about `wanted` of them."""
     span = high - low
     if span <= 0:
         return [low]
@@ -195,12 +197,12 @@ def ticks(low: float, high: float, wanted: int = 5) -> list[float]:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A value of an axis."""
+    """Return the label of an axis value."""
     return f"{value:.{digits}g}".replace("-", "−")
 
 
 def percent_axis(scale: Scale, y: float, top: float, step: int = 25) -> str:
-    """Of shares, below the figure: hairlines from `top` to `y`, and the percent below."""
+    """Return the axis of shares: grid lines from `top` to `y`, and percentages below."""
     parts = []
     for share in range(0, 101, step):
         x = scale(share / 100)
@@ -210,9 +212,10 @@ def percent_axis(scale: Scale, y: float, top: float, step: int = 25) -> str:
 
 
 def wrapped(text: str, most: int, rows: int = 2) -> list[str]:
-    """In at most `rows` lines of at most `most` characters, broken behind a hyphen, a slash or a blank.
+    """Return the text in at most `rows` lines of at most `most` characters, broken after hyphen, slash, underscore or
+    blank.
 
-    What does not fit is left out of the middle: names of checkpoints begin alike and differ in their ends.
+    Surplus text is cut from the middle, because names of checkpoints begin alike and differ at their ends.
     """
     found = [""]
     for word in re.findall(r"[^\s\-_/]*[\s\-_/]?", text):
@@ -228,14 +231,14 @@ def wrapped(text: str, most: int, rows: int = 2) -> list[str]:
 
 
 def label(x: float, y: float, text: str, most: int, anchor: str = "start", rows: int = 2) -> str:
-    """A name in as few lines as it needs, the middle of them at the line `y`."""
+    """Return a name in as few lines as possible, centred vertically at `y`."""
     found = wrapped(text, most, rows)
     top = y - LINE * (len(found) - 1) / 2
     return "".join(words(x, top + LINE * i, row, anchor) for i, row in enumerate(found))
 
 
 def legend(names: Sequence[tuple[int, str]], width: float) -> tuple[str, float]:
-    """Which colour is whose, each (series, name), in rows from the top of a figure; and how high they are."""
+    """Return the legend of (series, name) in rows from the top of a figure, and its height."""
     parts, x, y = [], 0.0, 12.0
     for i, name in names:
         wide = 24 + _LETTER * len(name) + 20

@@ -1,5 +1,5 @@
-"""Computes every number of a report again, from its data alone: `python3 -m recompute` in the report's folder.
+"""Recomputes every number of a report from its data alone: `python3 -m recompute` in the report's folder.
 
-Written apart from the lab's own statistics, with nothing but Python's standard library, so that an error there is not
-repeated here. What was drawn is drawn anew, and held against what drawing anew may differ by.
+Written independently of the lab's statistics, with Python's standard library only, so that an error there is not
+repeated here. Random draws are repeated, and compared within the tolerance of a new draw.
 """

@@ -1,6 +1,6 @@
-"""Computes every number of this report again and says which do not come out.
+"""Recomputes every number of this report and prints those that differ.
 
-Exit code 0 where all do, 1 where one does not, 2 where nothing contradicts but no key shows that nothing was rewritten.
+Exit code: 0 if all agree, 1 if one differs, 2 if nothing contradicts but without a key rewriting cannot be excluded.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ _FILES = {f"{name}.json" for name in ("plan", "seal", "numbers", "integrity")} |
     f"{name}.csv" for name in _TABLES
 }
 _FILES |= {"pictures"}
-_CLOSE = 1e-6  # relative: both ways to a number end in the last bits of different sums
-_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # as the export has it
+_CLOSE = 1e-6  # relative tolerance: sums in different order differ in their last bits
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  # prefixes that the export escapes
 Rows = list[dict[str, str]]
-_BROKEN = (  # of what a cell or a number should not be
+_BROKEN = (  # errors of malformed cells and numbers
     *(ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError, csv.Error),
 )
-_TAIL = 0.015  # of what was drawn anew, how much more or less than 2.5 % may lie beyond an end: six standard errors
+_TAIL = 0.015  # tolerance of the 2.5 % of new draws beyond an interval's end: six standard errors
 
 
 def main() -> int:
-    """Compare, tell."""
+    """Compare data, page and recomputed numbers; print differences and return the exit code."""
     data = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "data"
     plan, seal, shown, record = (
         json.loads((data / f"{name}.json").read_text("utf-8"), object_pairs_hook=_once)
@@ -121,7 +121,7 @@ def main() -> int:
 def statement(
     seal: dict[str, Any], plan: dict[str, Any], shown: dict[str, Any], record: dict[str, Any]
 ) -> Iterator[str]:
-    """What follows from the data, whatever the page beside them says."""
+    """Yield lines on what follows from the data, whatever the page states."""
     kept = seal["at_reveal"] or {}
     yield f"What follows from data/, of {plan['title']} v{plan['version']}, {plan['stopping']['rule']}:"
     for sentence in (*kept.get("headline", ()), kept.get("setting", "")):
@@ -148,7 +148,7 @@ def statement(
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON in which each key stands once."""
+    """Return a JSON object; raise ValueError if a key occurs twice."""
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError(f"a key stands twice in {sorted(found)[:3]} ...")
@@ -160,7 +160,7 @@ def _names(data: Path) -> set[str]:
 
 
 def _later(scores: Rows, at_reveal: dict[str, Any] | None) -> bool:
-    """Whether scores came after the reveal."""
+    """Return True if scores were given after the reveal."""
     if not at_reveal:
         return False
     then = datetime.fromisoformat(at_reveal["at"])
@@ -168,7 +168,7 @@ def _later(scores: Rows, at_reveal: dict[str, Any] | None) -> bool:
 
 
 def _boundary(plan: dict[str, Any]) -> list[str]:
-    """What is wrong with the boundary of the plan's design, if it has one."""
+    """Return the faults of the boundary of the plan's design; [] without one."""
     if not plan["stopping"].get("boundary"):
         return []
     found, alpha = error(plan), share_of(plan)
@@ -191,7 +191,7 @@ def _rows(path: Path) -> Rows:
 
 
 def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> Rows:
-    """The trials as they were scored when the plan was revealed: what was corrected since makes no other figure."""
+    """Return the trials as scored at the reveal: later corrections must not change any figure."""
     if not at_reveal:
         return rows
     then = datetime.fromisoformat(at_reveal["at"])
@@ -203,7 +203,7 @@ def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> 
 
 
 def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, str]:
-    """The trial by that score; why it failed is what is said of it now, where it failed by both."""
+    """Return the trial with that score; its cause of failure stays the current one if it failed by both."""
     if score is None:
         return {**row, "status": "ended" if row["status"] == "scored" else row["status"]}
     names = ["success", "score", "milestones"]
@@ -213,7 +213,7 @@ def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, s
 
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
-    """Of trials that count: what second raters said, and the score that stood then."""
+    """Return the agreement of second raters with the scores of that time, for trials that count."""
     given = _given(rows, scores)
     pairs = [(_stood(given[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in given]
     if not pairs:
@@ -235,7 +235,7 @@ def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None
 
 
 def _given(rows: Rows, scores: Rows) -> dict[str, Rows]:
-    """The scores of each trial that counts."""
+    """Return the scores of each trial that counts."""
     given: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
     for score in scores:
         given.get(score["trial"], []).append(score)
@@ -243,7 +243,9 @@ def _given(rows: Rows, scores: Rows) -> dict[str, Rows]:
 
 
 def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] | None:
-    """Of trials that count: what each version of each automatic judge said, and the score that stood then."""
+    """Return the agreement of each version of each automatic judge with the scores of that time, for trials
+    that count.
+    """
     given = _given(rows, scores)
     judges: dict[tuple[str, str], Rows] = {}
     for row in judgements:
@@ -274,7 +276,7 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
 
 
 def _stood(scores: Rows, at: str) -> dict[str, str]:
-    """The last of a trial's scores that was not later; the first where a clock that was set back leaves none."""
+    """Return the last score given by then; the first one if, after a clock was set back, there is none."""
     then = datetime.fromisoformat(at)
     return next(
         (score for score in reversed(scores) if datetime.fromisoformat(score["scored_at"]) <= then), scores[0]
@@ -286,7 +288,7 @@ def _of(preferred: dict[str, str]) -> tuple[str, str]:
 
 
 def _text(cell: str) -> str:
-    """Without the apostrophe that keeps a spreadsheet from taking a text for a formula."""
+    """Return the cell without the apostrophe that protects texts from becoming formulas in a spreadsheet."""
     return cell[1:] if cell.startswith("'") and cell.lstrip("'").startswith(_FORMULA) else cell
 
 
@@ -317,7 +319,7 @@ def _float(cell: str) -> float | None:
 
 
 def differences(shown: Any, found: Any, where: str) -> Iterator[tuple[str, str]]:
-    """Each number's place, and what is wrong with it or ""."""
+    """Yield the place of each number, and its fault or ""."""
     if isinstance(found, Drawn):
         yield where, _drawn(shown, found)
     elif isinstance(shown, dict) and isinstance(found, dict):
@@ -361,11 +363,13 @@ def _drawn(shown: Any, drawn: Drawn) -> str:
 if __name__ == "__main__":
     try:
         code = main()
-        print(end="", flush=True)  # also where there is no standard output (`>&-`)
+        print(end="", flush=True)  # flush here, so that errors of a closed standard output (`>&-`) are caught
     except _BROKEN as fault:
         print(f"the files in data/ contradict each other: {fault!r}")
         code = 1
-    except BrokenPipeError:  # `... | head -1`; this program stands alone
+    except (
+        BrokenPipeError
+    ):  # as in `... | head -1`; redirect, so that the interpreter's exit does not fail again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 141
     except OSError as fault:

@@ -1,4 +1,4 @@
-"""What the plan's design says of its trials, and how often its boundary stops wrongly, counted in whole numbers."""
+"""Conclusions of the plan's design from its trials, and the boundary's exact error, counted in integers."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Any, Protocol
 from . import methods
 
 Pair = tuple[float, float]
-Block = Sequence[tuple[int, float]]  # arm and outcome of each of its trials that count
-_TIE = 1e-9  # relative: a p that is alpha in other last bits
-_EDGE = 1e-9  # of rates and differences, nearer to whose ends none is taken
+Block = Sequence[tuple[int, float]]  # arm and outcome of each trial that counts
+_TIE = 1e-9  # relative tolerance: p equals alpha up to its last bits
+_EDGE = 1e-9  # distance of rates and differences from the ends of their range
 _HALVED = 60
 
 
 class Row(Protocol):
-    """What is needed of a trial."""
+    """Fields of a trial that this module needs."""
 
     block: str
     slot: int
@@ -33,14 +33,16 @@ class Row(Protocol):
 def planned(
     trials: Sequence[Row], plan: Mapping[str, Any], at_reveal: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
-    """What the design says of each of its comparisons: of the blocks as the reveal kept them, where there was one."""
+    """Return the conclusion of each comparison, from the blocks recorded at the reveal if there was one."""
     return conclusions(kept_blocks(at_reveal) if at_reveal else blocks_of(trials, plan), plan)
 
 
 def planned_letters(
     trials: Sequence[Row], plan: Mapping[str, Any], at_reveal: Mapping[str, Any] | None
 ) -> dict[str, str] | None:
-    """Letters by the plan's own comparisons, where it compared all checkpoints with each other and has ended."""
+    """Return letters from the plan's comparisons, if it compared all checkpoints with each other and has
+    ended; else None.
+    """
     names, arms = comparisons_of(plan), arms_of(plan)
     said = planned(trials, plan, at_reveal)
     if (
@@ -61,25 +63,25 @@ def planned_letters(
 
 
 def comparisons_of(plan: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The planned comparisons; a plan of before there were several has one or none."""
+    """Return the planned comparisons; early plans have at most one."""
     before = [plan["comparison"]] if plan.get("comparison") else []
     return [(first, second) for first, second in plan.get("comparisons", before)]
 
 
 def arms_of(plan: Mapping[str, Any]) -> list[str]:
-    """The compared checkpoints in the order in which comparisons name them."""
+    """Return the compared checkpoints in the order in which the comparisons name them."""
     return list(dict.fromkeys(name for names in comparisons_of(plan) for name in names))
 
 
 def kept_blocks(at_reveal: Mapping[str, Any]) -> list[Block]:
-    """Those of a reveal; one of before there were several comparisons kept pairs."""
+    """Return the blocks recorded at a reveal; early reveals recorded pairs."""
     if "blocks" in at_reveal:
         return [[(arm, float(value)) for arm, value in block] for block in at_reveal["blocks"]]
     return [[(0, float(one)), (1, float(other))] for one, other in at_reveal["pairs"]]
 
 
 def blocks_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Block]:
-    """Outcomes of the compared checkpoints by block, in the schedule's order, up to the last one that is used."""
+    """Return outcomes of the compared checkpoints by block, in the schedule's order, up to the last block used."""
     arms, by_score = arms_of(plan), plan["stopping"].get("outcome") == "score"
     blocks: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     for trial in trials:
@@ -97,7 +99,7 @@ def kept_faults(
     plan: Mapping[str, Any],
     at_reveal: Mapping[str, Any] | None,
 ) -> list[str]:
-    """Contradictions of the trials, their scores, and the pairs that the reveal kept."""
+    """Return contradictions between trials, scores, and the blocks recorded at the reveal."""
     given: dict[str, list[Mapping[str, str]]] = defaultdict(list)
     for score in scores:
         given[score["trial"]].append(score)
@@ -117,12 +119,12 @@ def kept_faults(
     if at_reveal is not None and not found:
         stood = [_stood(row, given, at_reveal["at"]) for row in rows]
         kept, given_then = kept_blocks(at_reveal), blocks_of(stood, plan)
-        # Not in which order a block's trials are listed: reveals that kept pairs did not say it.
+        # Compared without the order within a block: reveals that recorded pairs did not record it.
         if [sorted(block) for block in kept] != [sorted(block) for block in given_then]:
             found.append("the blocks of the reveal are not those of the scores that stood then")
         found += [
             f"the sums of {arm['checkpoint']} at the reveal are not those of the scores that stood then"
-            for arm in at_reveal.get("arms", ())  # which came later than the pairs
+            for arm in at_reveal.get("arms", ())  # recorded only by later formats
             if not _adds_up(arm, [row for row in stood if row.status and row.checkpoint == arm["checkpoint"]])
         ]
     return found
@@ -145,7 +147,7 @@ class _Stood:
 
 
 def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str]]], at: str) -> _Stood:
-    """A trial by the last of its scores at that time."""
+    """Return a trial with the last of its scores at that time."""
     then = datetime.fromisoformat(at)
     before = [score for score in given[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
     counts = row["status"] == "scored" and bool(before)
@@ -155,7 +157,7 @@ def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str
 
 
 def _plain(cell: str) -> Any:
-    """A cell as JSON reads it: numbers and lists are the same however they are written."""
+    """Return the cell parsed as JSON, so that equal numbers and lists compare equal; else the text."""
     try:
         return json.loads(cell)
     except ValueError:
@@ -163,9 +165,10 @@ def _plain(cell: str) -> Any:
 
 
 def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Of each comparison after how many blocks it ended, for which checkpoint, and the p of a fixed number's test.
+    """Return for each comparison the block of its end, its winner, and p of a fixed number's test.
 
-    Where checkpoints are dropped, block by block: what ends first in the schedule's order decides who is left.
+    If checkpoints are dropped, comparisons are decided block by block: the first to end in the schedule's order
+    decides which checkpoints remain.
     """
     names, arms = comparisons_of(plan), arms_of(plan)
     sides = [(arms.index(first), arms.index(second)) for first, second in names]
@@ -177,7 +180,7 @@ def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[s
         if plan.get("format", 1) >= 6 and all(said["p"] is not None for said in found.values()):
             _step_by_step(found, given, plan, sides)
     dropped: dict[int, int] = {}
-    # With a margin none is found worse; a control, which all comparisons have, stays whatever was found.
+    # With a margin no arm is found worse; a control, which is in all comparisons, always stays.
     margin = plan["stopping"].get("margin") is not None
     spared = {arm for arm in range(len(arms)) if margin or all(arm in pair for pair in sides)}
     while len(found) < len(sides):
@@ -221,7 +224,9 @@ def _step_by_step(
     plan: Mapping[str, Any],
     sides: Sequence[tuple[int, int]],
 ) -> None:
-    """Holm: the smallest p at alpha over all comparisons, the next at alpha over those that are left, and so on."""
+    """Apply Holm's procedure: smallest p at alpha over all comparisons, the next at alpha over the remaining
+    ones, and so on.
+    """
     ranked = sorted(found, key=lambda n: found[n]["p"])
     for left, n in zip(range(len(ranked), 0, -1), ranked, strict=True):
         if found[n]["p"] > plan["stopping"]["alpha"] / left * (1 + _TIE):
@@ -236,7 +241,7 @@ def _side_mean(given: Sequence[Block], plan: Mapping[str, Any], arm: int) -> flo
 
 
 def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[int, int]) -> dict[str, Any]:
-    """Of one comparison; `winner` is 0 or 1."""
+    """Return the conclusion of one comparison; `winner` is 0 or 1."""
     said = plan["stopping"]
     foreseen, alpha, margin = _foreseen(plan), share_of(plan), said.get("margin")
     given = _made(blocks, said.get("counts"), sides)
@@ -269,7 +274,7 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
 def _made(
     blocks: Sequence[Block], counts: Sequence[Sequence[int]] | None, sides: tuple[int, int]
 ) -> list[tuple[list[float], list[float]]]:
-    """Outcomes of both sides, block by block, up to the first that is not made."""
+    """Return the outcomes of both sides by block, up to the first incomplete block."""
     made: list[tuple[list[float], list[float]]] = []
     before = [0, 0]
     for number, block in enumerate(blocks):
@@ -288,15 +293,16 @@ def _sum(given: Sequence[tuple[list[float], list[float]]], side: int) -> tuple[f
 
 
 def error(plan: Mapping[str, Any]) -> float:
-    """A bound of how often the boundary stops where it must not; with a margin, the largest of 400 rates.
+    """Return an upper bound of the probability that the boundary stops wrongly; with a margin the maximum over 400
+    rates.
 
-    Every order of outcomes that leads to a table is as likely as any other: their number is counted exactly.
+    All orders of outcomes that lead to a table are equally likely, and their number is counted exactly.
     """
     said = plan["stopping"]
     margin, alpha = said.get("margin"), share_of(plan)
     if margin is not None:
         return _with_margin(list(_stopped(said["boundary"], margin)), margin)
-    gone, trials = [0], 0  # orders that have stopped, by their successes
+    gone, trials = [0], 0  # number of stopped orders by total successes
     for n, m, tables in _stopped(said["boundary"], margin):
         for _ in range(n + m - trials):
             gone = [one + other for one, other in zip([*gone, 0], [0, *gone], strict=True)]
@@ -308,15 +314,15 @@ def error(plan: Mapping[str, Any]) -> float:
 
 
 def share_of(plan: Mapping[str, Any]) -> float:
-    """Alpha of each comparison."""
+    """Return alpha of each comparison."""
     return float(plan["stopping"]["alpha"]) / max(1, len(comparisons_of(plan)))
 
 
 def _bound(share: Sequence[float], alpha: float) -> float:
-    """A bound of the mean of `share` over binomial numbers of successes, whatever the rate.
+    """Return an upper bound of the mean of `share` over binomial numbers of successes at any rate.
 
-    Along the angle of which the rate is the squared sine, that of a probability turns by at most sqrt(trials). Between
-    two rates that this does not keep below alpha another one is taken, until they are as near as can be told.
+    With rate = sin(angle)^2, the angle of a probability changes by at most sqrt(trials) per radian. If this does not
+    keep an interval below alpha, it is bisected, down to the numerical resolution.
     """
     turn, allowed, end = math.sqrt(len(share) - 1), math.asin(math.sqrt(alpha)), 1e-7
 
@@ -344,9 +350,9 @@ def _foreseen(plan: Mapping[str, Any]) -> int:
 
 
 def _side(look: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
-    """Which of the compared checkpoints (0, 1) the boundary stops for."""
+    """Return the side (0, 1) for which the boundary stops, or None."""
     n, m, *least = look
-    if margin is not None:  # it asks about its second arm: the first checkpoint
+    if margin is not None:  # with a margin it tests its second arm: the first checkpoint
         first, second = second, first
     if not least or not _reaches((int(first), n, int(second), m), (least[0], n, least[1], m), margin):
         return None
@@ -361,7 +367,9 @@ def _reaches(
 
 
 def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, int]:
-    """How extreme a table is, as a fraction: the squared pooled statistic; with a margin, that of Agresti and Caffo."""
+    """Return how extreme a table is, as a fraction: squared pooled statistic; with a margin that of Agresti
+    and Caffo.
+    """
     if margin is None:
         x, rest = a + b, n + m - a - b
         return ((a * m - b * n) ** 2, x * rest) if x and rest else (0, 1)
@@ -370,18 +378,18 @@ def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, 
     return lead * abs(lead) * n * m, (a * (n - a) * m**3 + b * (m - b) * n**3) * scale**2
 
 
-Tables = dict[tuple[int, int], int]  # successes of both arms, with the orders that come to them
+Tables = dict[tuple[int, int], int]  # successes of both arms: number of orders that lead to them
 
 
 def _stopped(boundary: Sequence[Sequence[int]], margin: float | None) -> Iterator[tuple[int, int, Tables]]:
-    """Each look's trials, and the tables that stop there."""
+    """Yield the trials of each look, and the tables that stop there."""
     yield from ((n, m, gone) for n, m, gone, _ in _walked(boundary, margin))
 
 
 def _walked(
     boundary: Sequence[Sequence[int]], margin: float | None
 ) -> Iterator[tuple[int, int, Tables, Tables]]:
-    """Each look's trials, the tables that stop there, and those that go on."""
+    """Yield the trials of each look, the tables that stop there, and those that continue."""
     alive, n, m = {(0, 0): 1}, 0, 0
     for look in boundary:
         for arm in (0,) * (look[0] - n) + (1,) * (look[1] - m):
@@ -398,7 +406,7 @@ def _walked(
 
 
 def _mixed(share: Sequence[float], p: float) -> float:
-    """The mean of `share` over a binomial number of successes."""
+    """Return the mean of `share` over a binomial number of successes."""
     n = len(share) - 1
     middle = min(n, int(p * (n + 1)))
     at = math.exp(
@@ -462,7 +470,9 @@ def _evidence(
 def estimate(
     boundary: Sequence[Sequence[int]], first: int, n: int, second: int, m: int
 ) -> tuple[float, float, float] | None:
-    """Difference of rates, median unbiased, with its 95 % interval, where a design ended: outcomes by stages."""
+    """Return the median-unbiased difference of rates with its 95 % interval, by the stagewise order; None if
+    not at a look.
+    """
     beyond: list[tuple[float, ...]] = []
     same: list[tuple[float, ...]] = []
     looks = [(look[0], look[1]) for look in boundary]
@@ -513,7 +523,7 @@ def estimate(
 
 
 def _likeliest(difference: float, first: int, n: int, second: int, m: int) -> tuple[float, float]:
-    """The rates with this difference under which the successes are likeliest."""
+    """Return the rates with this difference that maximise the likelihood."""
     low, high = max(0.0, -difference) + _EDGE / 4, min(1.0, 1.0 - difference) - _EDGE / 4
     for _ in range(_HALVED):
         q = (low + high) / 2

@@ -1,4 +1,4 @@
-"""Statistics of raters, automatic judges and preferences: agreement, calibration, Bradley-Terry by Newton."""
+"""Statistics of raters, automatic judges and preferences: agreement, calibration, Bradley-Terry by Newton's method."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 from . import methods
 
-_FAR = 30.0  # log-worths beyond which the likelihood has no maximum
+_FAR = 30.0  # size of log-worths that indicates a likelihood without maximum
 
 
 def agreement(pairs: Sequence[tuple[bool, bool]]) -> dict[str, Any]:
-    """Of two raters on yes and no."""
+    """Return the agreement of two raters on yes/no pairs."""
     n, same = len(pairs), sum(one == other for one, other in pairs)
     observed = same / n
     yes = [sum(pair[i] for pair in pairs) / n for i in (0, 1)]
@@ -22,9 +22,9 @@ def agreement(pairs: Sequence[tuple[bool, bool]]) -> dict[str, Any]:
     share = sum(yes) / 2
     gwet = 2 * share * (1 - share)
     ones, m = n * sum(yes), 2 * n
-    # Krippendorff: disagreement expected of all values together, drawn without replacement.
+    # Krippendorff: disagreement expected for all values pooled, drawn without replacement.
     expected = 2 * ones * (m - ones) / (m * (m - 1))
-    one_word = sum(yes) in (0.0, 2.0)  # of all ratings: what chance would do is then not defined
+    one_word = sum(yes) in (0.0, 2.0)  # all ratings are equal: chance agreement is undefined
     return {
         "n": n,
         "same": same,
@@ -36,7 +36,7 @@ def agreement(pairs: Sequence[tuple[bool, bool]]) -> dict[str, Any]:
 
 
 def calibration(pairs: Sequence[tuple[float, bool]]) -> dict[str, Any] | None:
-    """Of (probability, whether it was so), in tenths."""
+    """Return the calibration of (probability, outcome) pairs in tenths."""
     if not pairs:
         return None
     tenths: dict[int, list[tuple[float, bool]]] = {}
@@ -53,7 +53,7 @@ def calibration(pairs: Sequence[tuple[float, bool]]) -> dict[str, Any] | None:
 
 
 def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
-    """Of (by the score, by the judge, probability): both None where the judge gave no verdict."""
+    """Return the agreement on (score, judge, probability); the last two are None if the judge gave no verdict."""
     pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
     found = calibration([(p, scored) for scored, _, p in said if p is not None])
     return {
@@ -64,7 +64,7 @@ def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict
 
 
 def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
-    """Krippendorff's alpha of scores, by squared differences; None where all are the same."""
+    """Return Krippendorff's alpha of scores with squared differences; None if all are equal."""
     observed = sum((a - b) ** 2 for a, b in pairs) / len(pairs)
     values = [value for pair in pairs for value in pair]
     n = len(values)
@@ -73,7 +73,7 @@ def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
 
 
 def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """What was said of each; of several with the same words the second is "held (2)", in their order."""
+    """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:
         label, n = text, 1
@@ -85,7 +85,7 @@ def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def preferences(rows: Sequence[tuple[str, str, str, float]]) -> dict[str, Any] | None:
-    """Of (first, second, outcome, its share of one comparison); no ranking where the likelihood has no maximum."""
+    """Return the ranking of (first, second, outcome, weight); null if the likelihood has no maximum."""
     rows = [row for row in rows if row[0] != row[1]]
     if not rows:
         return None
@@ -160,7 +160,11 @@ def _slopes(design: _Design, x: Sequence[float]) -> tuple[list[float], list[list
 
 
 def _inverse(matrix: Sequence[Sequence[float]]) -> list[list[float]]:
-    """By Gauss and Jordan; ZeroDivisionError where there is none."""
+    """Return the inverse by Gauss-Jordan elimination.
+
+    Raises:
+        ZeroDivisionError: If the matrix is singular.
+    """
     n = len(matrix)
     rows = [[*row, *(float(i == j) for j in range(n))] for i, row in enumerate(matrix)]
     for i in range(n):

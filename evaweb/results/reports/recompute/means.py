@@ -1,4 +1,4 @@
-"""Means with Student's interval: the distribution of t as the finite sums that it is (Abramowitz and Stegun 26.7)."""
+"""Means with Student's interval; the t distribution as a finite sum (Abramowitz and Stegun 26.7)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .methods import solve
 
 
 def student(values: Sequence[float]) -> dict[str, Any] | None:
-    """Count of values, their mean and its interval; no interval where none of them differs."""
+    """Return number, mean and interval of the values; the interval is None if all are equal."""
     n = len(values)
     if not n:
         return None
@@ -23,13 +23,13 @@ def student(values: Sequence[float]) -> dict[str, Any] | None:
 
 
 def student_t(freedom: int) -> float:
-    """Beyond plus and minus which 5 % of t with so many degrees of freedom lie."""
+    """Return the two-sided 5 % quantile of t with `freedom` degrees of freedom."""
     angle = solve(lambda a: _within(a, freedom), 0.95, 0.0, math.pi / 2)
     return math.tan(angle) * math.sqrt(freedom)
 
 
 def _within(angle: float, freedom: int) -> float:
-    """The share of t between -x and x, for x = tan(angle) sqrt(freedom)."""
+    """Return the probability of t between -x and x, for x = tan(angle) sqrt(freedom)."""
     cosine, sine = math.cos(angle), math.sin(angle)
     term, total = (1.0, 0.0) if freedom % 2 == 0 else (cosine, 0.0)
     for k in range(freedom // 2):

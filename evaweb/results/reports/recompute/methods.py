@@ -1,4 +1,4 @@
-"""The formulae, by way of elementary sums: binomial and Poisson tails where the lab has Beta and Gamma functions."""
+"""Formulae by elementary sums: binomial and Poisson tails instead of the lab's Beta and Gamma functions."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ Ends = list[float]
 
 
 def solve(rises: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """Argument, from `low` to `high`, at which a rising function has the `wanted` value."""
+    """Return the argument in [low, high] at which an increasing function has the `wanted` value, by bisection."""
     for _ in range(200):
         middle = (low + high) / 2
         if not low < middle < high:
-            break  # there is no number between them
+            break  # adjacent floating-point numbers
         low, high = (middle, high) if rises(middle) < wanted else (low, middle)
     return (low + high) / 2
 
 
 def mass(n: int, p: float) -> list[float]:
-    """The binomial distribution of `n` trials at rate `p`."""
+    """Return the binomial distribution of `n` trials at rate `p`."""
     if p in (0.0, 1.0):
         return [float(k == (n if p else 0)) for k in range(n + 1)]
     whole = math.lgamma(n + 1)
@@ -35,21 +35,21 @@ def mass(n: int, p: float) -> list[float]:
 
 
 def wilson(x: int, n: int) -> Ends:
-    """The rates that a normal test at 5 % does not refuse: both roots of (x/n - p)^2 = z^2 p (1 - p) / n."""
+    """Return the rates that a normal test at 5 % does not reject: roots of (x/n - p)^2 = z^2 p (1 - p) / n."""
     a, b, c = 1 + Z * Z / n, -(2 * x / n + Z * Z / n), (x / n) ** 2
     root = math.sqrt(max(0.0, b * b - 4 * a * c))
     return [0.0 if x == 0 else (-b - root) / (2 * a), 1.0 if x == n else (-b + root) / (2 * a)]
 
 
 def clopper_pearson(x: int, n: int) -> Ends:
-    """The rates at which neither so many nor so few successes have a probability below 2.5 %."""
+    """Return the rates at which neither tail at x has a probability below 2.5 %."""
     low = 0.0 if x == 0 else solve(lambda p: math.fsum(mass(n, p)[x:]), 0.025, 0.0, 1.0)
     high = 1.0 if x == n else solve(lambda p: -math.fsum(mass(n, p)[: x + 1]), -0.025, 0.0, 1.0)
     return [low, high]
 
 
 def beta_interval(a: int, b: int) -> Ends:
-    """The middle 95 % of Beta(a, b): its distribution is a binomial tail of a + b - 1 trials."""
+    """Return the central 95 % of Beta(a, b), whose distribution is a binomial tail of a + b - 1 trials."""
 
     def share(p: float) -> float:
         return math.fsum(mass(a + b - 1, p)[a:])
@@ -58,7 +58,7 @@ def beta_interval(a: int, b: int) -> Ends:
 
 
 def garwood(events: int) -> Ends:
-    """The exact interval of a Poisson mean."""
+    """Return the exact interval of a Poisson mean."""
 
     def at_most(k: int, mean: float) -> float:
         if mean <= 0:
@@ -71,14 +71,14 @@ def garwood(events: int) -> Ends:
 
 
 def newcombe(x1: int, n1: int, x2: int, n2: int) -> Ends:
-    """Method 10 of Newcombe (1998)."""
+    """Return the interval of method 10 of Newcombe (1998)."""
     (l1, u1), (l2, u2), p1, p2 = wilson(x1, n1), wilson(x2, n2), x1 / n1, x2 / n2
     down, up = math.hypot(p1 - l1, u2 - p2), math.hypot(u1 - p1, p2 - l2)
     return [max(-1.0, p1 - p2 - down), min(1.0, p1 - p2 + up)]
 
 
 def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
-    """Statistic and two-sided probability; which tables are as extreme is decided in whole numbers."""
+    """Return statistic and two-sided probability; which tables are as extreme is decided in integers."""
     total = n1 + n2
 
     def square(a: int, b: int) -> tuple[int, int]:
@@ -88,7 +88,7 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
     if under == 0:
         return 0.0, 1.0
     z = (x1 / n1 - x2 / n2) / math.sqrt(under / total**2 * (1 / n1 + 1 / n2))
-    ends: list[tuple[int, int]] = []  # of each row: how many extreme tables at its beginning, and at its end
+    ends: list[tuple[int, int]] = []  # by row: number of extreme tables at its beginning and at its end
     for a in range(n1 + 1):
         extreme = [
             (square(a, b)[0] * under >= over * square(a, b)[1]) if square(a, b)[1] else over == 0
@@ -111,7 +111,7 @@ def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
 
 
 def _highest(function: Callable[[float], float], low: float, high: float, parts: int) -> float:
-    """The maximum of a smooth function that may have several peaks."""
+    """Return the maximum of a smooth function that may have several peaks."""
     width = (high - low) / parts
     values = [function(low + i * width) for i in range(parts + 1)]
     best = max(values)
@@ -130,7 +130,7 @@ def _highest(function: Callable[[float], float], low: float, high: float, parts:
 
 
 def better(x1: int, n1: int, x2: int, n2: int) -> float:
-    """The probability that the first rate is the higher, from uniform priors: Beta(a, b) above Beta(c, d)."""
+    """Return the probability that the first rate is higher, with uniform priors: Beta(a, b) above Beta(c, d)."""
     a, b, c, d = x1 + 1, n1 - x1 + 1, x2 + 1, n2 - x2 + 1
 
     def log_beta(p: float, q: float) -> float:
@@ -146,7 +146,7 @@ def better(x1: int, n1: int, x2: int, n2: int) -> float:
 
 
 def mcnemar(first_only: int, second_only: int) -> float:
-    """Two-sided probability of so uneven a split of the pairs in which only one succeeded."""
+    """Return the two-sided probability of a split of the discordant pairs as uneven as this."""
     n = first_only + second_only
     if n == 0:
         return 1.0
@@ -155,7 +155,7 @@ def mcnemar(first_only: int, second_only: int) -> float:
 
 
 def holm(probabilities: Sequence[float]) -> list[float]:
-    """Corrected for how many there are."""
+    """Return the probabilities corrected by Holm's procedure, in the given order."""
     n, found = len(probabilities), list(probabilities)
     for i, p in enumerate(probabilities):
         smaller = [q for j, q in enumerate(probabilities) if (q, j) <= (p, i)]
@@ -165,7 +165,7 @@ def holm(probabilities: Sequence[float]) -> list[float]:
 
 
 def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
-    """One letter for each largest group of which no two are apart; found by trying all groups one member larger."""
+    """Return one letter for each maximal group without a separated pair, found by enlarging groups by one member."""
     groups = {frozenset([name]) for name in names}
     grown = True
     while grown:
@@ -186,7 +186,9 @@ def letters(names: Sequence[str], apart: set[frozenset[str]]) -> dict[str, str]:
 
 
 def exact_within(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
-    """Exact conditional test of equal arms within strata, two-sided; by floating sums of hypergeometric masses."""
+    """Return the exact conditional two-sided test of equal arms within strata, by sums of hypergeometric
+    probabilities.
+    """
     telling = [(x1, n1, x2, n2) for x1, n1, x2, n2 in tables if n1 and n2 and 0 < x1 + x2 < n1 + n2]
     if len(telling) < 2:
         return None
@@ -203,7 +205,7 @@ def exact_within(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
 
 
 def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
-    """Zelen's exact test of one odds ratio in all strata; None where there is nothing, or too much, to count."""
+    """Return Zelen's exact test of a common odds ratio; None if there is nothing, or too much, to enumerate."""
     telling = [(x1, n1, x2, n2) for x1, n1, x2, n2 in tables if n1 and n2 and 0 < x1 + x2 < n1 + n2]
     sizes = sorted(len(_hypergeometric(n1, n2, x1 + x2)[1]) for x1, n1, x2, n2 in telling)
     if len(telling) < 2 or math.prod(sizes[:-1]) > 20_000:
@@ -227,14 +229,16 @@ def interaction(tables: Sequence[tuple[int, int, int, int]]) -> float | None:
 
 
 def _hypergeometric(n1: int, n2: int, successes: int) -> tuple[int, list[float]]:
-    """The least number of the first's successes with these margins, and the probability of each from there."""
+    """Return the smallest number of the first arm's successes with these margins, and the probabilities from
+    there on.
+    """
     least, most = max(0, successes - n2), min(n1, successes)
     whole = math.comb(n1 + n2, successes)
     return least, [math.comb(n1, x) * math.comb(n2, successes - x) / whole for x in range(least, most + 1)]
 
 
 def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, object]:
-    """Over scenes, each (successes, trials, successes, trials)."""
+    """Return the comparison over scenes of (successes, trials, successes, trials) each."""
     surplus = variance = above = below = weighted = weights = 0.0
     for x1, n1, x2, n2 in tables:
         n, x = n1 + n2, x1 + x2
@@ -257,7 +261,7 @@ def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, ob
 
 
 def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
-    """Log e after each pair (worse one's outcome, better one's outcome), of a bet that the latter is the better."""
+    """Return log e after each pair (outcome of the worse, outcome of the better) of a bet on the latter."""
     log_e, path = 0.0, []
     for t, (worse, better_one) in enumerate(pairs):
         p = (1 + sum(w for w, _ in pairs[:t])) / (3 + t)
@@ -271,9 +275,9 @@ def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
 
 
 def score_bets(differences: Sequence[float]) -> list[float]:
-    """Log e after each difference of scores, of a bet that their mean is above 0.
+    """Return log e after each difference of scores, of a bet that their mean is above 0.
 
-    Five gamblers with equal money and a stake each are one whose stake is the mean of theirs, weighed by what they own.
+    Five gamblers with equal money and one stake each act as one gambler with the wealth-weighted mean of their stakes.
     """
     log_e, path, owned = 0.0, [], {stake / 10: 0.2 for stake in (1, 3, 5, 7, 9)}
     for difference in differences:
@@ -286,8 +290,10 @@ def score_bets(differences: Sequence[float]) -> list[float]:
 
 
 def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
-    """The means that no bet has refuted after any pair: those of `score_bets`, of how far each difference is from m
-    on a scale on which the least, -1, is at -1 and m at 0."""
+    """Return the interval of means that no bet has refuted after any pair, or None if it is empty.
+
+    The bets are those of `score_bets` on differences rescaled such that -1 is at -1 and the tested mean at 0.
+    """
 
     def refuted(given: Sequence[float]) -> float:
         def stands(mean: float) -> float:
@@ -301,9 +307,9 @@ def anytime(differences: Sequence[float], alpha: float) -> Ends | None:
 
 
 def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
-    """Two-sided probability of so large a sum of differences, had each the other sign as likely.
+    """Return the two-sided probability of a sum of differences as large as this if each sign is equally likely.
 
-    In whole numbers: the coefficients of the product of all (1 + x^d), side by side in one long number.
+    Computed in integers: the coefficients of the product of all (1 + x^d), packed into one long number.
     """
     units: list[int] = []
     for parts in (25_200, 2_520, 420, 60, 12):
@@ -323,5 +329,5 @@ def sign_flips(differences: Sequence[float], widest: float = 1.0) -> float:
 
 
 def separated(names: Sequence[str], p: dict[frozenset[str], float], alpha: float) -> set[frozenset[str]]:
-    """Pairs that a corrected probability of at most `alpha` tells apart."""
+    """Return the pairs with a corrected probability of at most `alpha`."""
     return {frozenset(pair) for pair in combinations(names, 2) if p[frozenset(pair)] <= alpha}

@@ -1,4 +1,4 @@
-"""All numbers of a report from its trials; the same shape as the report's own `numbers.json`."""
+"""All numbers of a report from its trials, in the structure of the report's `numbers.json`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DRAWS = 4000
 
 @dataclass(frozen=True)
 class Trial:
-    """One row of trials.csv."""
+    """Row of trials.csv."""
 
     order: int
     block: str
@@ -41,13 +41,13 @@ class Trial:
 
     @property
     def condition(self) -> str:
-        """The initial condition."""
+        """Initial condition."""
         return f"{self.scene}/{self.position}"
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """Values of which an interval's lower end has 2.5 % below it and its upper end 2.5 % above, drawn anew."""
+    """New draws for an interval: 2.5 % of `lower` are below its lower end, 2.5 % of `upper` above its upper end."""
 
     lower: list[float]
     upper: list[float]
@@ -55,24 +55,24 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Timing:
-    """The horizon of times to success, 0 where nothing has a duration, and each scene's limit."""
+    """Horizon of times to success [s], 0 without any duration, and each scene's limit [s]."""
 
     until: float
     limits: Mapping[str, float]
 
     def time(self, trial: Trial) -> float:
-        """When it succeeded, up to the horizon; the horizon where it did not."""
+        """Return the time to success up to the horizon [s]; the horizon for a failure."""
         assert trial.duration is not None
         own = min(trial.duration, self.limits.get(trial.scene, math.inf))
         return own if self.reached(trial) else self.until
 
     def reached(self, trial: Trial) -> bool:
-        """True where it succeeded within the horizon."""
+        """Return True if the trial succeeded within the horizon."""
         own = min(trial.duration or 0.0, self.limits.get(trial.scene, math.inf))
         return trial.success and own <= self.until
 
     def known(self, trials: Trials) -> list[Trial]:
-        """Those with a time."""
+        """Return the trials with a known time."""
         return [t for t in trials if t.duration is not None] if self.until > 0 else []
 
 
@@ -80,7 +80,7 @@ Trials = Sequence[Trial]
 
 
 def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Every number there is; `said` is what the plan's design says of each of its comparisons."""
+    """Return every number; `said` are the conclusions of the plan's design."""
     alpha = plan["stopping"]["alpha"]
     arms: dict[str, list[Trial]] = defaultdict(list)
     broken: dict[str, list[Trial]] = defaultdict(list)
@@ -115,7 +115,7 @@ def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str,
     for comparison in compared:
         one = decided.get((comparison["first"], comparison["second"]))
         comparison["standing"] = "not planned" if one is None else "open" if one["at"] is None else "decided"
-        if one is not None:  # its design tells apart, and no test beside it
+        if one is not None:  # its design decides, and not a test
             corrected[frozenset((one["first"], one["second"]))] = 0.0 if one["winner"] is not None else 1.0
         if comparison["standing"] == "open":
             _describe(comparison, plan["stopping"])
@@ -132,12 +132,14 @@ def numbers(trials: Trials, plan: Mapping[str, Any], said: Sequence[Mapping[str,
 
 
 def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, Any]:
-    """Of each recipe of which several runs were tried the mean of their rates; of three or more with its interval."""
+    """Return the mean rate of each recipe with several runs; with an interval from three runs on."""
     runs: dict[str, dict[str, float]] = defaultdict(dict)
     rows = plan.get("checkpoints", ())
     weights = [row["digest"] for row in rows if row.get("digest")]
     for row in rows:
-        served = row.get("strategy") or weights.count(row.get("digest")) > 1  # the same weights once more
+        served = (
+            row.get("strategy") or weights.count(row.get("digest")) > 1
+        )  # the same weights served in another way
         if row.get("recipe") and row["name"] in arms and not served:
             runs[row["recipe"]][row["name"]] = _rate(arms[row["name"]])
     found = {}
@@ -150,7 +152,7 @@ def _recipes(arms: Mapping[str, Trials], plan: Mapping[str, Any]) -> dict[str, A
 
 
 def _describe(comparison: dict[str, Any], stopping: Mapping[str, Any]) -> None:
-    """Leave what describes the trials, and the evidence by which the design decides."""
+    """Remove inference from an open comparison; only descriptions and the evidence that is its design remain."""
     own = {"success": "evidence", "score": "score_evidence"}[stopping.get("outcome") or "success"]
     for name in (
         *("barnard", "probability_better", "mcnemar", "scores", "over_scenes", "evidence"),
@@ -216,7 +218,7 @@ def _arm(trials: Trials, broken: Trials, timing: Timing) -> dict[str, Any]:
 
 
 def _modes(trials: Trials) -> list[dict[str, Any]]:
-    """Failed trials by phase and cause, the most frequent first; shares are of all trials."""
+    """Return failure modes by phase and cause, most frequent first; shares are of all trials."""
     n = len(trials)
     counts = Counter((t.failure_phase, t.failure) for t in trials if not t.success)
     ranked = sorted((-count, not phase, phase, not cause, cause) for (phase, cause), count in counts.items())
@@ -253,10 +255,10 @@ def _funnel(trials: Trials) -> list[dict[str, Any]]:
 
 
 def _time(trials: Trials, timing: Timing) -> dict[str, Any]:
-    """Of trials with a time: the share that had succeeded by each of them, and the mean up to the horizon."""
+    """Return the curve of successes over time, and the mean up to the horizon."""
     n, ended = len(trials), sorted(timing.time(t) for t in trials if timing.reached(t))
     curve = [[t, rank / n, *methods.wilson(rank, n)] for rank, t in enumerate(ended, start=1)]
-    last = {point[0]: point for point in curve}  # of those at the same time
+    last = {point[0]: point for point in curve}  # of points at the same time the last
     lasted = [timing.time(t) / timing.until for t in trials]
     return {
         "n": n,
@@ -273,9 +275,10 @@ def _time(trials: Trials, timing: Timing) -> dict[str, Any]:
 
 
 def _drawn(strata: Sequence[Sequence[float]], low: float, high: float) -> Drawn:
-    """Means over strata of outcomes from 0 to 1, with weights drawn anew, on a scale from `low` to `high`.
+    """Return new draws of means over strata of outcomes from 0 to 1, scaled to [low, high].
 
-    The weights are those of gaps between uniform numbers; one gap more goes to 0 for the lower end, to 1 for the upper.
+    The weights are gaps between uniform numbers; one extra gap is given to 0 for the lower end, to 1 for the upper
+    end.
     """
     chance, found = random.Random(1), Drawn([], [])
     counted = [list(Counter(values).items()) for values in strata]
@@ -317,7 +320,7 @@ def _comparison(
     pairs = _pairs(first, second) if in_pairs else []
     told = [
         pair for place, pair in enumerate(pairs) if int(pair[0].block) == place
-    ]  # up to the first unmade block
+    ]  # up to the first incomplete block
     statistic, p = methods.barnard(*counts)
     only = (
         sum(a.success and not b.success for a, b in pairs),
@@ -391,7 +394,7 @@ def _stratified(first: Trials, second: Trials) -> dict[str, Any] | None:
 
 
 def _tables(first: Trials, second: Trials, key: str) -> dict[str, tuple[int, int, int, int]]:
-    """Successes and trials of both in each stratum in which both were tried."""
+    """Return successes and trials of both in each stratum in which both were tried."""
     ours, theirs = ({getattr(t, key): [] for t in arm} for arm in (first, second))
     for arm, found in ((first, ours), (second, theirs)):
         for trial in arm:

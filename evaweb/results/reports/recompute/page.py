@@ -1,4 +1,4 @@
-"""The report's page as somebody sees it: what it says, each thing once, and nothing of it hidden."""
+"""Report page as a reader perceives it: its statements, each exactly once, and nothing hidden."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from html.parser import HTMLParser
 from typing import Any
 
-_ALONE = frozenset({"meta", "br", "hr"})  # without an end
+_ALONE = frozenset({"meta", "br", "hr"})  # elements without an end tag
 _DRAWN = frozenset({"svg", "g", "path", "rect", "line", "circle", "text", "title", "desc", "metadata"})
 _TAGS = _DRAWN | {
     *(
@@ -63,7 +63,7 @@ _SAID, _DOUBTS = "plan-sentence", "Reasons for doubt, as the reveal kept them"
 
 
 class Node:
-    """An element with what stands in it: elements and texts."""
+    """Element with its children: elements and texts."""
 
     def __init__(self, tag: str, attributes: Mapping[str, str]) -> None:
         self.tag, self.attributes = tag, attributes
@@ -71,12 +71,12 @@ class Node:
 
     @property
     def classes(self) -> set[str]:
-        """Names of its style."""
+        """Style classes."""
         return set(self.attributes.get("class", "").split())
 
     @property
     def text(self) -> str:
-        """What somebody reads in it, blanks as one."""
+        """Visible text, with blanks collapsed."""
         return plain("".join(self._texts()))
 
     def _texts(self) -> Iterator[str]:
@@ -88,7 +88,7 @@ class Node:
                 yield " " if each.tag in ("br", "p", "li", "td", "th", "div", "dd", "dt") else ""
 
     def all(self, *tags: str) -> Iterator[Node]:
-        """Those within it, in their order; of any tag where none is named."""
+        """Yield the descendants in document order, with these tags or all."""
         for each in self.inner:
             if isinstance(each, Node):
                 if not tags or each.tag in tags:
@@ -127,12 +127,14 @@ class _Reader(HTMLParser):
 
 
 def plain(text: str) -> str:
-    """It with its blanks as one."""
+    """Return the text with blanks collapsed."""
     return " ".join(text.split())
 
 
 def read(page: str, styles: str | None) -> tuple[Node, list[str]]:
-    """The page, and what of it could hide or change what is read; `styles`: what its style has to be, None: unknown."""
+    """Return the page, and everything that could hide or change its text; `styles` is the required style,
+    None if unknown.
+    """
     reader = _Reader()
     reader.feed(re.sub(r"^\s*<!doctype html>", "", page, flags=re.IGNORECASE))
     reader.close()
@@ -157,7 +159,7 @@ def read(page: str, styles: str | None) -> tuple[Node, list[str]]:
 
 
 def _hiding(styles: str) -> set[str]:
-    """Classes of which a style says that what has them is not seen."""
+    """Return the classes whose style hides their elements."""
     found: set[str] = set()
     for selectors, rules in re.findall(r"([^{}]+)\{([^{}]*)\}", styles):
         if _HIDES.search(rules):
@@ -170,10 +172,10 @@ def _hiding(styles: str) -> set[str]:
 def said_faults(
     root: Node, seal: Mapping[str, Any], plan: Mapping[str, Any], shown: Mapping[str, Any]
 ) -> list[str]:
-    """What the page says otherwise than the reveal, the plan and numbers.json."""
+    """Return differences between the page's statements and the reveal, the plan and numbers.json."""
     kept, text = seal["at_reveal"] or {}, root.text
     found = []
-    if "headline" in kept:  # of format 6 on
+    if "headline" in kept:  # from format 6 on
         for what, given, wanted in (
             ("headline", _sentences(root), [f"{one}." for one in kept["headline"]]),
             ("reasons for doubt", _listed(root, _DOUBTS), [f"{one}." for one in kept.get("caveats", ())]),
@@ -210,7 +212,7 @@ def _sentences(root: Node) -> list[str]:
 
 
 def _listed(root: Node, heading: str) -> list[str]:
-    """The items of the list behind a heading."""
+    """Return the items of the list after a heading."""
     nodes = list(root.all("h3", "ul"))
     at = [i for i, node in enumerate(nodes) if node.tag == "h3" and node.text == heading]
     behind = [nodes[i + 1] for i in at if i + 1 < len(nodes) and nodes[i + 1].tag == "ul"]
@@ -218,7 +220,7 @@ def _listed(root: Node, heading: str) -> list[str]:
 
 
 def below(root: Node, *head: str) -> list[list[str]]:
-    """The rows of the one table whose head begins so; two of them are one row that fits nothing."""
+    """Return the rows of the only table with this head; if there are two, one row that matches nothing."""
     tables = [
         [[cell.text for cell in row.all("th", "td")] for row in one.all("tr")] for one in root.all("table")
     ]
@@ -227,7 +229,7 @@ def below(root: Node, *head: str) -> list[list[str]]:
 
 
 def cells_fit(given: Sequence[str], wanted: Sequence[str], later: bool) -> bool:
-    """Whether each cell says what is wanted; where there are `later` corrections they stand behind the rate."""
+    """Return True if each cell has the wanted text; with `later`, corrections may follow the rate."""
     rate, *rest = given or [""]
     return list(rest) == list(wanted[1:]) and (
         rate == wanted[0] or (later and rate.startswith(f"{wanted[0]} with later corrections "))

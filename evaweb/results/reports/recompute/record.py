@@ -1,4 +1,6 @@
-"""Whether the record is whole: nothing that was tried or said is missing, and nothing was changed since the reveal."""
+"""Completeness of the record: nothing is missing that was tried or recorded, and nothing was changed after
+the reveal.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,12 @@ SCORE = (
     *("reason", "scored_at"),
 )
 ENDED = ("estop", "interruption", "timeout")
-STAYS = ("looks", "voids", "cameras")  # after a reveal
+STAYS = ("looks", "voids", "cameras")  # unchanged after a reveal
 Rows = Sequence[Mapping[str, str]]
 
 
 def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
-    """What was handed out or said and is not there any more."""
+    """Return gaps: missing trials, attempts, scores and corrections."""
     found = _missing("trials.csv lacks the trial handed out as number", [int(row["order"]) for row in rows])
     attempts: dict[str, list[int]] = defaultdict(list)
     for row in rows:
@@ -53,7 +55,7 @@ def gaps(rows: Rows, scores: Rows, record: Mapping[str, Any]) -> list[str]:
 
 
 def _counts(rows: Rows, given: Mapping[str, Rows], record: Mapping[str, Any]) -> Iterator[str]:
-    """What integrity.json counts of each checkpoint otherwise than the tables."""
+    """Yield the counts by checkpoint in integrity.json that differ from the tables."""
     by = {row["checkpoint"]: row for row in record.get("checkpoints", ())}
     for name in sorted({row["checkpoint"] for row in rows}):
         own = [row for row in rows if row["checkpoint"] == name]
@@ -89,7 +91,7 @@ def _counts(rows: Rows, given: Mapping[str, Rows], record: Mapping[str, Any]) ->
 
 
 def _copies(rows: Rows, given: Mapping[str, Rows]) -> Iterator[str]:
-    """What trials.csv says of the score that counts otherwise than scores.csv."""
+    """Yield values in trials.csv that differ from the score that counts in scores.csv."""
     for row in rows:
         if row["status"] == "scored" and (scores := given.get(row["trial"])):
             for name in SCORE:
@@ -105,12 +107,14 @@ def changes(
     seal: Mapping[str, Any],
     record: Mapping[str, Any],
 ) -> list[str]:
-    """What is not as the reveal kept it; `judged`: the tables of what others said. Nothing before a reveal."""
+    """Return what differs from the record of the reveal; [] before a reveal. `judged` are the tables of
+    raters and judges.
+    """
     kept = seal["at_reveal"]
     if not kept:
         return []
     found = [] if seal["key"] else ["what counts was kept, and seal.json has no key"]
-    if "record" not in kept:  # plans of format 5 and before
+    if "record" not in kept:  # plans up to format 5
         return found
     then = datetime.fromisoformat(kept["at"])
     attempts = [
@@ -121,7 +125,7 @@ def changes(
     ]
     if digest({"attempts": attempts, "scores": said}) != kept["record"]:
         found.append("attempts, scores, reasons or times are not those of which the reveal kept the digest")
-    if "measured" in kept:  # those of before have none
+    if "measured" in kept:  # not recorded by earlier reveals
         names = kept["measured"].get("names", MEASURED)
         later = {str(trial) for trial in kept["measured"]["later"]}
         values = [

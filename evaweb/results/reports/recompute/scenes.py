@@ -1,4 +1,4 @@
-"""Scores held against the plan: milestones of its scenes, which are required, their points, and what ends count as."""
+"""Scores compared with the plan: milestones of its scenes, required milestones, points, and rules for abnormal ends."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-_JUDGED_AS_FROZEN = 5  # format of the plans whose trials are judged by the scenes that were frozen
+_JUDGED_AS_FROZEN = 5  # plan format from which trials are judged by the frozen scenes
 
 
 def scene_faults(
     plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]], *judged: Sequence[Mapping[str, str]]
 ) -> list[str]:
-    """Scores and second ratings that do not follow from the scene of their trial, as the plan has it."""
+    """Return scores and second ratings that contradict the scene of their trial in the plan."""
     if plan.get("format", 1) < _JUDGED_AS_FROZEN:
         return []
     scenes = {scene["name"]: scene["milestones"] for scene in plan["scenes"]}
@@ -30,7 +30,7 @@ def scene_faults(
 
 
 def ending_faults(plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Runs that did not end by themselves and count as something else than the plan says."""
+    """Return runs with an abnormal end that do not count as the plan requires."""
     counts = plan.get("counts_as", {})
     last = {row["slot"]: int(row["attempt"]) for row in sorted(rows, key=lambda row: int(row["attempt"]))}
     found = []
@@ -41,7 +41,7 @@ def ending_faults(plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) ->
             found.append(f"trial {row['trial']} counts, its end ({by}) is repeated by the plan")
         if rule == "failure" and row["status"] == "scored" and row["success"] == "true":
             found.append(f"trial {row['trial']} is a success, its end ({by}) is a failure by the plan")
-        nothing = row.get("frames", "1") in ("", "0")  # nobody could have scored it
+        nothing = row.get("frames", "1") in ("", "0")  # without frames it could not be scored
         again = row["status"] == "interrupted" and int(row["attempt"]) < last[row["slot"]]
         if rule == "failure" and again and not nothing:
             found.append(f"trial {row['trial']} was repeated, its end ({by}) is a failure by the plan")

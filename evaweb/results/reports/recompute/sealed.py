@@ -1,4 +1,4 @@
-"""Schedule, codes and commitment again, from the key that the reveal showed."""
+"""Schedule, codes and commitment, recomputed from the revealed key."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import Any
 
 from .designs import arms_of
 
-_ALL_KEPT = 7  # format of the plans whose reveals keep what counts also without a comparison
-_IMBALANCE = 3  # trials by which one of two checkpoints in random order may be ahead at a condition
+_ALL_KEPT = 7  # plan format from which reveals keep a record without a comparison too
+_IMBALANCE = (
+    3  # lead of one of two checkpoints in random order, per condition, at which the other one is forced
+)
 _KEPT = (
     "pairs",
     "blocks",
@@ -23,18 +25,18 @@ _KEPT = (
     "measured",
     "judged",
     "conduct",
-)  # of a reveal, under its digest
+)  # parts of a reveal that its digest covers
 _LETTERS = "ABCDEFGHJKLMNPQRSTUVWXYZ23456789"
 
 
 def digest(document: Any) -> str:
-    """SHA-256 of the canonical form."""
+    """Return the SHA-256 of the canonical form."""
     text = json.dumps(_plain(document), sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """A whole number is written without a point, by any writer."""
+    """Return the value with integral floats as integers, because writers of JSON differ in the decimal point."""
     if isinstance(value, float) and value.is_integer():
         return int(value)
     if isinstance(value, dict):
@@ -63,12 +65,12 @@ def _shuffled(draws: Iterator[int], items: Sequence[Any]) -> list[Any]:
 
 
 def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
-    """[index, block, checkpoint, scene, position, repetition] of every trial that the plan foresaw."""
+    """Return [index, block, checkpoint, scene, position, repetition] of every planned trial."""
     names = [row["name"] for row in plan["checkpoints"]]
     conditions = [(scene["name"], p["number"]) for scene in plan["scenes"] for p in scene["positions"]]
     draws, coins, k = _draws(key, "orders"), _draws(key, "allocation"), len(names)
     orders: list[list[str]] = []
-    ahead: dict[tuple[str, int], int] = {}  # trials of the first checkpoint less those of the second
+    ahead: dict[tuple[str, int], int] = {}  # trials of the first checkpoint minus those of the second
     random_order = plan.get("allocation") == "random"
     units: list[list[Any]] = []
     block = 0
@@ -94,13 +96,13 @@ def schedule(plan: Mapping[str, Any], key: bytes) -> list[list[Any]]:
 
 
 def counts(units: Sequence[Sequence[Any]], names: Sequence[str]) -> list[list[int]]:
-    """Trials of two checkpoints after each block."""
+    """Return the trials of two checkpoints after each block."""
     blocks = 1 + max(unit[1] for unit in units)
     return [[sum(u[2] == name for u in units if u[1] <= at) for name in names] for at in range(blocks)]
 
 
 def codes(key: bytes, count: int) -> list[str]:
-    """The codes in the order in which trials were handed out."""
+    """Return the codes in order of allocation."""
     draws, found = _draws(key, "codes"), dict[str, None]()
     while len(found) < count:
         found["".join(_LETTERS[_below(draws, len(_LETTERS))] for _ in range(5))] = None
@@ -108,19 +110,19 @@ def codes(key: bytes, count: int) -> list[str]:
 
 
 def faults(seal: Mapping[str, Any], plan: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Contradictions of plan, commitment, key and trials; none where all fit together."""
+    """Return contradictions between plan, commitment, key and trials."""
     found = []
     if digest(plan) != seal["digest"]:
         found.append(f"plan.json has the digest {digest(plan)}, the plan that was frozen {seal['digest']}")
     kept = seal["at_reveal"]
-    said = {name: kept[name] for name in _KEPT if name in kept} if kept else {}  # as it was then
+    said = {name: kept[name] for name in _KEPT if name in kept} if kept else {}  # parts covered by the digest
     if kept and digest({"plan": seal["digest"], **said}) != kept["digest"]:
         found.append(f"the pairs of the reveal have not the digest {kept['digest']}")
     if not seal["key"]:
         return found
     version = plan.get(
         "format", 1
-    )  # from 3 on a reveal kept what counts, from 4 on blocks and sums, from 6 on words
+    )  # reveals record a digest from format 3 on, blocks and arms from 4 on, texts from 6 on
     kinds = () if version < 3 else ("digest",) if version == 3 else ("digest", "blocks", "arms")
     kinds += ("headline", "caveats", "record") if version >= 6 else ()
     kinds += ("setting", "measured", "judged", "conduct") if version >= _ALL_KEPT else ()

@@ -1,4 +1,4 @@
-"""What the report's page and headline say in words, held against the numbers."""
+"""Statements of the report's page and headline, compared with the numbers."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from .designs import Block, arms_of
 from .numbers import Trial
 from .page import Node, below, cells_fit, plain
 
-_FROM = 6  # of plans, the format whose reveals keep words
+_FROM = 6  # plan format from which reveals record texts
 
 
 def headline_faults(
     said: Sequence[Mapping[str, Any]], blocks: Sequence[Block], plan: Mapping[str, Any], told: Sequence[str]
 ) -> list[str]:
-    """What the sentences of a reveal do not say, or say beyond it, of what the design found of its blocks."""
+    """Return conclusions missing from the sentences of a reveal, and sentences without a conclusion."""
     if plan.get("format", 1) < _FROM or not said:
         return []
     left, found = list(told), []
@@ -35,7 +35,7 @@ def headline_faults(
 
 
 def _ways(one: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, Any]) -> Iterator[str]:
-    """How the sentence of a comparison may begin, with its counts."""
+    """Yield the possible beginnings of a comparison's sentence, with its counts."""
     first, second, stopping = one["first"], one["second"], plan["stopping"]
     if one["at"] is None:
         yield f"{first} and {second} were not compared: closed after {one['blocks']} of "
@@ -60,7 +60,7 @@ def _ways(one: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, An
         yield f"Undecided: {one['at']} {_unit(plan)} cannot tell {first} and {second} apart: {counts}"
     elif not by_score:
         yield f"{better} succeeded more often than {worse}: {counts}"
-    elif one["p"] is not None:  # flipped signs within pairs test whether two can be exchanged
+    elif one["p"] is not None:  # sign-flip tests show only that the two are not exchangeable
         yield f"Scores of {better} and {worse} differ: {counts}"
     else:
         yield f"{better} reached higher scores than {worse}: {counts}"
@@ -71,7 +71,7 @@ def _unit(plan: Mapping[str, Any]) -> str:
 
 
 def _best(said: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
-    """How the sentence on the best of several begins, "" where there is to be none."""
+    """Return the beginning of the sentence on the best of several, "" if there must be none."""
     arms, stopping = arms_of(plan), plan["stopping"]
     of_all = len(arms) > 2 and 2 * len(said) == len(arms) * (len(arms) - 1)
     differ = stopping.get("outcome") == "score" and any(one["p"] is not None for one in said)
@@ -89,9 +89,8 @@ def _best(said: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
 
 
 def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], later: bool) -> list[str]:
-    """What the page's tables of checkpoints and trials say otherwise than numbers.json and trials.csv.
-
-    `later`: scores came after the reveal.
+    """Return differences of the page's tables from numbers.json and trials.csv; `later`: scores came after
+    the reveal.
     """
     arms = {row[0]: row[1:] for row in below(root, "Checkpoint", "Groups")}
     found = []
@@ -117,7 +116,7 @@ def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], l
 
 
 def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
-    """Whether it is the value, rounded to so many digits in any way."""
+    """Return True if the cell is the value, rounded to `digits` in any direction."""
     if value is None:
         return cell == ""
     try:
@@ -127,7 +126,7 @@ def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
 
 
 def _cells(arm: Mapping[str, Any]) -> list[str]:
-    """Of a checkpoint all that its row says behind its letters."""
+    """Return the cells of a checkpoint's row after its letters."""
     rate = f"{arm['successes']}/{arm['n']}, {100 * arm['rate']:.0f} % [{_ends(arm['wilson'])}]"
     means = (
         f"{100 * arm[name]['value']:.0f} % [{_ends(arm[name]['gaffke'])}]" for name in ("score", "macro")
