@@ -121,8 +121,12 @@ def collecting(ann):
 @pytest.mark.story
 def test_a_session_is_collected_by_keyboard_processed_meanwhile_and_published(collecting, demo):
     ann, page = collecting, collecting.page
-    ann.key("Enter")
-    ann.said("Start: arm first")
+
+    def refused():
+        ann.key("Enter")  # a button that has just come up asks for a second press
+        return "Start: arm first" in page.locator("#outcome").inner_text()
+
+    eventually(refused, "Start is refused, because the arm switch is off")
     assert ann.state() == "READY"
     ann.key("a")
     page.locator("#arm[aria-checked=true]").wait_for()

@@ -46,7 +46,7 @@ def trial(operator):
     eventually(lambda: operator.truth()["success"], "the block lies on the plate", 3 * PATIENCE_S)
     page.keyboard.press("s")
     operator.reaches("READY")
-    page.locator("#score").wait_for()
+    page.locator("#score .verdict", has_text=":").wait_for()  # a script writes it once the card is there
     seen["verdicts"] = [page.locator("#score .verdict").inner_text()]
     for check in page.locator("input[name=milestone]").all():
         check.check()
