@@ -2,6 +2,7 @@
 
 import math
 import socket
+from functools import partial
 
 import pytest
 
@@ -230,28 +231,43 @@ def test_a_first_action_that_is_far_is_warned_of_and_approached(ready):
 def test_space_is_a_focused_controls_and_escape_closes_what_is_open_before_it_stops(ready):
     page = ready.page
 
+    def faulted():
+        return ready.snapshot()["state"] == "faulted"
+
     def stopped():
         ready.reaches("FAULTED")
         ready.press("release")
         ready.reaches("IDLE")
 
+    def has_space(control, shown):
+        """Space is the control's; a page that a busy machine left without news stops instead, and is asked again."""
+        page.locator(control).focus()
+        page.keyboard.press("Space")
+        eventually(lambda: shown() or faulted(), f"Space is for {control}, or stops")
+        if faulted():
+            stopped()
+        return shown()
+
     def closes(what, opened):
-        """Escape closes it and stops nothing; a page that a busy machine left without news stops as well."""
+        """Escape closes it and stops nothing; but for a page without news, as above."""
         opened()
         page.locator(f"{what}[open]").wait_for()
         page.keyboard.press("Escape")
         page.locator(f"{what}:not([open])").wait_for(state="attached")
-        if ready.snapshot()["state"] != "faulted":
+        if not faulted():
             return True
         stopped()
         return False
 
     ready.keys("6")
-    for focused in ("#task", "#strategy-kind", "[data-toggle=frames]", ".bar-user summary"):
-        page.locator(focused).focus()
-        page.keyboard.press("Space")
-    page.locator(".bar-user[open]").wait_for()
-    page.locator("[data-toggle=frames][aria-pressed=true]").wait_for()
+    controls = {
+        "#task": lambda: page.locator("#task").input_value().endswith(" "),
+        "#strategy-kind": lambda: page.locator("#strategy-kind:focus").count() == 1,
+        "[data-toggle=frames]": page.locator("[data-toggle=frames][aria-pressed=true]").is_visible,
+        ".bar-user summary": page.locator(".bar-user[open]").is_visible,
+    }
+    for control, shown in controls.items():
+        eventually(partial(has_space, control, shown), f"Space is for {control}", 3 * PATIENCE_S)
     ready.keys("e")
     page.locator(".bar-user summary").click()
     menu = page.locator(".bar-user summary")

@@ -2,7 +2,7 @@
 
 import { t } from "../../site/sentences.js";
 
-const EVERY_MS = 80; // between two questions; the newest one always goes out
+const EVERY_MS = 80; // at least, between two questions; the newest one always goes out
 const PATIENCE_MS = 4000; // longer than the lab's own
 
 /**
@@ -13,9 +13,10 @@ const PATIENCE_MS = 4000; // longer than the lab's own
 export class Aim {
   #send;
   #number = 0;
+  #shown = 0; // the newest question whose answer was shown, or that was cleared
   #waiting = new Map(); // id -> {resolve, timer}
   #next = null; // the newest question that waits for its turn
-  #turn = 0;
+  #following = false;
 
   /** `send(message)` is false where the socket is closed. */
   constructor(send) {
@@ -32,16 +33,16 @@ export class Aim {
     });
   }
 
-  /** Ask about what changes quickly, such as a slider: not too often, and only the newest; `heard(answer)`. */
+  /** Ask about what changes quickly, such as a slider: one at a time, and only the newest; `heard(answer)`. */
   follow(args, heard) {
     this.#next = { args, heard };
-    if (!this.#turn) this.#go();
+    if (!this.#following) this.#go();
   }
 
   /** There is no target any more. */
   clear() {
     this.#next = null;
-    this.#number += 1; // what is still under way is no longer shown
+    this.#shown = this.#number; // what is still under way is no longer shown
     tell(null);
   }
 
@@ -51,20 +52,30 @@ export class Aim {
     if (!asked) return;
     this.#waiting.delete(answer.id);
     clearTimeout(asked.timer);
-    if (answer.id === this.#number) tell(answer);
+    if (answer.id > this.#shown) {
+      this.#shown = answer.id;
+      tell(answer);
+    }
     asked.resolve(answer);
   }
 
+  /** The next question waits for the answer: on a slow connection every answer would be out of date before it came. */
   async #go() {
-    const { args, heard } = this.#next;
-    this.#next = null;
-    this.#turn = setTimeout(() => {
-      this.#turn = 0;
-      if (this.#next) this.#go();
-    }, EVERY_MS);
-    const number = this.#number + 1;
-    const answer = await this.ask(args);
-    if (number === this.#number) heard(answer);
+    this.#following = true;
+    try {
+      while (this.#next) {
+        const { args, heard } = this.#next;
+        this.#next = null;
+        const pause = new Promise((resolve) => setTimeout(resolve, EVERY_MS));
+        const asked = this.ask(args);
+        const number = this.#number;
+        const answer = await asked;
+        if (number === this.#shown) heard(answer);
+        await pause;
+      }
+    } finally {
+      this.#following = false;
+    }
   }
 }
 

@@ -17,7 +17,7 @@ export class ManualPanel {
   #pose = ""; // the named pose that the target is, as long as nobody changes it
   #edited = false; // else the target follows the robot
   #held = new Set(); // grippers that are part of the target; others stay as they are told by their own buttons
-  #sent = false; // the target is where the robot was sent
+  #sent = null; // of this press of Send, as long as the target is where the robot was sent
   #clipped = ""; // what was said of the last edit
   #rows;
   #steps = Promise.resolve(); // steps of the hand, one after the other
@@ -57,7 +57,7 @@ export class ManualPanel {
   }
 
   #move() {
-    this.#sent = true;
+    this.#sent = {};
     const speed = Number(this.#speed.value);
     return this.#pose ? { pose: this.#pose, speed } : { joints: this.#moved, speed };
   }
@@ -69,7 +69,8 @@ export class ManualPanel {
 
   /** The target is where the robot is, and goes with it. */
   reset(said = t("page.manual.at_robot", "The target is where the robot is.")) {
-    this.#edited = this.#sent = false;
+    this.#edited = false;
+    this.#sent = null;
     this.#held.clear();
     this.#pose = this.#clipped = "";
     this.#poses.selectedIndex = 0;
@@ -154,7 +155,7 @@ export class ManualPanel {
 
   #changed(pose = "") {
     this.#edited = true;
-    this.#sent = false;
+    this.#sent = null;
     this.#clipped = "";
     this.#pose = pose;
     if (!pose) this.#poses.selectedIndex = 0;
@@ -166,11 +167,15 @@ export class ManualPanel {
   #look() {
     if (!this.#edited) return;
     if (document.getElementById("panel-manual").hidden) this.#aim.clear();
-    else this.#aim.follow({ joints: this.#target }, (answer) => this.#heard(answer));
+    else {
+      const sent = this.#sent;
+      this.#aim.follow({ joints: this.#target }, (answer) => this.#heard(answer, sent));
+    }
   }
 
-  #heard(answer) {
-    if (this.#sent && answer.ok && arrived(answer)) {
+  /** `sent` is the press that had been made when this was asked: an answer from before it says of no arrival. */
+  #heard(answer, sent = null) {
+    if (sent && sent === this.#sent && answer.ok && arrived(answer)) {
       this.reset(t("page.manual.arrived", "The robot has arrived."));
       return;
     }

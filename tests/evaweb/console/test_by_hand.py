@@ -450,6 +450,30 @@ def test_a_slider_that_runs_asks_the_newest_place_alone() -> None:
     assert found["heard"] == [1, 2]
 
 
+def test_on_a_slow_connection_each_answer_is_shown_before_the_next_question_goes_out() -> None:
+    body = """
+    const heard = [], ask = (x) => aim.follow({ joints: [x] }, (answer) => heard.push(answer.id));
+    ask(1);
+    for (const x of [2, 3]) {
+      ask(x);
+      await new Promise((resolve) => setTimeout(resolve, 100)); // longer than the pause between two questions
+    }
+    const before = sent.length;
+    aim.answered({ id: 1, ok: true });
+    await new Promise((resolve) => setTimeout(resolve, 0));
+    aim.answered({ id: 2, ok: true });
+    await new Promise((resolve) => setTimeout(resolve, 0));
+    return { before, asked: sent.map(({ args }) => args.joints[0]), heard, told };
+    """
+
+    assert run("manual/aim.js", AIM + body, {"open": True}) == {
+        "before": 1,
+        "asked": [1, 3],
+        "heard": [1, 2],
+        "told": [1, 2],
+    }
+
+
 def test_an_answer_that_comes_after_the_target_was_dropped_shows_no_ghost() -> None:
     body = """
     const asked = aim.ask({ pose: "home" });
