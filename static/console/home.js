@@ -12,9 +12,10 @@ async function ask(element) {
   const name = element.dataset.live;
   const reason = document.querySelector(`[data-live-reason="${CSS.escape(name)}"]`);
   try {
-    const { snapshot, gone } = await get(`/api/v1/stations/${encodeURIComponent(name)}`);
+    const { snapshot: said, gone } = await get(`/api/v1/stations/${encodeURIComponent(name)}`);
+    const snapshot = localized(said);
     show(element, snapshot?.state_is);
-    reason.textContent = snapshot ? localized(snapshot).reason : gone;
+    reason.textContent = snapshot ? snapshot.reason : gone;
   } catch (error) {
     if (!(error instanceof RequestFailed)) throw error;
     show(element, undefined);
@@ -58,6 +59,7 @@ document.body.addEventListener("htmx:afterSettle", ({ target }) => {
   askAll();
   lookAll();
 });
+document.addEventListener("eva:language", askAll);
 setInterval(askAll, EVERY_MS);
 setInterval(lookAll, STILL_MS);
 askAll();

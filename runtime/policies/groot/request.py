@@ -130,7 +130,7 @@ class Gr00tRequest:
     def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
         """Return the data of get_action for the newest input, which is stored as long as later requests need it."""
         wanted = self._wanted
-        assert wanted is not None, "agree comes first"
+        assert wanted is not None, "configure comes first"
         self._remember(moment)
         settings = self._settings
         seen, felt = self._at(wanted.video.steps), self._at(wanted.state.steps)

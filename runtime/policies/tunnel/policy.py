@@ -59,6 +59,7 @@ class TunnelledPolicy(Policy):
         self._turning = threading.Lock()  # for the change of keepers; held briefly
         self._keeper: TunnelKeeper | None = None
         self.observation_eef, self.uses_poses = policy.observation_eef, policy.uses_poses
+        self.uses_images, self.is_queried = policy.uses_images, policy.is_queried
         self.observe_period_s = policy.observe_period_s
         policy.address_override = self._local_address
 
@@ -90,6 +91,10 @@ class TunnelledPolicy(Policy):
         """Call the policy's `reset`."""
         with self._explain_errors():
             self._policy.reset()
+
+    def resume(self) -> None:
+        """Call the policy's `resume`."""
+        self._policy.resume()
 
     def end_episode(self) -> None:
         """Call the policy's `end_episode`."""

@@ -54,7 +54,6 @@ def drawing(
     inner = "".join(parts)
     role = "group" if "<a " in inner else "img"  # an image may not contain links
     data = "".join(iter_csv(columns, [[dict(zip(columns, row, strict=True)) for row in rows]]))
-    role = "group" if "<a " in inner else "img"  # an image may not contain links
     text = (
         f'<svg class="drawing {escape(kind)}" viewBox="0 0 {_n(width)} {_n(height)}" width="{_n(width)}" '
         f'role="{role}" aria-labelledby="{name}-t {name}-d">'

@@ -22,11 +22,13 @@ from runtime.core.errors import (
     TunnelError,
     UnreachableError,
 )
+from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.ipc.session_state import SessionState
-from runtime.policies.base import Policy
+from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
 from runtime.policies.tunnel.process import free_port
+from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.processes.coordinator.builders import make_policy
 from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
@@ -67,6 +69,44 @@ def standing(behaviour: Behaviour | None = None) -> Iterator[tuple[OpenpiServer,
     server = OpenpiServer(PIPER, behaviour or Behaviour())
     with contextlib.closing(server):
         yield server, str(server.start()["url"])
+
+
+class Unusual(Policy):
+    """A policy that differs from the interface in everything that it may say of itself."""
+
+    observation_eef = "fk"
+    uses_poses = True
+    observe_period_s = 0.5
+    uses_images = False
+    is_queried = False
+
+    def __init__(self) -> None:
+        self.resumed = 0
+
+    def connect(self) -> PolicyInfo:
+        return PolicyInfo("unusual")
+
+    def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
+        raise NotImplementedError
+
+    def reset(self) -> None: ...
+
+    def resume(self) -> None:
+        self.resumed += 1
+
+    def close(self) -> None: ...
+
+
+def test_what_a_policy_says_of_itself_is_said_through_a_tunnel_too() -> None:
+    own = Unusual()
+    made = TunnelledPolicy(own, TunnelSettings(host="far"), ("127.0.0.1", 1), "ssh")
+    made.resume()
+
+    assert own.resumed == 1
+    flags = [name for name, value in vars(Unusual).items() if name[0] != "_" and not callable(value)]
+    assert {name: getattr(made, name) for name in flags} == {name: getattr(own, name) for name in flags}
+    passed_on = {name for name in vars(Policy) if name[0] != "_"} - {*flags, "address_override"}
+    assert passed_on <= set(vars(TunnelledPolicy))
 
 
 def ssh_of(policy: TunnelledPolicy) -> int:
