@@ -57,7 +57,7 @@ def main() -> int:
 
 
 def _up(lab: Any, given: argparse.Namespace) -> None:
-    from evaweb.lab import programs, seed
+    from evaweb.lab import demo_rows, programs
     from evaweb.lab.benches import Bench
     from evaweb.lab.processes import ProgramSpec
     from evaweb.roles import Role
@@ -74,7 +74,7 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
         *given.assignments,
     ]
     url = lab.start([Bench(_ROOT / "deployments" / "tabletop.toml", assignments)])
-    login = seed.demo_login(username="operator", role=Role.OPERATOR)
+    login = demo_rows.demo_login(username="operator", role=Role.OPERATOR)
     facts = {"url": url, "passwords": {login.username: login.password}, "node": node["obs_endpoint"]}
     announce_ready({**facts, "pids": lab.processes.pids()}, given.ready_file)
 

@@ -33,8 +33,8 @@ from benchmarks.lab import enrol, two_free_ports
 from benchmarks.labs import RunningLab, lab
 from benchmarks.report import Figure, Report
 from benchmarks.start import started
-from evaweb.lab.patience import DemoFailed, NoReply
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.rest_client import RestClient
+from evaweb.lab.stall_detection import DemoFailed, NoReply
 from tests.crash.lab import ROOT, Lab
 
 SECONDS = 600.0
@@ -322,10 +322,10 @@ def _rows(policy: str) -> None:
     import django
 
     django.setup()
-    from evaweb.lab import seed
+    from evaweb.lab import demo_rows
 
-    seed.demo_scene()
-    seed.demo_checkpoint(name="chaos", description="", policy={"url": policy})
+    demo_rows.demo_scene()
+    demo_rows.demo_checkpoint(name="chaos", description="", policy={"url": policy})
 
 
 def _at_rest(operator: _Operator, robot: Path, data: Path) -> Found:

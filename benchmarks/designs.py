@@ -25,7 +25,7 @@ from benchmarks import coverage
 from benchmarks.report import Figure, Report
 from evaweb.plans.schedule import RANDOM, Condition, Unit, counts_of, schedule
 from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness_of
-from evaweb.statistics.courses import design_power
+from evaweb.statistics.design_power import design_power
 from evaweb.statistics.designs import (
     ANYTIME,
     FIXED,

@@ -25,7 +25,7 @@ from benchmarks.estop_station import Station, StationWatch
 from benchmarks.labs import ROOT, RunningLab, lab
 from benchmarks.report import Figure, Report
 from benchmarks.results_postgresql import server, why_not
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.rest_client import RestClient
 from runtime.core.errors import RuntimeFault
 
 ATTACKS = (

@@ -89,7 +89,7 @@ def _people() -> dict[str, Any]:
     from django.contrib.auth.models import User
 
     from evaweb.api.tokens import create_token
-    from evaweb.lab.seed import demo_login
+    from evaweb.lab.demo_rows import demo_login
     from evaweb.roles import Role
 
     people = {str(role): role for role in Role} | {GUESSED_ACCOUNT: Role.VIEWER}

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 from benchmarks.estop_lab import PRESSED
-from evaweb.lab.patience import DemoFailed, NoReply
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.stall_detection import DemoFailed, NoReply
 
 PATIENCE_S = 10.0
 _DONE = "done"

@@ -30,7 +30,7 @@ from benchmarks.labs import RunningLab, lab
 from benchmarks.linked_lab import STATIONS
 from benchmarks.report import Figure, Report
 from benchmarks.start import StartedStation, started
-from evaweb.lab.visitor import LivePage
+from evaweb.lab.rest_client import LivePage
 from runtime.clients.client import StationClient
 from runtime.core.errors import RuntimeFault
 from tests.crash.lab import ROOT, Lab

@@ -16,7 +16,7 @@ from typing import Any
 
 import psutil
 
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
 from runtime.recording.reader import Episode, open_episode
 
 ROOT = Path(__file__).parents[1]

@@ -30,8 +30,8 @@ import zmq
 
 from benchmarks.labs import STATION, ProcessorUsage, RunningLab, busy_lab, only_episode, set_up, watch
 from benchmarks.report import Figure, Report
-from evaweb.lab.patience import DemoFailed
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.stall_detection import DemoFailed
 from runtime.core import msgpack_arrays
 from runtime.recording.reader import Episode
 

@@ -20,8 +20,8 @@ import psutil
 
 from benchmarks.labs import STATION, lab, watch
 from benchmarks.report import Figure, Report
-from evaweb.lab.once import TrialChoice, start
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.single_trial import TrialChoice, start
 
 _VIEWERS, _STALLED = 20, 10
 

@@ -33,7 +33,7 @@ from benchmarks.labs import (
     watch,
 )
 from benchmarks.report import Figure, Report
-from evaweb.lab.visitor import LivePage
+from evaweb.lab.rest_client import LivePage
 from runtime.recording.reader import Episode
 
 SECONDS = 30.0

@@ -20,7 +20,7 @@ from typing import Any
 
 from benchmarks.labs import ROOT, STATION, RunningLab, lab
 from benchmarks.report import Figure, Report
-from evaweb.lab.once import TrialChoice, run_one_trial
+from evaweb.lab.single_trial import TrialChoice, run_one_trial
 
 PLANS, TRIALS = 200, 100_000
 LOADS = 5

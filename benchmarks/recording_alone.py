@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, feed_frames, finish, joints
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.recording.base import ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.settings import RecordingSettings

@@ -20,8 +20,8 @@ from typing import Any
 
 from benchmarks.labs import ROOT, STATION, lab
 from benchmarks.report import Figure, Report
-from evaweb.lab.once import TrialChoice, start
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.single_trial import TrialChoice, start
 
 SECONDS = 30.0  # of the recording
 _AGAIN = 9

@@ -18,7 +18,7 @@ from typing import Any
 
 import robots
 from robots import Robot
-from runtime.cameras.attaching import attach_cameras
+from runtime.cameras.attach import attach_cameras
 from runtime.core import malloc as heap
 from runtime.core.clock import Clock, MonotonicClock, VirtualClock
 from runtime.core.plugins import variants

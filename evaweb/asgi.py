@@ -15,7 +15,7 @@ from channels.security.websocket import AllowedHostsOriginValidator
 from channels.sessions import CookieMiddleware
 from django.conf import settings
 
-from evaweb.api.door import StopGateway
+from evaweb.api.stop_gateway import StopGateway
 from evaweb.console.origins import SameOrigin
 from evaweb.console.routing import websocket_urlpatterns
 from evaweb.slots import RequestLimiter

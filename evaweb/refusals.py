@@ -50,7 +50,7 @@ class RefusalMiddleware(MiddlewareMixin):
     """Error responses: a page with the message for a browser that navigates, JSON (`errors.refusal`) otherwise."""
 
     def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
-        # REST parses its body itself, checked by evaweb.api.questions.
+        # REST parses its body itself, checked by evaweb.api.request_validation.
         fields = [request.GET] if _of_programs(request) else [request.GET, request.POST]
         texts = (text for one in fields for name, values in one.lists() for text in (name, *values))
         if not is_text(request.path):

@@ -28,7 +28,8 @@ class RequestLimiter:
     Each login and each address has a bounded share, so that a client with many requests leaves slots for the others.
 
     A slot is released when the work on its request ends, not when its client hangs up: the thread and its database
-    connection cannot be interrupted. Requests that stop a robot never get here: evaweb.api.door answers them first.
+    connection cannot be interrupted. Requests that stop a robot never get here: evaweb.api.stop_gateway answers them
+    first.
     """
 
     def __init__(self, application: Callable[..., Awaitable[Any]]) -> None:

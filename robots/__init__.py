@@ -3,7 +3,7 @@
 from robots.body import Body
 from robots.chain import Chain
 from robots.errors import RobotError
-from robots.gripping import GripperChoice
+from robots.grippers import GripperChoice
 from robots.loading import load_robot, load_robot_with_optional_groups, robot_names
 from robots.robot import EEF_FIELDS, Camera, Gripper, Group, Robot
 from robots.visuals import RobotScene, Visual, scene_of

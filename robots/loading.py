@@ -12,7 +12,12 @@ from robots import description, urdf
 from robots.arms import build_arm_chain, check_arm, check_mounts
 from robots.description import TABLE, GroupTable, RobotTable
 from robots.errors import RobotError
-from robots.gripping import GripperChoice, apply_gripper_choices, gripper_of, tip_frame
+from robots.grippers import (
+    GripperChoice,
+    apply_gripper_choices,
+    gripper_of,
+    tip_frame,
+)
 from robots.limits import group_limits
 from robots.places import pose_vector, read_only
 from robots.refusals import check_movers, reject_duplicates

@@ -104,10 +104,10 @@ def _resolved(given: argparse.Namespace) -> Resolved:
 
 def _require_encoder(made: StationSpec) -> None:
     """The encoder of the recording is missed here, not by the first run; ConfigurationError."""
-    from runtime.recording import trial
+    from runtime.recording import encoder_check
 
     if made.deployment.recording.enabled:
-        trial.require_encoder(made.deployment.recording)
+        encoder_check.require_encoder(made.deployment.recording)
 
 
 def _check(made: StationSpec) -> int:
@@ -138,7 +138,7 @@ def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
     well = done.state is SessionState.READY and episode.get("status", "finished") == "finished"
     into = made.deployment.publish
     if well and into.dataset and episode and made.deployment.run.mode != "sim":
-        from runtime.datasets.published import publish
+        from runtime.datasets.publishing import publish
 
         published = publish(Path(episode["path"]), made.deployment.data / into.dataset, version=into.version)
         print(f"dataset  {published.dataset}  episode {published.episode_index}, {published.frames} frames")

@@ -11,12 +11,12 @@ from typing import Any
 
 from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.client import Refused, StationClient
-from runtime.clients.terminal import aims, watching
+from runtime.clients.terminal import aim_text, watch
 from runtime.clients.terminal.arguments import arguments
 from runtime.clients.terminal.command_follower import LASTING, follow_command
-from runtime.clients.terminal.figures import status_line, status_report, tuning_lines
-from runtime.clients.terminal.settling import wait_until_settled
+from runtime.clients.terminal.status_text import status_line, status_report, tuning_lines
 from runtime.clients.terminal.syntax import parse
+from runtime.clients.terminal.wait_settled import wait_until_settled
 from runtime.core.errors import RuntimeFault, TransportError
 
 DONE, FAILED, UNKNOWN, INTERRUPTED = 0, 1, 3, 130  # exit codes; 2 is argparse's, 141 that of broken_pipe
@@ -87,7 +87,7 @@ def _print(text: str) -> None:
 
 def _tell(event: dict[str, Any]) -> None:
     if event["kind"] != "command":  # the one that was just given
-        watching.tell(event)
+        watch.tell(event)
 
 
 def _silent(what: object) -> None:
@@ -125,24 +125,24 @@ def _approach(client: StationClient, given: argparse.Namespace) -> int:
 
 def _move(client: StationClient, given: argparse.Namespace) -> int:
     return _run_and_wait(
-        client, given, "move", aims.aim_arguments(client, given) | _speed(given), "motion_done"
+        client, given, "move", aim_text.aim_arguments(client, given) | _speed(given), "motion_done"
     )
 
 
 def _jog(client: StationClient, given: argparse.Namespace) -> int:
     """Aim, say what it comes to, and go there: to where the aim is as it was shown, and nowhere else."""
-    aim = client.query("aim", **aims.aim_arguments(client, given)).data
+    aim = client.query("aim", **aim_text.aim_arguments(client, given)).data
     _show_aim(client, aim, given)
-    short = aims.aim_problem(aim)
+    short = aim_text.aim_problem(aim)
     if short and not given.nearest:
         raise Refused(f"it cannot go there: {short}; allowed: a smaller step, or --nearest")
     return _run_and_wait(client, given, "move", {"joints": aim["joints"]} | _speed(given), "motion_done")
 
 
 def _aim(client: StationClient, given: argparse.Namespace) -> int:
-    aim = client.query("aim", **aims.aim_arguments(client, given)).data
+    aim = client.query("aim", **aim_text.aim_arguments(client, given)).data
     _show_aim(client, aim, given)
-    return FAILED if aims.aim_problem(aim) else DONE
+    return FAILED if aim_text.aim_problem(aim) else DONE
 
 
 def _speed(given: argparse.Namespace) -> dict[str, float]:
@@ -156,7 +156,7 @@ def _show_aim(client: StationClient, aim: Any, given: argparse.Namespace) -> Non
     names = client.status()["facts"]["joint_names"]
     commanded = client.query("aim").data["joints"]
     speed = getattr(given, "speed", None) or 1.0
-    print("\n".join(aims.aim_lines(aim, commanded, names, speed)), flush=True)
+    print("\n".join(aim_text.aim_lines(aim, commanded, names, speed)), flush=True)
 
 
 def _tune(client: StationClient, given: argparse.Namespace) -> int:
@@ -210,7 +210,7 @@ def _wait(client: StationClient, given: argparse.Namespace) -> int:
 
 
 def _watch(client: StationClient, given: argparse.Namespace) -> int:
-    return watching.watch(client, given.json)
+    return watch.watch(client, given.json)
 
 
 _OWN_WAYS = {
@@ -227,7 +227,7 @@ _OWN_WAYS = {
     "status": _status,
     "wait": _wait,
     "watch": _watch,
-    "events": watching.list_events,
+    "events": watch.list_events,
 }
 
 

@@ -61,7 +61,7 @@ _LONGEST = (
     "tests/runtime/processes/lockstep/test_lockstep.py",
     "tests/evaweb/plans/test_design.py",
     "tests/runtime/clients/channel/test_server.py",
-    "tests/runtime/transports/ros/test_tcpros.py",
+    "tests/runtime/transports/ros/test_rospy_middleware.py",
     "tests/evaweb/episodes/test_views.py",
     "tests/runtime/processes/control/test_encoder_offset.py",
 )

@@ -16,8 +16,8 @@ from websockets.exceptions import ConnectionClosed
 from benchmarks.attacks.requests import again_and_again, long_to_parse
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import OTHER, PRESSED
-from evaweb.lab.patience import DemoFailed
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.stall_detection import DemoFailed
 from runtime.ipc.bus import Endpoints
 
 _STOPS, _PRESSES = 5000, 1500

@@ -16,8 +16,8 @@ from urllib.parse import urlsplit
 
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import GUESSED_ACCOUNT, PRESSED
-from evaweb.lab.patience import DemoFailed
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.rest_client import RestClient
+from evaweb.lab.stall_detection import DemoFailed
 from evaweb.roles import Role
 
 _CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4

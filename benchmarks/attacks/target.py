@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.rest_client import RestClient
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.kinematics.forward import ChainForward
 from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.processes.coordinator.inference.worker import LockstepRunner
+from runtime.processes.coordinator.inference.runners import LockstepRunner
 from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.checks import check_deployment

@@ -13,7 +13,6 @@ from ninja.errors import AuthenticationError, HttpError, ValidationError, Valida
 from evaweb.api import (
     accounts,
     checkpoints,
-    collecting,
     datasets,
     episodes,
     failures,
@@ -24,13 +23,14 @@ from evaweb.api import (
     results,
     reviews,
     scenes,
+    sessions,
     stations,
     statistics,
     trials,
 )
-from evaweb.api.answers import describe_errors
 from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
-from evaweb.api.questions import BoundedParser, reject_unknown_parameters
+from evaweb.api.request_validation import BoundedParser, reject_unknown_parameters
+from evaweb.api.responses import describe_errors
 from evaweb.errors import EvaError, refusal
 from evaweb.races import TAKEN, was_taken
 from evaweb.refusals import retrying
@@ -79,7 +79,7 @@ api.add_router("/scenes", scenes.router)
 api.add_router("/failures", failures.router)
 api.add_router("/checkpoints", checkpoints.router)
 api.add_router("/preflights", preflights.router)
-api.add_router("", collecting.router)
+api.add_router("", sessions.router)
 api.add_router("", results.router)
 api.add_router("/jobs", jobs.router)
 api.add_router("/find", find.router)

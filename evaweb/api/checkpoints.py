@@ -8,7 +8,7 @@ from typing import Any
 from django.http import HttpRequest
 from ninja import Query, Router, Schema
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.responses import FAILURES, Page, Paging
 from evaweb.blinding import visibility_for_request
 from evaweb.trials import selectors
 from evaweb.trials.models import Checkpoint

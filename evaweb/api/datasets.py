@@ -9,10 +9,10 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Router, Schema, Status
 
-from evaweb.api.answers import FAILURES
 from evaweb.api.jobs import JobOut
-from evaweb.datasets import dataset_jobs, listing, orders
-from evaweb.datasets.finding import Overview, overview, overviews
+from evaweb.api.responses import FAILURES
+from evaweb.datasets import dataset_jobs, dataset_orders, episode_list
+from evaweb.datasets.overview import Overview, overview, overviews
 from evaweb.errors import Conflict
 from runtime.recording.files import RecordingError
 
@@ -65,7 +65,7 @@ class DatasetEpisodeOut(Schema):
     verdict: str
 
     @staticmethod
-    def of(row: listing.DatasetRow) -> dict[str, Any]:
+    def of(row: episode_list.DatasetRow) -> dict[str, Any]:
         """Return the episode as listed in the dataset, with the lab's newest verdict."""
         plain = ("index", "seconds", "task", "success", "result", "verdict")
         return {**{name: getattr(row, name) for name in plain}, "rows": row.length, "uuid": row.uuid or None}
@@ -80,7 +80,7 @@ def datasets(request: HttpRequest) -> Any:
 @router.get("/one", response={200: DatasetOut, **FAILURES}, summary="One dataset", url_name="dataset")
 def dataset(request: HttpRequest, name: str) -> Any:
     """By its name; `cups` is datasets/cups."""
-    return DatasetOut.of(overview(orders.full_name(name)))
+    return DatasetOut.of(overview(dataset_orders.full_name(name)))
 
 
 @router.get(
@@ -96,7 +96,7 @@ def episodes(
     `verdict` pass, fail or unreviewed."""
     only = {"words": words, "success": success, "result": result, "verdict": verdict}
     try:
-        found = listing.list_rows(orders.full_name(name), **only)
+        found = episode_list.list_rows(dataset_orders.full_name(name), **only)
     except RecordingError as error:
         raise Conflict(str(error)) from None
     return [DatasetEpisodeOut.of(row) for row in found]
@@ -108,6 +108,6 @@ def episodes(
     summary="Have something done",
     url_name="dataset-jobs",
 )
-def ask(request: HttpRequest, given: orders.Order) -> Any:
+def ask(request: HttpRequest, given: dataset_orders.Order) -> Any:
     """Check, repair, convert, merge, split; delete and push are for administrators. The job says how far it is."""
-    return Status(202, orders.submit_order(user=request.auth, given=given.model_dump()))
+    return Status(202, dataset_orders.submit_order(user=request.auth, given=given.model_dump()))

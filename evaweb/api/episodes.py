@@ -10,12 +10,12 @@ from asgiref.sync import async_to_sync
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES, Page, Paging
 from evaweb.api.jobs import JobOut
+from evaweb.api.responses import FAILURES, Page, Paging
 from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.collect.selectors import PUBLISHED_RESULTS, accepted_demonstrations
 from evaweb.episodes import services
-from evaweb.episodes.exporting import CONTENT_TYPE, table_file
+from evaweb.episodes.export_table import CONTENT_TYPE, table_file
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
 from evaweb.errors import Conflict, NotFound

@@ -7,7 +7,7 @@ from typing import Any
 from django.http import HttpRequest
 from ninja import Router, Schema
 
-from evaweb.api.answers import FAILURES
+from evaweb.api.responses import FAILURES
 from evaweb.trials.models import FailureTerm
 
 router = Router(tags=["scenes"])

@@ -8,7 +8,7 @@ from typing import Any
 from django.http import HttpRequest
 from ninja import Query, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.responses import FAILURES, Page, Paging
 from evaweb.blinding import HIDDEN, Visibility, visibility_for_request
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus

@@ -9,7 +9,12 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 from pydantic import StrictBool
 
-from evaweb.api.answers import FAILURES, Body, Page, Paging
+from evaweb.api.responses import (
+    FAILURES,
+    Body,
+    Page,
+    Paging,
+)
 from evaweb.api.trials import TrialDetail
 from evaweb.blinding import visibility_for_request
 from evaweb.plans import allocation, services

@@ -9,7 +9,12 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES, Body, Page, Paging
+from evaweb.api.responses import (
+    FAILURES,
+    Body,
+    Page,
+    Paging,
+)
 from evaweb.blinding import visibility_for_request
 from evaweb.preflights import selectors, services
 from evaweb.preflights.blinding_rules import visible_preflight

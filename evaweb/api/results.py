@@ -12,7 +12,7 @@ from django.urls import reverse
 from ninja import Field, Query, Router, Schema
 from pydantic import create_model
 
-from evaweb.api.answers import FAILURES, Page, Paging
+from evaweb.api.responses import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_response
 from evaweb.errors import NotFound
 from evaweb.plans.models import Plan
@@ -24,10 +24,10 @@ from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.analysis.simulated import set_beside, simulated_plans
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.presentation.caveats import caveats_of
-from evaweb.results.presentation.citing import citation
+from evaweb.results.presentation.citation import citation
 from evaweb.results.presentation.headline import headline_document, with_planned_letters
 from evaweb.results.presentation.integrity import integrity_document
-from evaweb.results.ratings.unblinding import require_visible_results, sealed_reason
+from evaweb.results.ratings.result_visibility import require_visible_results, sealed_reason
 from evaweb.results.reports.document import (
     analysis_document,
     arm_document,

@@ -9,8 +9,8 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Field, Router, Schema, Status
 
-from evaweb.api.answers import FAILURES, Body
 from evaweb.api.jobs import JobOut
+from evaweb.api.responses import FAILURES, Body
 from evaweb.blinding import visibility_for_request
 from evaweb.episodes.selectors import episode_get, tag_counts
 from evaweb.reviews import selectors, services

@@ -12,16 +12,16 @@ from django.utils import timezone
 from ninja import Field, Router, Schema, Status
 from pydantic import AfterValidator, ValidationError, field_validator
 
-from evaweb.api.answers import FAILURES, Body, ErrorOut
+from evaweb.api.responses import FAILURES, Body, ErrorOut
 from evaweb.api.trials import TrialDetail
 from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.collect.selectors import session_get
 from evaweb.collect.station_commands import session_command
-from evaweb.datasets.on_robot import replay_command
+from evaweb.datasets.robot_replay import replay_command
 from evaweb.errors import EvaError, StationGone, reasoned
 from evaweb.stations import commands, leases, selectors, stops
 from evaweb.stations import redaction as veil
-from evaweb.stations.holders import holder_display_name
+from evaweb.stations.lease_holders import holder_display_name
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.runtime_client import connection_to
 from evaweb.trials import selectors as trial_selectors
@@ -302,7 +302,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     """Stop the robot now; any logged-in user. To the wire first, without a wait for the row."""
-    # In a served lab evaweb.api.door answers first, even if the database cannot verify the login.
+    # In a served lab evaweb.api.stop_gateway answers first, even if the database cannot verify the login.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth
     answer = stops.press_estop(

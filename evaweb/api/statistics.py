@@ -7,7 +7,7 @@ from typing import Any
 from django.http import HttpRequest, HttpResponse
 from ninja import Query, Router, Schema
 
-from evaweb.api.answers import FAILURES
+from evaweb.api.responses import FAILURES
 from evaweb.api.tables import Format, table_response
 from evaweb.api.trials import Filters
 from evaweb.blinding import visibility_for_request

@@ -11,7 +11,12 @@ from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema
 from pydantic import StrictBool, create_model
 
-from evaweb.api.answers import FAILURES, Body, Page, Paging
+from evaweb.api.responses import (
+    FAILURES,
+    Body,
+    Page,
+    Paging,
+)
 from evaweb.api.tables import Format, table_response
 from evaweb.blinding import Visibility, visibility_for_request
 from evaweb.trials import corrections, selectors, services, voids

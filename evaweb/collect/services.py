@@ -18,7 +18,7 @@ from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
 from evaweb.journal import clean_text
 from evaweb.roles import Role, require_role
-from evaweb.stations.holders import holder_display_name
+from evaweb.stations.lease_holders import holder_display_name
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import connection_to
 from runtime.core.sentences import Pattern, fixed

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.console import parts
-from evaweb.console.parts import EncodedPart
+from evaweb.console import frame_parts
+from evaweb.console.frame_parts import EncodedPart
 from evaweb.stations.robot_geometry import DrawnRobot
 
 GHOSTS = 12  # greatest number of whole robots; the page animates one between them
@@ -28,13 +28,13 @@ def encode_chunk(content: Mapping[str, Any], looks: DrawnRobot | None, now: floa
     if "targets" in content:
         words["targets"] = np.asarray(content["targets"]).tolist()
     if looks is None or rows.ndim != 2 or not len(rows) or rows.shape[1] != looks.robot.dim:
-        return parts.encode_facts("chunk", words, now)
+        return frame_parts.encode_facts("chunk", words, now)
     if not np.isfinite(rows).all():
-        return parts.encode_facts("chunk", words, now)
+        return frame_parts.encode_facts("chunk", words, now)
     links = looks.poses(rows)
     arrays: dict[str, NDArray[Any]] = {"tips": looks.fingertip_positions(links)}
     if content.get("state") == "proposed":
         shown = np.unique(np.linspace(0, len(rows) - 1, min(GHOSTS, len(rows))).round().astype(int))
         words["ghost_rows"] = shown.tolist()
         arrays["ghost"] = links[shown]
-    return parts.encode_numbers("chunk", words, arrays, now)
+    return frame_parts.encode_numbers("chunk", words, arrays, now)

@@ -23,20 +23,20 @@ from django.db import Error
 from evaweb.blinding import FULL_VISIBILITY, Visibility, visibility_for_user
 from evaweb.callers import client_key
 from evaweb.console import requests
+from evaweb.console.aim_queries import AimQueries
 from evaweb.console.hub import StationRoom, hub
 from evaweb.console.logins import current_role
 from evaweb.console.mailbox import Mailbox
-from evaweb.console.pose_queries import AimQueries
+from evaweb.console.page_stops import PageStops
 from evaweb.console.quota import PER_SECOND, MessageQuota
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
-from evaweb.console.stopping import PageStops
 from evaweb.cookies import session_keys
 from evaweb.credentials import COUNTS_S, SESSION, Login, credentials
 from evaweb.errors import NotFound, StationGone, reasoned
 from evaweb.roles import Role, role_of
 from evaweb.stations import leases
-from evaweb.stations.flights import RequestCoalescer, TooManyRequests
 from evaweb.stations.models import Station
+from evaweb.stations.request_coalescer import RequestCoalescer, TooManyRequests
 from evaweb.stations.robot_geometry import describe_robot
 from evaweb.stations.selectors import station_get
 from runtime.core.sentences import Pattern, identity

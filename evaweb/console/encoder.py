@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.console import parts
+from evaweb.console import frame_parts
 from evaweb.console.chunks import encode_chunk
-from evaweb.console.parts import EncodedPart
-from evaweb.console.recent import RecentSamples
+from evaweb.console.frame_parts import EncodedPart
+from evaweb.console.recent_samples import RecentSamples
 from evaweb.errors import NotFound
 from evaweb.stations import redaction as veil
 from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot
@@ -46,9 +46,9 @@ class StreamEncoder:
         now = time.monotonic()
         if stream == "state":
             self._update_robot(content.get("facts"))
-            return [parts.encode_facts(stream, content, now)]
+            return [frame_parts.encode_facts(stream, content, now)]
         if stream == "chunk" and self._veiled:
-            return [parts.encode_facts("chunk", {"chunk": 0}, now)]
+            return [frame_parts.encode_facts("chunk", {"chunk": 0}, now)]
         if stream == "joints" and self._veiled:
             return self._joints(veil.redact_joints(content), now)
         if stream == "joints":
@@ -56,7 +56,7 @@ class StreamEncoder:
         if stream == "chunk":
             return [encode_chunk(content, self.looks, now)]
         if stream.startswith("camera/"):
-            return [parts.encode_picture(stream, content, now)]
+            return [frame_parts.encode_picture(stream, content, now)]
         return []
 
     def _update_robot(self, facts: Any) -> None:
@@ -70,13 +70,13 @@ class StreamEncoder:
         vectors = {name: np.asarray(content[name], np.float32) for name in _VECTORS if name in content}
         words = {key: content[key] for key in content if key not in vectors}
         made = [
-            parts.encode_numbers("joints", words, vectors, now),
+            frame_parts.encode_numbers("joints", words, vectors, now),
             self._recent.add_sample(vectors, words, now),
         ]
         if self.looks and _drawable(vectors["measured"], self.looks):
             rows = shown_rows(vectors, engaged=bool(content.get("engaged")))
             poses = self.looks.poses(rows)
-            made.append(parts.encode_array("poses", poses if len(rows) > 1 else poses[0], now))
+            made.append(frame_parts.encode_array("poses", poses if len(rows) > 1 else poses[0], now))
         return made
 
 

@@ -17,13 +17,13 @@ from django.utils import timezone
 from evaweb.blinding import Visibility
 from evaweb.console.feed import feeds
 from evaweb.console.views_jobs import Row, row_of
-from evaweb.episodes.verifying import unverified
+from evaweb.episodes.verification import unverified
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import jobs_failed
 from evaweb.jobs.workers import served
 from evaweb.plans.models import PlanState
 from evaweb.results import selectors as results
-from evaweb.results.ratings.unblinding import sealed_reason
+from evaweb.results.ratings.result_visibility import sealed_reason
 from evaweb.results.selectors import PlanRow
 from evaweb.reviews.selectors import unreviewed_episodes
 from evaweb.roles import Role, role_of

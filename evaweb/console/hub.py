@@ -10,11 +10,11 @@ from weakref import WeakKeyDictionary
 
 from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.console import blinding as sights
-from evaweb.console import changes, parts
+from evaweb.console import change_marks, frame_parts
 from evaweb.console.encoder import StreamEncoder
 from evaweb.console.feed import Feeds, History, LinkState, feeds
+from evaweb.console.frame_parts import EncodedPart
 from evaweb.console.mailbox import Deliver, Mailbox
-from evaweb.console.parts import EncodedPart
 from evaweb.stations import redaction as veil
 from evaweb.stations.robot_geometry import DrawnRobot
 
@@ -190,7 +190,7 @@ class StationRoom:
         def make_frame(wanted: Iterable[EncodedPart]) -> bytes:
             chosen = tuple(sorted(wanted, key=lambda part: part.stream))
             if chosen not in made:
-                made[chosen] = parts.build_frame(chosen, self._frames, now)
+                made[chosen] = frame_parts.build_frame(chosen, self._frames, now)
             return made[chosen]
 
         for viewer in self._viewers:
@@ -201,9 +201,9 @@ class StationRoom:
         known = None
         while True:
             self._refresh_visibility()
-            found = await changes.read_marks(self.station)
+            found = await change_marks.read_marks(self.station)
             if known is not None and found is not None and found != known:
-                what = changes.changed_names(known, found)
+                what = change_marks.changed_names(known, found)
                 for viewer in self._viewers:
                     viewer.put_changed(what)
                 self.schedule_flush()

@@ -12,7 +12,7 @@ from typing import Any
 
 from evaweb.blinding import FULL_VISIBILITY, Visibility
 from evaweb.console.feed import History, LinkState
-from evaweb.console.parts import EncodedPart
+from evaweb.console.frame_parts import EncodedPart
 from evaweb.errors import reasoned
 from evaweb.stations import redaction as veil
 

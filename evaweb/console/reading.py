@@ -10,7 +10,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from evaweb.console.sockets import unsent
+from evaweb.console.websocket_limits import unsent
 
 AHEAD = 256 * 1024  # [bytes] unread part of an answer below which the next piece is produced
 STALLED_S = 30.0  # time without a byte read after which the connection is aborted

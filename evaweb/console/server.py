@@ -18,9 +18,9 @@ from daphne.server import Server, twisted_loop  # must come first: it selects th
 # isort: split
 from twisted.internet import reactor, task
 
-from evaweb.console.arrivals import ConnectionLimiter, LimitedFactory, Request
+from evaweb.console.connection_limits import ConnectionLimiter, LimitedFactory, Request
 from evaweb.console.reading import until_read
-from evaweb.console.sockets import LimitedWebSocket
+from evaweb.console.websocket_limits import LimitedWebSocket
 from evaweb.lock_wait import limit_page_waits
 
 _ACCEPTED = 16  # connections accepted per turn of the event loop

@@ -8,7 +8,7 @@ from collections import defaultdict
 
 from evaweb.console.feed import feeds
 from evaweb.errors import Conflict, NotFound
-from evaweb.plans import pictures
+from evaweb.plans import image_store
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
@@ -46,6 +46,6 @@ def still_of(station: Station) -> bytes:
 def _asked(station: Station, cameras: list[str]) -> bytes:
     """Return the image, b"" if none came in time."""
     try:
-        return pictures.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
+        return image_store.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
     except Conflict:
         return b""

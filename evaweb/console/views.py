@@ -18,7 +18,7 @@ from evaweb.console import selectors
 from evaweb.console.history import histories
 from evaweb.console.home import alarms, now
 from evaweb.console.stills import still_of
-from evaweb.datasets.on_robot import make_offer, playable_episode
+from evaweb.datasets.robot_replay import make_offer, playable_episode
 from evaweb.errors import EvaError, NotFound
 from evaweb.lock_wait import lock_wait
 from evaweb.roles import role_of

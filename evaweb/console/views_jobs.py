@@ -15,7 +15,7 @@ from django.views.decorators.http import require_GET, require_POST
 
 from evaweb.blinding import HIDDEN, Visibility, visibility_for_request
 from evaweb.datasets import dataset_jobs
-from evaweb.datasets.orders import KIND as DATASET
+from evaweb.datasets.dataset_orders import KIND as DATASET
 from evaweb.errors import EvaError
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus

@@ -9,8 +9,8 @@ from typing import Any
 
 from django.db.models import Q
 
-from evaweb.datasets.finding import dataset_found
-from evaweb.datasets.orders import KIND, key_of
+from evaweb.datasets.dataset_orders import KIND, key_of
+from evaweb.datasets.overview import dataset_found
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.workers import waiting_for
 from runtime.datasets import layout

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from evaweb.datasets.finding import dataset_found, folder_named
-from evaweb.datasets.orders import KIND, least_for
+from evaweb.datasets.dataset_orders import KIND, least_for
+from evaweb.datasets.overview import dataset_found, folder_named
 from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.errors import EvaError
 from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
@@ -19,7 +19,7 @@ _READ = ("check", "push")  # orders that change no dataset
 
 @job_kind(KIND, least=lambda args: least_for(args["what"]))
 def dataset(work: JobContext) -> Mapping[str, Any]:
-    """Execute an order; args: a checked order of evaweb.datasets.orders.
+    """Execute an order; args: a checked order of evaweb.datasets.dataset_orders.
 
     A refusal is a result (`done` False, `why`), because a retry would not change it.
     """

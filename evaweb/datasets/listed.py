@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from evaweb.datasets.finding import Overview
-from evaweb.datasets.listing import RESULTS, VERDICTS
+from evaweb.datasets.episode_list import RESULTS, VERDICTS
+from evaweb.datasets.overview import Overview
 from evaweb.lists import SEARCH, Column, Filter, words_of
 
 COLUMNS = (

@@ -15,8 +15,13 @@ from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
-from evaweb.datasets import dataset_jobs, listed, listing, orders
-from evaweb.datasets.finding import overview, overviews
+from evaweb.datasets import (
+    dataset_jobs,
+    dataset_orders,
+    episode_list,
+    listed,
+)
+from evaweb.datasets.overview import overview, overviews
 from evaweb.errors import Conflict, EvaError
 from evaweb.lists import Listing
 from evaweb.names import is_name
@@ -56,14 +61,14 @@ def dataset_list(request: HttpRequest) -> HttpResponseBase:
 @require_GET
 def dataset(request: HttpRequest, name: str) -> HttpResponseBase:
     """Show one dataset: its overview, episodes and operations."""
-    name = orders.full_name(name)
+    name = dataset_orders.full_name(name)
     shown = Listing(request.GET, listed.EPISODE_COLUMNS, listed.EPISODE_FILTERS)
     found = overview(name)
-    rows: list[listing.DatasetRow] = []
+    rows: list[episode_list.DatasetRow] = []
     problem = found.problem
     if not problem:
         try:
-            rows = shown.sorted(listing.list_rows(name, **shown.chosen))
+            rows = shown.sorted(episode_list.list_rows(name, **shown.chosen))
         except RecordingError as error:
             problem = str(error)
     if shown.wants_file and not problem:
@@ -94,7 +99,7 @@ def _chosen(given: str) -> str:
 def dataset_work(request: HttpRequest) -> HttpResponse:
     """Return the newest jobs as a fragment; make the page reload when none is active."""
     given = request.GET.get("dataset", "")
-    name = orders.full_name(given) if given else ""
+    name = dataset_orders.full_name(given) if given else ""
     context = {"name": name, **_work(name)}
     answer = render(request, "datasets/work.html", context)
     if not context["passing"]:
@@ -106,7 +111,7 @@ def dataset_work(request: HttpRequest) -> HttpResponse:
 def dataset_ask(request: HttpRequest) -> HttpResponse:
     """Submit an order from a form."""
     try:
-        job = orders.submit_order(user=request.user, given=_order(request.POST))
+        job = dataset_orders.submit_order(user=request.user, given=_order(request.POST))
     except EvaError as error:
         messages.error(request, str(error))
     else:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from evaweb.binary_frames import Stream, encode
 from evaweb.episodes.bench import milestones_reached
 from evaweb.episodes.chunks import chunk_arrays
-from evaweb.episodes.robot import drawn_robot_for, robot_of_manifest
+from evaweb.episodes.manifest_robot import drawn_robot_for, robot_of_manifest
 from evaweb.errors import NotFound
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.summary import HELD

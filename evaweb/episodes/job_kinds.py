@@ -11,7 +11,7 @@ from uuid import UUID
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.episodes import services, verifying
+from evaweb.episodes import services, verification
 from evaweb.episodes.arriving import take_in_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import write_sidecars
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
@@ -25,12 +25,12 @@ from evaweb.episodes.videos import put_videos, unstored
 from evaweb.jobs.kinds import JobContext, job_kind, periodic_task, startup_task
 from evaweb.jobs.services import enqueue
 from evaweb.object_stores import the_store
-from runtime.datasets.published import never_published, publish
+from runtime.datasets.publishing import never_published, publish
 from runtime.recording.export import write_export
 from runtime.recording.files import RecordingError
+from runtime.recording.integrity import DamagedError
 from runtime.recording.labels import latest_label
 from runtime.recording.scrub import verify_episode
-from runtime.recording.verdict import DamagedError
 
 _AT_ONCE = 20  # jobs queued per call of a periodic task
 
@@ -99,10 +99,10 @@ def publish_episode(work: JobContext) -> Mapping[str, Any]:
     try:
         return _published(work, episode, folder)
     except RecordingError:
-        verdict = verifying.compare_with_row(episode, verify_episode(folder))
+        verdict = verification.compare_with_row(episode, verify_episode(folder))
         if verdict.state != "damaged":
             raise
-        verifying.record_verification(verdict)
+        verification.record_verification(verdict)
         return {"published": False, "why": str(DamagedError(verdict))}
 
 
@@ -153,7 +153,7 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
 @job_kind("scrub")
 def scrub(work: JobContext) -> Mapping[str, Any]:
     """Verify the recordings that were verified longest ago against their digests."""
-    return verifying.scrub_due(work)
+    return verification.scrub_due(work)
 
 
 @job_kind("reconcile")
@@ -191,7 +191,7 @@ def look_for_arrived() -> int:
 @periodic_task("recordings to be verified")
 def find_unverified_episodes() -> bool:
     """Queue the verification of old recordings if the workers are idle."""
-    return verifying.request_scrub() is not None
+    return verification.request_scrub() is not None
 
 
 @periodic_task("runs to be measured")

@@ -11,8 +11,13 @@ from typing import Any
 from evaweb.episodes.models import EpisodeStatus
 from runtime.recording.files import RecordingError, read_json
 from runtime.recording.layout import Layout, simulated
+from runtime.recording.outcome_seal import (
+    MANIFEST,
+    OUTCOME,
+    SEAL,
+    read_outcome,
+)
 from runtime.recording.scrub import require_intact
-from runtime.recording.sealing import MANIFEST, OUTCOME, SEAL, read_outcome
 
 CLOSED = (EpisodeStatus.FINISHED, EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED)
 

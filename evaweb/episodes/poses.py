@@ -8,7 +8,7 @@ import numpy as np
 
 from evaweb.binary_frames import Stream, encode
 from evaweb.episodes.curves import vectors
-from evaweb.episodes.robot import drawn_robot_for
+from evaweb.episodes.manifest_robot import drawn_robot_for
 from evaweb.errors import NotFound
 from runtime.core.sentences import Pattern
 from runtime.recording.reader import Episode, open_episode

@@ -13,7 +13,7 @@ from django.db.models import Q
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.episodes.exporting import exported, job_key
+from evaweb.episodes.export_table import exported, job_key
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED, RecordedEpisode, read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
@@ -24,8 +24,8 @@ from evaweb.stations.models import Station, StationKey
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import RecordingError
+from runtime.recording.outcome_seal import OUTCOME
 from runtime.recording.quarantine import marked_damage
-from runtime.recording.sealing import OUTCOME
 
 log = logging.getLogger(__name__)
 _NO_EPISODE_EXPECTED_UUID = Pattern(

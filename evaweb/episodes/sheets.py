@@ -10,7 +10,7 @@ import numpy as np
 import simplejpeg
 from PIL import Image
 
-from runtime.datasets.pictures import VideoFrames
+from runtime.datasets.video_frames import VideoFrames
 from runtime.recording.files import RecordingError
 
 MOST = 100  # tiles

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaweb.episodes.curves import vectors
-from evaweb.episodes.robot import robot_for
+from evaweb.episodes.manifest_robot import robot_for
 from evaweb.errors import NotFound
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.smoothness import CUT_OFF, sparc

@@ -14,7 +14,14 @@ from typing import BinaryIO
 from django.http import HttpRequest, HttpResponse, HttpResponseNotAllowed, StreamingHttpResponse
 from django.http.response import HttpResponseBase
 
-from evaweb.episodes.ranges import Span, Unsatisfiable, Validators, not_modified, range_holds, span_asked
+from evaweb.episodes.http_ranges import (
+    Span,
+    Unsatisfiable,
+    Validators,
+    not_modified,
+    range_holds,
+    span_asked,
+)
 from evaweb.errors import NotFound
 from runtime.core.sentences import Pattern
 

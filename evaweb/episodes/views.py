@@ -21,11 +21,11 @@ from evaweb.blinding import visibility_for_request
 from evaweb.episodes import listed, selectors, services
 from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curve_message
-from evaweb.episodes.exporting import CONTENT_TYPE, table_file, table_of
+from evaweb.episodes.export_table import CONTENT_TYPE, table_file, table_of
 from evaweb.episodes.folders import THUMBNAIL, journal_folder, preview_folder, preview_sheet
+from evaweb.episodes.manifest_robot import drawn_robot_for
 from evaweb.episodes.models import Episode
 from evaweb.episodes.poses import pose_message
-from evaweb.episodes.robot import drawn_robot_for
 from evaweb.episodes.selectors import episode_get
 from evaweb.episodes.sheets import Grid
 from evaweb.episodes.streaming import file_answer

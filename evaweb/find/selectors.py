@@ -14,7 +14,7 @@ from django.urls import reverse
 from django.utils.timezone import localtime
 
 from evaweb.blinding import Visibility
-from evaweb.datasets.finding import dataset_names
+from evaweb.datasets.overview import dataset_names
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import tag_counts
 from evaweb.errors import EvaError

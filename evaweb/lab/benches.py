@@ -9,8 +9,8 @@ from pathlib import Path
 from django.conf import settings
 
 from evaweb.lab import programs
+from evaweb.lab.demo_rows import station_registered
 from evaweb.lab.processes import LabError, ProgramSpec
-from evaweb.lab.seed import station_registered
 from runtime.config.loader import ConfigurationError, load
 
 

@@ -11,7 +11,7 @@ from django.contrib.auth.models import User
 from django.db import Error, transaction
 
 from evaweb.errors import Conflict
-from evaweb.lab.seed import fresh_password, has_no_accounts
+from evaweb.lab.demo_rows import fresh_password, has_no_accounts
 from evaweb.roles import Role, set_role
 from runtime.recording.files import write_atomic
 

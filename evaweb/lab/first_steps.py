@@ -12,9 +12,9 @@ from django.urls import NoReverseMatch, reverse
 
 from evaweb.errors import StationGone
 from evaweb.lab import deployments
+from evaweb.lab.demo_rows import demo_scene
 from evaweb.lab.deployments import Kept, Standing, is_simulated, kept_of, standing_of
 from evaweb.lab.processes import LabError
-from evaweb.lab.seed import demo_scene
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.plans.models import CameraCheck
 from evaweb.stations.models import CARRIED_OUT, Station

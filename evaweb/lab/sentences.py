@@ -17,7 +17,7 @@ from typing import Any
 
 from django.apps import apps
 
-from evaweb.datasets.listing import RESULTS, VERDICTS
+from evaweb.datasets.episode_list import RESULTS, VERDICTS
 from evaweb.episodes.selectors import QUALITY, REVIEW
 from evaweb.languages import label_id
 from evaweb.roles import Role

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evaweb.errors import EvaError
-from evaweb.lab import lifetime, programs, seed
+from evaweb.lab import demo_rows, lifetime, programs
 from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec
 from evaweb.trials.models import Checkpoint
 
@@ -86,7 +86,7 @@ def bring(
         serving = programs.policy(name, robot, how.skill(policy), known_port(name))
         if serving.name not in processes.pids():
             found = yield from _starting(processes, serving, f"the policy {name}")
-            seed.demo_checkpoint(name=name, description=description, policy={"url": found["url"]})
+            demo_rows.demo_checkpoint(name=name, description=description, policy={"url": found["url"]})
     url = _url_of(f"{SKILLED}-{robot}")
     return [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',

@@ -21,10 +21,10 @@ from evaweb.errors import EvaError, NotFound
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.workers import waiting_for
 from evaweb.lab import deployments, first_account, first_steps, machine_check, services
+from evaweb.lab.demo_rows import station_registered
 from evaweb.lab.draft_form import form_of
 from evaweb.lab.first_steps import Walk, walk
-from evaweb.lab.seed import station_registered
-from evaweb.plans import pictures
+from evaweb.plans import image_store
 from evaweb.plans.bench_checks import cameras_of, confirm_cameras
 from evaweb.roles import Role, require_role
 from evaweb.stations.selectors import station_get
@@ -170,7 +170,7 @@ def camera(request: HttpRequest, name: str, camera: str) -> HttpResponse:
         raise NotFound(
             f"{name} has no camera {camera!r:.60}; it has {', '.join(cameras_of(station)) or 'none'}"
         )
-    answer = HttpResponse(pictures.current_images(station, [camera])[camera], content_type="image/jpeg")
+    answer = HttpResponse(image_store.current_images(station, [camera])[camera], content_type="image/jpeg")
     answer["Cache-Control"] = "no-store"
     return answer
 

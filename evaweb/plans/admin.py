@@ -17,9 +17,9 @@ from django.utils.safestring import SafeString, mark_safe
 
 from evaweb.errors import EvaError
 from evaweb.plans.design import looks_of
-from evaweb.plans.exchange import export_archive, export_toml, import_file
 from evaweb.plans.models import Plan, PlanEvent, PlanState
 from evaweb.plans.references import LARGEST, unpacked
+from evaweb.plans.toml_exchange import export_archive, export_toml, import_file
 from evaweb.trials.admin import ReadOnly, Table
 from evaweb.trials.models import Checkpoint, Position, Scene
 

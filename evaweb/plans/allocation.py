@@ -24,7 +24,7 @@ from evaweb.plans.design import (
     findings_of,
     visible_close_reason,
 )
-from evaweb.plans.documents import require_checkpoints, require_scene, units_of
+from evaweb.plans.frozen_document import require_checkpoints, require_scene, units_of
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.selectors import without_dropped
 from evaweb.plans.services import end_plan_if_decided, slots_of

@@ -13,19 +13,19 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.journal import clean_text
-from evaweb.plans import pictures, regions
+from evaweb.plans import image_store, region_matching
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.counting import fails_by
 from evaweb.plans.design import ended_at_an_ask
-from evaweb.plans.documents import require_checkpoints, require_scene
+from evaweb.plans.frozen_document import require_checkpoints, require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.roles import Role, require_role
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import describe_robot
 from evaweb.trials.models import Position, Trial, TrialStatus
+from evaweb.trials.scoring import LONGEST_NOTE
 from evaweb.trials.services import register_check
-from evaweb.trials.verdicts import LONGEST_NOTE
 from evaweb.trials.voids import register_two_person_rule
 from runtime.core.sentences import Pattern, fixed
 
@@ -112,15 +112,15 @@ def confirm_cameras(*, user: User, station: Station, first: bool = False) -> Cam
     if missing and not first:
         raise Conflict(_NO_REFERENCE_PICTURE_YET_LOOK(missing=", ".join(missing)))
     seen = {}
-    for camera, jpeg in pictures.current_images(station, cameras).items():
-        name = pictures.store_image(jpeg)
+    for camera, jpeg in image_store.current_images(station, cameras).items():
+        name = image_store.store_image(jpeg)
         reference = known.get(camera) or Reference.objects.create(
             station=station, camera=camera, picture=name, by=user
         )
         seen[camera] = {
             "picture": name,
             "reference": reference.picture,
-            "match": pictures.image_match(pictures.load_image(reference.picture), jpeg),
+            "match": image_store.image_match(image_store.load_image(reference.picture), jpeg),
         }
     return CameraCheck.objects.create(station=station, boot=station.boot, seen=seen, by=user)
 
@@ -141,7 +141,7 @@ def take_references(*, user: User, station: Station, position: Position | None) 
     Regions keep their place in the picture. Raises: Conflict if a running plan uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
-    found = pictures.current_images(station, cameras_of(station))
+    found = image_store.current_images(station, cameras_of(station))
     Station.objects.select_for_update().get(
         pk=station.pk
     )  # serializes with `save_regions`, which needs the newest reference
@@ -153,7 +153,7 @@ def take_references(*, user: User, station: Station, position: Position | None) 
             station=station,
             position=position,
             camera=camera,
-            picture=pictures.store_image(jpeg),
+            picture=image_store.store_image(jpeg),
             regions=before[camera].regions if camera in before else [],
             by=user,
         )
@@ -168,7 +168,7 @@ def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
     Raises: Conflict if there is a newer one, or a running plan with a least match has used this camera's reference.
     """
     require_role(user, Role.OPERATOR)
-    found = regions.regions_of(drawn)
+    found = region_matching.regions_of(drawn)
     position = reference.position
     if position is None:
         raise EvaError(_THIS_REFERENCE_SAYS_WHAT_CAMERA)
@@ -176,7 +176,7 @@ def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
     newest = references(station=station, position=position)[reference.camera]
     if newest.pk != reference.pk:
         raise Conflict(_HAS_NEWER_REFERENCE_HERE_BY(camera=reference.camera, user=newest.by.get_username()))
-    regions.check_sizes(found, pictures.load_image(reference.picture))
+    region_matching.check_sizes(found, image_store.load_image(reference.picture))
     _require_unjudged(reference)
     return Reference.objects.create(
         station=station,
@@ -247,17 +247,17 @@ def _compare_cameras(trial: Trial, cameras: Sequence[str], patience_s: float) ->
     if trial.status != TrialStatus.PREPARED:
         raise Conflict(_TRIAL_BENCH_LOOKED_AT_BEFORE(trial=trial.pk, status=trial.get_status_display()))
     known = references(station=trial.station, position=trial.position)
-    found = pictures.current_images(trial.station, cameras, patience_s)
+    found = image_store.current_images(trial.station, cameras, patience_s)
     return [_seen(camera, jpeg, known.get(camera)) for camera, jpeg in found.items()]
 
 
 def _seen(camera: str, jpeg: bytes, reference: Reference | None) -> CameraMatch:
     if reference is None:
         return CameraMatch(camera, jpeg, None, None, [])
-    before = pictures.load_image(reference.picture)
-    drawn = regions.regions_of(reference.regions)
-    rows = regions.match_regions(drawn, before, jpeg) if drawn else []
-    return CameraMatch(camera, jpeg, reference, pictures.image_match(before, jpeg), rows)
+    before = image_store.load_image(reference.picture)
+    drawn = region_matching.regions_of(reference.regions)
+    rows = region_matching.match_regions(drawn, before, jpeg) if drawn else []
+    return CameraMatch(camera, jpeg, reference, image_store.image_match(before, jpeg), rows)
 
 
 def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achieved]:
@@ -273,7 +273,7 @@ def record_layout(*, user: User, trial: Trial, override: str = "") -> list[Achie
         Achieved.objects.create(
             trial=trial,
             camera=one.camera,
-            picture=pictures.store_image(one.jpeg),
+            picture=image_store.store_image(one.jpeg),
             reference=one.reference,
             match=one.match,
             regions=one.regions,

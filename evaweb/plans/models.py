@@ -377,8 +377,8 @@ class PlanEvent(models.Model):
 class Reference(models.Model):
     """Reference picture of a camera: of a position as laid out, or without a position of the camera's view.
 
-    The newest per camera and position counts. `picture` names a file: see evaweb.plans.pictures. `regions` are around
-    objects: see evaweb.plans.regions; changed regions are a new row with the same picture.
+    The newest per camera and position counts. `picture` names a file: see evaweb.plans.image_store. `regions` are
+    around objects: see evaweb.plans.region_matching; changed regions are a new row with the same picture.
     """
 
     station = models.ForeignKey(Station, on_delete=models.PROTECT, related_name="references")
@@ -404,9 +404,9 @@ class Reference(models.Model):
 class Achieved(models.Model):
     """Image of a camera before a trial's run, and its match to the reference at that time.
 
-    `match` is evaweb.plans.pictures.image_match of the whole picture; `regions` is the result of
-    evaweb.plans.regions.match_regions, which counts instead if the reference has regions. `override`: why a match
-    below the plan's least one was accepted.
+    `match` is evaweb.plans.image_store.image_match of the whole picture; `regions` is the result of
+    evaweb.plans.region_matching.match_regions, which counts instead if the reference has regions. `override`: why a
+    match below the plan's least one was accepted.
     """
 
     trial = models.ForeignKey(Trial, on_delete=models.PROTECT, related_name="achieved")

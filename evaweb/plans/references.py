@@ -21,8 +21,8 @@ from typing import Any
 from django.contrib.auth.models import User
 
 from evaweb.errors import EvaError, NotFound
-from evaweb.plans import pictures
-from evaweb.plans import regions as drawing
+from evaweb.plans import image_store
+from evaweb.plans import region_matching as drawing
 from evaweb.plans.models import Reference
 from evaweb.stations.models import Station
 from evaweb.trials.models import Position, Scene
@@ -100,7 +100,7 @@ def packed(text: str, name: str, references: Iterable[Mapping[str, Any]]) -> byt
         archive.writestr(name, text)
         for picture in sorted({str(row["picture"]) for row in references}):
             try:
-                jpeg = pictures.load_image(picture)
+                jpeg = image_store.load_image(picture)
             except NotFound:
                 continue  # the import reports missing pictures
             archive.writestr(f"pictures/{picture}.jpg", jpeg, zipfile.ZIP_STORED)
@@ -152,7 +152,7 @@ def _of(archive: zipfile.ZipFile) -> tuple[str, dict[str, bytes]]:
         if hashlib.sha256(jpeg).hexdigest() != name:
             raise EvaError(_BYTES_HAVE_ANOTHER_SHA_256(filename=entry.filename))
         try:
-            pictures.image_match(jpeg, jpeg)
+            image_store.image_match(jpeg, jpeg)
         except EvaError as error:
             raise EvaError(f"{entry.filename}: {error}") from None
         found[name] = jpeg
@@ -201,11 +201,11 @@ def _taken(row: Mapping[str, Any], found: Mapping[str, bytes], user: User) -> st
     jpeg = found.get(row["picture"])
     if ours is not None:
         if jpeg is not None:
-            pictures.store_image(jpeg)  # restores a lost file
+            image_store.store_image(jpeg)  # restores a lost file
         return "the same"
-    if jpeg is None and not pictures.has_image(row["picture"]):
+    if jpeg is None and not image_store.has_image(row["picture"]):
         return "left out, because the file lacks their pictures: import the archive"
-    drawing.check_sizes(drawing.regions_of(row["regions"]), jpeg or pictures.load_image(row["picture"]))
-    name = pictures.store_image(jpeg) if jpeg else row["picture"]
+    drawing.check_sizes(drawing.regions_of(row["regions"]), jpeg or image_store.load_image(row["picture"]))
+    name = image_store.store_image(jpeg) if jpeg else row["picture"]
     Reference.objects.create(**key, picture=name, regions=row["regions"], by=user)
     return "new"

@@ -32,9 +32,9 @@ from evaweb.plans.design import (
     recorded_so_far,
     reveal_record,
 )
-from evaweb.plans.documents import UnevenError, document_of, units_of
 from evaweb.plans.draft_checks import covered, problems
 from evaweb.plans.drafting import Changed, Values, apply, digest_of, merged, values_of
+from evaweb.plans.frozen_document import UnevenError, document_of, units_of
 from evaweb.plans.models import Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import new_key

@@ -7,9 +7,9 @@ from django.shortcuts import render
 from django.urls import reverse
 from django.views.decorators.http import require_safe
 
-from evaweb.plans import regions
+from evaweb.plans import region_matching
 from evaweb.plans.bench_checks import references
-from evaweb.plans.pictures import load_image
+from evaweb.plans.image_store import load_image
 from evaweb.plans.selectors import reference_get
 from evaweb.roles import Role, role_of
 
@@ -31,7 +31,7 @@ def reference(request: HttpRequest, id: int) -> HttpResponse:
         "cameras": sorted(newest.items()),
         "editing": {
             "regions": found.regions,
-            "most": regions.MOST,
+            "most": region_matching.MOST,
             "save": reverse("api:reference-regions", args=[found.pk]),
             "next": reverse("reference", args=[0]),
         },

@@ -14,7 +14,7 @@ from evaweb.blinding import visibility_for_request
 from evaweb.preflights import services
 from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight, PreflightStatus
-from evaweb.preflights.reading import time_since, view_report
+from evaweb.preflights.report_view import time_since, view_report
 from evaweb.preflights.selectors import preflight_get, preflight_newest
 from evaweb.trials.selectors import checkpoint_get
 

@@ -16,7 +16,7 @@ from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.results.judges import KINDS
 from evaweb.results.judges.base import PATIENCE_S, Setup
-from evaweb.results.judges.finding import build_judge
+from evaweb.results.judges.loading import build_judge
 from evaweb.trials.models import Trial
 
 

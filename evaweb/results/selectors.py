@@ -13,7 +13,7 @@ from django.db.models import Case, Count, Exists, IntegerField, Max, Min, OuterR
 from evaweb.errors import EvaError, NotFound
 from evaweb.plans.models import Plan, PlanState, Slot
 from evaweb.stations.models import Station
-from evaweb.trials.failure_words import is_not_said
+from evaweb.trials.failure_text import is_not_said
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED

@@ -19,7 +19,7 @@ from evaweb.reviews import selectors, services
 from evaweb.reviews.dataset_sidecars import review_lines, write_review_sidecars
 from evaweb.reviews.folders import bounds_file, report_file
 from evaweb.reviews.models import Standing
-from runtime.datasets.sides import attach_sidecar
+from runtime.datasets.sidecars import attach_sidecar
 from runtime.recording.files import read_json, to_json, write_atomic
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def _inspected(episode: Episode, settings: QualitySettings) -> Report:
 
     An imported one is checked in its dataset: its folder has other times, and re-encoded images.
     """
-    from runtime.datasets.identities import uuids_of
+    from runtime.datasets.episode_uuids import uuids_of
     from runtime.quality.inspection import check_dataset_episode, check_episode
 
     folder = journal_folder(episode.uuid)

@@ -11,7 +11,7 @@ from django.views.decorators.http import require_GET, require_http_methods, requ
 
 from evaweb.blinding import visibility_for_request
 from evaweb.errors import EvaError, NotFound
-from evaweb.plans import pictures
+from evaweb.plans import image_store
 from evaweb.roles import Role, require_role, role_of
 from evaweb.setup import editing, selectors
 from evaweb.stations.selectors import station_get
@@ -86,7 +86,7 @@ def preview(request: HttpRequest) -> JsonResponse:
 @require_GET
 def live(request: HttpRequest, name: str, camera: str) -> HttpResponse:
     """Return the current image of a station's camera."""
-    found = pictures.current_images(station_get(name=name), [camera], _PATIENCE_S)
+    found = image_store.current_images(station_get(name=name), [camera], _PATIENCE_S)
     return HttpResponse(found[camera], content_type="image/jpeg")
 
 

@@ -22,13 +22,13 @@ from django.utils import timezone
 from evaweb.binary_frames import to_json_value
 from evaweb.errors import Conflict, EvaError, NotAllowed, StationGone
 from evaweb.roles import Role, require_role, role_of
-from evaweb.stations.holders import holder_of
+from evaweb.stations.lease_holders import holder_of
 from evaweb.stations.models import CARRIED_OUT, Command, CommandStatus, Station
-from evaweb.stations.notes import StopRecorder
 from evaweb.stations.runtime_client import NoAnswer, connection_to
 from evaweb.stations.selectors import station_get
+from evaweb.stations.stop_recorder import StopRecorder
 from evaweb.stations.stops import Answer, answer_of, clean_reason, press_estop, request_stop
-from evaweb.stations.unwritten import UnwrittenCommands
+from evaweb.stations.unwritten_commands import UnwrittenCommands
 from runtime.core.sentences import Pattern
 from runtime.ipc import messages
 from runtime.ipc.bus import CodecError

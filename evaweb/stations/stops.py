@@ -16,9 +16,9 @@ from django.conf import settings
 
 from evaweb.binary_frames import to_json_value
 from evaweb.errors import StationGone
-from evaweb.stations.flights import RequestCoalescer, TooManyRequests
-from evaweb.stations.holders import holder_of, with_display_names
+from evaweb.stations.lease_holders import holder_of, with_display_names
 from evaweb.stations.models import CommandStatus
+from evaweb.stations.request_coalescer import RequestCoalescer, TooManyRequests
 from evaweb.stations.runtime_client import NoAnswer, connection_to
 from runtime.core.sentences import Pattern
 from runtime.ipc import estop_requests as pressing

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from evaweb.statistics.base import StatisticsError, check_alpha, check_share
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import DesignPower
+from evaweb.statistics.design_power import DesignPower
 from evaweb.statistics.designs import ANYTIME, FIXED
 from evaweb.statistics.sequential import BET_FRACTIONS
 

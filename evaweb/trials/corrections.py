@@ -13,10 +13,10 @@ from evaweb.journal import clean_text
 from evaweb.roles import Role, require_role
 from evaweb.stations.commands import parse_command_uuid
 from evaweb.trials import failures
-from evaweb.trials.failure_words import UNSPECIFIED, failure_text
+from evaweb.trials.failure_text import UNSPECIFIED, failure_text
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
+from evaweb.trials.scoring import LONGEST_NOTE
 from evaweb.trials.services import counts_now, lock_trial, require_scorable, run_checks
-from evaweb.trials.verdicts import LONGEST_NOTE
 from runtime.core.sentences import Pattern
 
 _TRIAL_ONLY_SCORE_COUNTS_HAS = Pattern(

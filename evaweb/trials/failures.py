@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from evaweb.errors import EvaError
 from evaweb.journal import clean_text
-from evaweb.trials.failure_words import is_not_said
+from evaweb.trials.failure_text import is_not_said
 from evaweb.trials.models import FailureTerm, Scene, Score
-from evaweb.trials.verdicts import LONGEST_FAILURE
+from evaweb.trials.scoring import LONGEST_FAILURE
 from runtime.core.sentences import Pattern
 
 _ALLOWED_OTHER_WORDS_NONE_WHERE = Pattern(

@@ -22,7 +22,7 @@ from django.db.models import (
 from evaweb.blinding import HIDDEN, Visibility, code_of
 from evaweb.errors import EvaError
 from evaweb.trials.clips import clip_of
-from evaweb.trials.failure_words import UNSPECIFIED, is_not_said
+from evaweb.trials.failure_text import UNSPECIFIED, is_not_said
 from evaweb.trials.models import Trial, TrialStatus
 from evaweb.trials.selectors import TrialFilters, trial_list
 from runtime.core.sentences import Pattern

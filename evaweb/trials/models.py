@@ -15,7 +15,7 @@ from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
 from evaweb.names import check_name
 from evaweb.stations.models import Station
-from evaweb.trials.failure_words import failure_text
+from evaweb.trials.failure_text import failure_text
 from evaweb.trials.tables import check_bench, check_policy, check_strategy, check_tags, check_term
 
 

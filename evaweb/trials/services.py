@@ -34,9 +34,14 @@ from evaweb.trials.models import (
     TrialStatus,
 )
 from evaweb.trials.record import JUDGEMENTS, OutcomeLine, ScoreLine, journal_uuid
+from evaweb.trials.scoring import (
+    LONGEST_NOTE,
+    ScoredOutcome,
+    reached_in_truth,
+    score_outcome,
+)
 from evaweb.trials.selectors import attempts_of, trial_open
 from evaweb.trials.station_events import apply_station_event
-from evaweb.trials.verdicts import LONGEST_NOTE, ScoredOutcome, reached_in_truth, score_outcome
 from runtime.core.sentences import Pattern
 
 _PREPARED_AT_ONCE = Pattern(

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import pydantic
 from django.core.exceptions import ValidationError
 
-from evaweb.trials.failure_words import is_not_said
+from evaweb.trials.failure_text import is_not_said
 from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")

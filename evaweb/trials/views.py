@@ -18,9 +18,9 @@ from evaweb.lists import DAY, Column, Filter, Listing
 from evaweb.roles import Role, role_of
 from evaweb.stations.selectors import station_list
 from evaweb.trials import failures, lifecycle, selectors, services, voids
-from evaweb.trials.figures import scene_figures
 from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.rate_bars import scene_figures
 from evaweb.trials.record import visible_labels
 from evaweb.trials.selectors import TrialFilters
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robots import urdf
-from robots.draft.pictures import MeshCopyReport, copy_urdf
+from robots.draft.draft_model import RobotDraft, build_draft
+from robots.draft.mesh_copy import MeshCopyReport, copy_urdf
 from robots.draft.postures import PostureSearch
-from robots.draft.sheet import RobotDraft, build_draft
-from robots.draft.text import render_readme, render_robot_toml
+from robots.draft.rendering import render_readme, render_robot_toml
 from robots.errors import RobotError
 from robots.inspection import Inspection, inspect_robot
 from robots.loading import load_robot, robot_names

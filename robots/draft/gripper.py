@@ -8,8 +8,8 @@ from itertools import combinations, product
 
 import numpy as np
 
-from robots.draft.anatomy import GroupGuess
 from robots.draft.geometry import places
+from robots.draft.group_guessing import GroupGuess
 from robots.draft.limits import FASTEST
 from robots.rotations import Float64, quaternion_of_matrix
 from robots.urdf import Joint, Urdf

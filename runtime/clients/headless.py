@@ -13,7 +13,7 @@ from typing import Any
 
 from robots.broken_pipe import exit_on_broken_pipe
 from runtime.clients.client import StationClient
-from runtime.clients.terminal.figures import format_figure, status_line
+from runtime.clients.terminal.status_text import format_figure, status_line
 from runtime.config import loader
 from runtime.config.schema import Deployment
 from runtime.core import logs as log
@@ -186,7 +186,7 @@ def _export_and_publish(settings: Deployment, episode: Path, well: bool) -> dict
 
 
 def _publish(settings: Deployment, episode: Path) -> dict[str, Any]:
-    from runtime.datasets.published import publish
+    from runtime.datasets.publishing import publish
 
     dataset = settings.data / str(settings.publish.dataset)
     published = publish(episode, dataset, version=settings.publish.version)

@@ -14,7 +14,7 @@ from runtime.datasets import layout, operations
 from runtime.datasets.assemble import AssemblyResult
 from runtime.datasets.consistency import check_with_remarks
 from runtime.datasets.hub import push
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 
 
 @exit_on_broken_pipe

@@ -16,8 +16,8 @@ import numpy as np
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog, new_info, single_file_line
+from runtime.datasets.column_renaming import ColumnRenaming
 from runtime.datasets.columns import column_statistics
-from runtime.datasets.cut import NotCopyableError, copy_segment, encode_segment, other_streams
 from runtime.datasets.entries import entry, episode_lines, own_keys, statistic_lines, task_lines
 from runtime.datasets.features import (
     LANGUAGE,
@@ -31,14 +31,19 @@ from runtime.datasets.features import (
 )
 from runtime.datasets.layout import Line
 from runtime.datasets.parquet_lists import EPISODES_FOLDER, is_storable
-from runtime.datasets.pictures import StoredImages
 from runtime.datasets.reader import Dataset, open_dataset
-from runtime.datasets.renaming import ColumnRenaming
 from runtime.datasets.rows import column_array, row_shape, write_table
-from runtime.datasets.sides import FOLDER, sidecar_path, sidecar_paths
+from runtime.datasets.sidecars import FOLDER, sidecar_path, sidecar_paths
 from runtime.datasets.splits import TRAIN, episodes_of, written
 from runtime.datasets.staging import LOCK, Draft
 from runtime.datasets.stats import Statistic, fault, picture_statistic, video_statistic
+from runtime.datasets.video_frames import StoredImages
+from runtime.datasets.video_segments import (
+    NotCopyableError,
+    copy_segment,
+    encode_segment,
+    other_streams,
+)
 from runtime.recording.files import disk_error
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from runtime.datasets.features import (
     stored_features,
     vector,
 )
-from runtime.datasets.journal import FinishedEpisode
+from runtime.datasets.finished_episode import FinishedEpisode
 from runtime.datasets.stats import Statistic, column_statistic
 
 if TYPE_CHECKING:

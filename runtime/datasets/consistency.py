@@ -33,11 +33,11 @@ from runtime.datasets.features import (
     picture_size,
     stored_features,
 )
-from runtime.datasets.pictures import StoredImages, VideoFrames, VideoSegment
 from runtime.datasets.rows import column_array, read_rows, row_shape
-from runtime.datasets.sides import orphaned_sidecars
+from runtime.datasets.sidecars import orphaned_sidecars
 from runtime.datasets.splits import episodes_of
 from runtime.datasets.stats import FIGURES, fault, finite
+from runtime.datasets.video_frames import StoredImages, VideoFrames, VideoSegment
 
 if TYPE_CHECKING:
     import pyarrow as pa

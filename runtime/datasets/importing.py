@@ -20,11 +20,11 @@ import robots
 from runtime.core.errors import RecordingError
 from runtime.core.types import Float32
 from runtime.datasets import layout
-from runtime.datasets.carried import ExtraStreams, dimension_names, read_extra_streams
-from runtime.datasets.identities import uuids_of
+from runtime.datasets.episode_uuids import uuids_of
+from runtime.datasets.extra_streams import ExtraStreams, dimension_names, read_extra_streams
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import ImageSequence
 from runtime.datasets.reader import Dataset, RecordedEpisode
+from runtime.datasets.video_frames import ImageSequence
 from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import disk_error, sync_folder

@@ -22,9 +22,9 @@ from runtime.datasets.assemble import (
     assemble,
     ignore_progress,
 )
+from runtime.datasets.column_renaming import ColumnRenaming
 from runtime.datasets.consistency import check
 from runtime.datasets.entries import episode_lines
-from runtime.datasets.renaming import ColumnRenaming
 from runtime.datasets.staging import LOCK, lock_dataset, recover, remove_drafts
 from runtime.recording.files import disk_error
 

@@ -14,8 +14,13 @@ from runtime.core.types import Float32, Float64
 from runtime.datasets import layout
 from runtime.datasets.entries import EpisodeEntry, Span, entry, episode_lines, task_lines
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import ImageSequence, StoredImages, VideoFrames, VideoSegment
 from runtime.datasets.rows import read_rows
+from runtime.datasets.video_frames import (
+    ImageSequence,
+    StoredImages,
+    VideoFrames,
+    VideoSegment,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa

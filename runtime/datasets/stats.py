@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from runtime.core.errors import RecordingError
 from runtime.core.picture_bounds import open_video
 from runtime.core.types import UInt8
-from runtime.datasets.pictures import StoredImages
+from runtime.datasets.video_frames import StoredImages
 
 # min, max, mean, std and the quantiles: lists of the feature's shape; count: [n]
 Statistic = dict[str, list[Any]]

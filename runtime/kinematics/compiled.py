@@ -15,6 +15,13 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float64
 from runtime.kinematics import kernel_cache
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsError, KinematicsSettings
+from runtime.kinematics.chain_records import (
+    POSED,
+    ChainSequence,
+    Record,
+    Records,
+    chain_records,
+)
 from runtime.kinematics.replanning import (
     MIN_LIMIT_MARGIN,
     ROOMIER,
@@ -22,7 +29,6 @@ from runtime.kinematics.replanning import (
     replan,
     sample_postures,
 )
-from runtime.kinematics.tables import POSED, ChainSequence, Record, Records, chain_records
 
 _WRONG = {  # by return value of kernels.chunks.solve_chunk
     1: "a target, the seed or the anchor holds a number that is not finite",
@@ -59,7 +65,7 @@ class CompiledKinematics(Kinematics):
 
     def __init__(self, robot: Robot, config: Config | None = None) -> None:
         try:
-            from runtime.kinematics.kernels import chains, chunks, frames
+            from runtime.kinematics.kernels import chunk_solver, forward_kinematics, frame_solver
         except ImportError as error:
             raise SetupError(str(error)) from error
         config = config or Config()
@@ -72,17 +78,17 @@ class CompiledKinematics(Kinematics):
             for dims in (group.joint_dims for group, _ in own)
         ]
         self._robot = robot
-        self._poses_of, self._solve_chunk = chains.compute_poses, chunks.solve_chunk
-        self._reach_type = chains.fk_buffer_type(self._whole["drive"].shape[1])
-        self._scratch_type = chunks.scratch_type(*_lengths(self._arms))
-        self._costs = frames.Costs(
+        self._poses_of, self._solve_chunk = forward_kinematics.compute_poses, chunk_solver.solve_chunk
+        self._reach_type = forward_kinematics.fk_buffer_type(self._whole["drive"].shape[1])
+        self._scratch_type = chunk_solver.scratch_type(*_lengths(self._arms))
+        self._costs = frame_solver.Costs(
             config.position_weight,
             config.rotation_weight,
             config.rest_weight,
             config.home_rate,
             config.max_iterations,
         )
-        self._tolerances = chunks.Tolerances(
+        self._tolerances = chunk_solver.Tolerances(
             config.position_tolerance, config.rotation_tolerance, config.singular_below
         )
 
@@ -249,7 +255,7 @@ def _full_chain(group: Group, chain: Chain) -> ChainSequence:
 
 def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: float) -> Records:
     """Return the arms as records; shorter arms are padded with fixed joints."""
-    from runtime.kinematics.kernels.chunks import arm_type
+    from runtime.kinematics.kernels.chunk_solver import arm_type
 
     chains = chain_records([ChainSequence([chain], [range(chain.size)]) for _, chain in own])
     carriers = chain_records([_carrier_chain(group) for group, _ in own])

@@ -12,7 +12,7 @@ from runtime.core.types import Float32
 from runtime.kinematics.base import KinematicsError
 
 if TYPE_CHECKING:
-    from runtime.kinematics.kernels.bodies import LinkTable
+    from runtime.kinematics.kernels.link_poses import LinkTable
 
 
 class LinkPoses:
@@ -24,7 +24,7 @@ class LinkPoses:
 
     def __init__(self, body: Body) -> None:
         try:
-            from runtime.kinematics.kernels.bodies import compute_link_poses
+            from runtime.kinematics.kernels.link_poses import compute_link_poses
         except ImportError as error:
             raise KinematicsError(str(error)) from error
         self._place = compute_link_poses
@@ -48,7 +48,7 @@ class LinkPoses:
 
 
 def _parts_of(body: Body) -> LinkTable:
-    from runtime.kinematics.kernels.bodies import LinkTable
+    from runtime.kinematics.kernels.link_poses import LinkTable
 
     tables = body.tables
     motions = tables.motions.reshape(-1, 4, 4, 4)

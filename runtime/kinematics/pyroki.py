@@ -20,7 +20,7 @@ from runtime.core.errors import SetupError
 from runtime.core.types import Float64
 from runtime.kinematics import compiled
 from runtime.kinematics.base import IkResult, Kinematics, KinematicsSettings
-from runtime.kinematics.measuring import evaluate_solution
+from runtime.kinematics.evaluation import evaluate_solution
 
 _BUCKET = 64  # [rows] chunks are padded to a multiple, so that few lengths are compiled
 _BOX_WEIGHT = 100.0  # per rad beyond the box; the remaining excess is clipped

@@ -9,7 +9,12 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, Float32, Space
 from runtime.policies.answers import ActionFormatSettings
 from runtime.policies.pictures import Resize
-from runtime.policies.request import RequestLayout, RequestSettings, Size, pose_rows_for
+from runtime.policies.request_layout import (
+    RequestLayout,
+    RequestSettings,
+    Size,
+    pose_rows_for,
+)
 
 if TYPE_CHECKING:
     from robots import Robot

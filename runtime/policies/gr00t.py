@@ -25,15 +25,15 @@ from runtime.core.errors import (
     ServerReportedError,
     WrongProtocolError,
 )
-from runtime.core.machine_names import Variable
+from runtime.core.host_references import Variable
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.groot import arrays
-from runtime.policies.groot.link import ReqLink
 from runtime.policies.groot.modality import parse_modalities
+from runtime.policies.groot.req_socket import ReqLink
 from runtime.policies.groot.request import Gr00tRequest, RequestSettings
-from runtime.policies.link import error_headline
 from runtime.policies.tunnel.settings import TunnelSettings
+from runtime.policies.websocket_link import error_headline
 
 if TYPE_CHECKING:
     from robots import Robot

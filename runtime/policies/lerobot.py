@@ -28,7 +28,7 @@ from runtime.core.errors import (
 )
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.async_inference import messages
-from runtime.policies.async_inference.link import Channel
+from runtime.policies.async_inference.grpc_channel import Channel
 from runtime.policies.async_inference.pickles import MODULES, TimedAction, load_actions
 from runtime.policies.async_inference.request import AsyncRequest, RequestSettings
 from runtime.policies.base import Policy, PolicyInfo

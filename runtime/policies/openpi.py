@@ -18,19 +18,19 @@ from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
-from runtime.policies.agreement import DeclaredPolicy, check_server_claims
+from runtime.policies.action_rows import parse_action_rows
 from runtime.policies.answers import ActionFormatSettings
 from runtime.policies.base import PolicyInfo
 from runtime.policies.gripper_convention import Convention, GripperConvention
-from runtime.policies.link import ANSWER_LIMIT
-from runtime.policies.request import RequestLayout, RequestSettings, pose_rows_for
-from runtime.policies.rows import parse_action_rows
+from runtime.policies.request_layout import RequestLayout, RequestSettings, pose_rows_for
 from runtime.policies.rtc.async_rtc import AsyncRtc, Schedule
 from runtime.policies.rtc.base import Dialect, NoRtc
 from runtime.policies.rtc.kai0 import Kai0
 from runtime.policies.rtc.openpi_rtc import EnvelopeKeys, OpenpiRtc, Rows
 from runtime.policies.rtc.prev_action import PrevAction
+from runtime.policies.server_claims import DeclaredPolicy, check_server_claims
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
+from runtime.policies.websocket_link import ANSWER_LIMIT
 
 if TYPE_CHECKING:
     from robots import Robot

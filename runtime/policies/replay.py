@@ -13,13 +13,13 @@ from pydantic import Field
 import robots
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, RecordingError
-from runtime.core.machine_names import Recording
+from runtime.core.host_references import Recording
 from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation, Space
 from runtime.datasets.mapping import ColumnMapping
 from runtime.policies.base import Policy, PolicyInfo
-from runtime.policies.request import pose_rows_for
+from runtime.policies.request_layout import pose_rows_for
 from runtime.recording.base import IMPORTED
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class ReplayPolicy(Policy):
         )
 
     def _recording(self) -> _Recorded:
-        from runtime.datasets.journal import read_finished_episode
+        from runtime.datasets.finished_episode import read_finished_episode
         from runtime.recording.scrub import require_intact
 
         if self._config.episode:

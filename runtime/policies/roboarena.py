@@ -17,7 +17,7 @@ from runtime.core.errors import ContradictionError, PolicyError, ServerReportedE
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.arena.actions import ArenaActions, ArenaActionSettings
 from runtime.policies.arena.request import ArenaRequest, ArenaRequestSettings
-from runtime.policies.arena.wants import ServerRequirements, parse_requirements
+from runtime.policies.arena.requirements import ServerRequirements, parse_requirements
 from runtime.policies.base import PolicyInfo
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
 

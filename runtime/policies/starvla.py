@@ -27,12 +27,12 @@ from runtime.core.errors import (
 )
 from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.policies.action_layout import ActionLayoutSettings
+from runtime.policies.action_rows import parse_action_rows
 from runtime.policies.base import PolicyInfo
-from runtime.policies.link import error_headline
-from runtime.policies.request import PIXELS, RequestLayout, Size
-from runtime.policies.rows import parse_action_rows
-from runtime.policies.statistics import Statistics
+from runtime.policies.normalization import Statistics
+from runtime.policies.request_layout import PIXELS, RequestLayout, Size
 from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
+from runtime.policies.websocket_link import error_headline
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -13,13 +13,13 @@ from pydantic import Field
 from runtime.core import msgpack_arrays
 from runtime.core.environment import read_secret
 from runtime.core.errors import CodecError, PolicyError, WrongProtocolError
-from runtime.core.machine_names import Variable
+from runtime.core.host_references import Variable
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.settings import Settings
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.health import require_healthy
-from runtime.policies.link import ANSWER_LIMIT, WebsocketLink
 from runtime.policies.tunnel.settings import TunnelSettings
+from runtime.policies.websocket_link import ANSWER_LIMIT, WebsocketLink
 
 _POLICY_CLOSED = Pattern("policy.server.policy_closed", "the policy at {url} is closed; connect first")
 _NO_MAP = Pattern("policy.server.no_map", "{url} sent {what} that is a {kind}; expected a map")

@@ -22,9 +22,9 @@ from runtime.core import environment
 from runtime.core import logs as log
 from runtime.core.errors import ConfigurationError, RuntimeFault
 from runtime.ipc.lifeline import Lifeline
-from runtime.policies.link import wait_closed
-from runtime.preflight.course import PreflightRunner
+from runtime.policies.websocket_link import wait_closed
 from runtime.preflight.report import Report
+from runtime.preflight.runner import PreflightRunner
 from runtime.preflight.verdict import PreflightStage, PreflightVerdict
 from runtime.station.checks import check_deployment
 from runtime.station.permissions import require_allowed_references

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.core.types import Float32, Float64
-from runtime.quality.luma import FrameStream
+from runtime.quality.frame_stream import FrameStream
 from runtime.quality.report import Severity
 
 Bools = NDArray[np.bool_]

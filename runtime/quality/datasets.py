@@ -16,11 +16,11 @@ from runtime.core.types import EEF_WIDTH, Float64
 from runtime.datasets import layout
 from runtime.datasets.features import picture_size
 from runtime.datasets.mapping import ColumnMapping, video_key
-from runtime.datasets.pictures import VideoSegment
 from runtime.datasets.reader import Dataset
+from runtime.datasets.video_frames import VideoSegment
 from runtime.quality.block import BLOCK_ROWS, Block, Bools, EpisodeSource, JointSpecs, Vector, VectorColumn
+from runtime.quality.frame_stream import FrameStream, StoredFrameStream, VideoFrameStream
 from runtime.quality.joints import known_joints, unknown_joints
-from runtime.quality.luma import FrameStream, StoredFrameStream, VideoFrameStream
 
 STATES = ("observation.state", "observation.qpos")  # names of the state column, in order of preference
 ACTION = "action"

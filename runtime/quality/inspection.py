@@ -11,13 +11,13 @@ from runtime.core.errors import RecordingError
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.quality.block import EpisodeSource
 from runtime.quality.datasets import DatasetSource
+from runtime.quality.image_checks import ImageCheck
 from runtime.quality.journals import JournalSource
-from runtime.quality.motion import MotionCheck
-from runtime.quality.pictures import ImageCheck
+from runtime.quality.motion_checks import MotionCheck
 from runtime.quality.report import Flag, FlagCollector, Report
 from runtime.quality.settings import QualitySettings
-from runtime.quality.times import TimingCheck
-from runtime.quality.values import ValueCheck
+from runtime.quality.timing_checks import TimingCheck
+from runtime.quality.value_checks import ValueCheck
 
 
 def check_episode(folder: Path, settings: QualitySettings | None = None) -> Report:

@@ -21,13 +21,13 @@ from runtime.quality.block import (
     VectorColumn,
     VideoEnd,
 )
+from runtime.quality.frame_stream import FrameStream, VideoFrameStream
 from runtime.quality.joints import known_joints, unknown_joints
-from runtime.quality.luma import FrameStream, VideoFrameStream
 from runtime.quality.report import Severity
 from runtime.recording.files import read_json
 from runtime.recording.layout import Layout, simulated
+from runtime.recording.outcome_seal import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.scrub import verify_episode
-from runtime.recording.sealing import DIGESTS, OUTCOME, read_outcome
 from runtime.recording.tables import added, rows_schema
 
 _ROLES = {"qpos": "state", "action": "action", "eef": "poses", "eef_action": "poses"}

@@ -12,8 +12,8 @@ import av
 
 from runtime.core.errors import RecordingError
 from runtime.core.types import UInt8
-from runtime.recording.backlog import Picture, PictureQueue, encode_count
 from runtime.recording.digests import rows_per_piece
+from runtime.recording.encoder_queue import Picture, PictureQueue, encode_count
 from runtime.recording.files import AppendFile, DiskFullError
 from runtime.recording.histogram import DurationHistogram
 from runtime.recording.settings import RecordingSettings

@@ -38,7 +38,13 @@ from runtime.recording.files import (
 )
 from runtime.recording.fragments import count_frames
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import MANIFEST, digest_of, digests_of, seal_outcome, write_outcome
+from runtime.recording.outcome_seal import (
+    MANIFEST,
+    digest_of,
+    digests_of,
+    seal_outcome,
+    write_outcome,
+)
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.summary import summarise
 from runtime.recording.tables import read_table, rows_schema

@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from runtime.core.errors import RecordingError
 from runtime.recording.files import disk_error, exclusive, read_json, to_json, write_atomic
 from runtime.recording.layout import Layout
+from runtime.recording.outcome_seal import read_outcome, without_digests
 from runtime.recording.scrub import require_intact
-from runtime.recording.sealing import read_outcome, without_digests
 from runtime.recording.tables import SCHEMAS, read_table
 
 FOLDER = "exports"

@@ -7,10 +7,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from runtime.recording.damage_marks import data_of, mark_file, read_mark
 from runtime.recording.files import disk_error, exclusive, sync_folder, to_json, write_atomic
-from runtime.recording.marks import data_of, mark_file, read_mark
+from runtime.recording.integrity import IntegrityCheck
 from runtime.recording.scrub import verify_episode
-from runtime.recording.verdict import IntegrityCheck
 
 
 def update_mark(verdict: IntegrityCheck) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from runtime.core.errors import RecordingError
 from runtime.recording.files import read_json
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import OUTCOME, read_outcome, without_digests
+from runtime.recording.outcome_seal import OUTCOME, read_outcome, without_digests
 from runtime.recording.tables import SCHEMAS, read_table
 
 

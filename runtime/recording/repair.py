@@ -11,15 +11,14 @@ from typing import Literal
 
 from runtime.core.errors import RecordingError
 from runtime.recording.base import VIDEO_LOST
+from runtime.recording.damage_marks import data_of
 from runtime.recording.episode import lock_folder
 from runtime.recording.export import export_path
 from runtime.recording.files import disk_error, read_json, sync_folder, to_json, write_atomic
 from runtime.recording.fragments import count_frames, whole_bytes
+from runtime.recording.integrity import IntegrityCheck
 from runtime.recording.layout import Layout
-from runtime.recording.marks import data_of
-from runtime.recording.reader import read_events
-from runtime.recording.scrub import verify_episode
-from runtime.recording.sealing import (
+from runtime.recording.outcome_seal import (
     MANIFEST,
     OUTCOME,
     OUTCOME_COPY,
@@ -29,9 +28,10 @@ from runtime.recording.sealing import (
     seal_outcome,
     write_outcome,
 )
+from runtime.recording.reader import read_events
+from runtime.recording.scrub import verify_episode
 from runtime.recording.summary import summarise
 from runtime.recording.tables import SCHEMAS, read_table, write_table
-from runtime.recording.verdict import IntegrityCheck
 
 REASON = "the recorder ended without closing the episode"
 UNCUT = "rows.uncut.arrow"  # rows as they were found, if some were cut

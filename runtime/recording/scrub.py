@@ -10,12 +10,25 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from runtime.core.errors import RecordingError
+from runtime.recording.damage_marks import known_damage
 from runtime.recording.digests import FileDigest
 from runtime.recording.files import disk_error, read_json
-from runtime.recording.marks import known_damage
-from runtime.recording.readable import find_unreadable
-from runtime.recording.sealing import COPY, DIGESTS, MANIFEST, OUTCOME, OUTCOME_COPY, SEAL, read_outcome
-from runtime.recording.verdict import Damage, DamagedError, IntegrityCheck, State
+from runtime.recording.integrity import (
+    Damage,
+    DamagedError,
+    IntegrityCheck,
+    State,
+)
+from runtime.recording.outcome_seal import (
+    COPY,
+    DIGESTS,
+    MANIFEST,
+    OUTCOME,
+    OUTCOME_COPY,
+    SEAL,
+    read_outcome,
+)
+from runtime.recording.unreadable_files import find_unreadable
 
 
 def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:

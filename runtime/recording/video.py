@@ -14,7 +14,7 @@ from av.video.reformatter import ColorRange, Colorspace
 
 from runtime.core.types import UInt8
 from runtime.recording import codecs
-from runtime.recording.backlog import RUN
+from runtime.recording.encoder_queue import RUN
 from runtime.recording.files import AppendFile
 from runtime.recording.fragments import frames_in
 from runtime.recording.planes import to_yuv_planes

@@ -34,7 +34,7 @@ def check_deployment(resolved: Resolved) -> StationSpec:
             f"allowed: {', '.join(made.cameras)}"
         )
     if settings.cameras:
-        from runtime.cameras.attaching import check
+        from runtime.cameras.attach import check
 
         check(settings.cameras, robot)
     collection.check(settings.collection, made.cameras)

@@ -13,7 +13,7 @@ from pathlib import Path
 from runtime.config.loader import Resolved, apply_changes
 from runtime.config.schema import Deployment
 from runtime.core.errors import ConfigurationError, RuntimeFault
-from runtime.core.machine_names import HostReference, find_host_references
+from runtime.core.host_references import HostReference, find_host_references
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.identity import LOCAL, SCRIPT
 from runtime.ipc.messages import Command

@@ -10,7 +10,7 @@ import numpy as np
 from runtime.core.types import Float64
 from runtime.motion.timeline import Contributions, DimensionKinds, PlacedChunk, Timeline, difference
 from runtime.strategies.base import ArrivedChunk, Merge, Paced, Placement, Query, StrategyParameters
-from runtime.strategies.placing import place
+from runtime.strategies.placement import place
 
 USES = frozenset({"inference_rate", "k_max", "ensemble_m", "ensemble_horizon"})
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from runtime.motion.timeline import DimensionKinds, Timeline, single_contribution
 from runtime.strategies.base import ArrivedChunk, Merge, Paced, Placement, Query, StrategyParameters
-from runtime.strategies.placing import place
+from runtime.strategies.placement import place
 
 USES = frozenset({"execution_horizon", "inference_rate", "k_max"})
 

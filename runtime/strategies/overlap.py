@@ -16,7 +16,7 @@ from runtime.motion.timeline import (
     single_contribution,
 )
 from runtime.strategies.base import ArrivedChunk, Merge, Paced, Placement, Query, StrategyParameters
-from runtime.strategies.placing import place
+from runtime.strategies.placement import place
 
 USES = frozenset({"execution_horizon", "inference_rate", "k_max", "blend_window", "blend_shape"})
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from runtime.motion.timeline import DimensionKinds, Timeline, single_contribution
 from runtime.strategies.base import ArrivedChunk, Merge, Placement, Progress, Query, StrategyParameters
-from runtime.strategies.placing import drop, place
+from runtime.strategies.placement import drop, place
 
 USES = frozenset({"execution_horizon"})
 

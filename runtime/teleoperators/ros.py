@@ -13,9 +13,9 @@ from runtime.core.errors import CodecError, ConfigurationError
 from runtime.core.settings import Settings
 from runtime.core.types import Float64
 from runtime.teleoperators.base import Leader
+from runtime.transports.ros.message_reading import JointOrder, Names
 from runtime.transports.ros.messages import JointState, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality
-from runtime.transports.ros.reading import JointOrder, Names
 from runtime.transports.ros.source import Subscription, subscriptions
 from runtime.transports.ros.topics import StreamSpec
 

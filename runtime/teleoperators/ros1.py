@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from runtime.core.clock import Clock
 from runtime.teleoperators.ros import NODE, TABLE, LeaderGroups, RosLeader
 from runtime.transports import ros1
-from runtime.transports.ros import packed
+from runtime.transports.ros import ros1_serialization
 from runtime.transports.ros.middleware import Quality
 
 if TYPE_CHECKING:
@@ -25,4 +25,6 @@ class Config(ros1.Link, LeaderGroups):
 
 def build(config: Config, robot: Robot, clock: Clock) -> RosLeader:
     """Create the leader, not yet connected. Raises ConfigurationError for a group or joint that the robot lacks."""
-    return RosLeader(config, 1, robot, clock, _NEWEST, packed, lambda: ros1.middleware(config, NODE))
+    return RosLeader(
+        config, 1, robot, clock, _NEWEST, ros1_serialization, lambda: ros1.middleware(config, NODE)
+    )

@@ -16,8 +16,8 @@ from runtime.transports.base import Capabilities, Sink, Source
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.datasets.pictures import ImageSequence
     from runtime.datasets.reader import RecordedEpisode
+    from runtime.datasets.video_frames import ImageSequence
 
 TOLERANCE = 1e-6  # a frame is due this much early [s]: due times are sums of floats
 

@@ -23,7 +23,7 @@ from runtime.ipc.messages import Event
 from runtime.ipc.readable import readable
 from runtime.transports import node_link
 from runtime.transports.base import Source
-from runtime.transports.freshness import FROZEN_S, FrozenCameraDetector
+from runtime.transports.frozen_cameras import FROZEN_S, FrozenCameraDetector
 from runtime.transports.node_messages import (
     MESSAGE_LIMIT,
     MessageRefused,

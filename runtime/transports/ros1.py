@@ -17,13 +17,13 @@ from runtime.core.clock import Clock
 from runtime.core.errors import ConfigurationError
 from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
-from runtime.transports.ros import packed
+from runtime.transports.ros import ros1_serialization
 from runtime.transports.ros.middleware import COMMAND_QUALITY, Middleware, Quality
+from runtime.transports.ros.rospy_middleware import TcpRosMiddleware
 from runtime.transports.ros.rospy_process import RosEnvironment, require
 from runtime.transports.ros.settings import RosSettings, camera_keys
 from runtime.transports.ros.sink import RosSink
 from runtime.transports.ros.source import RosSource, Subscription, subscriptions
-from runtime.transports.ros.tcpros import TcpRosMiddleware
 from runtime.transports.ros.topics import StreamSpec
 
 if TYPE_CHECKING:
@@ -95,14 +95,14 @@ def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
     """Create the source of observations from the robot's topics. Raises ConfigurationError if a topic is unknown."""
     parts, _ = config.streams(robot, 1)
     opener = lambda: middleware(config, f"{NODE}_source")  # noqa: E731
-    return RosSource(robot, _heard(parts), config.acceptance_limits, clock, packed, opener)
+    return RosSource(robot, _heard(parts), config.acceptance_limits, clock, ros1_serialization, opener)
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
     """Create the sink of commands to the robot's topics. Raises ConfigurationError if a topic is unknown."""
     _, outlets = config.streams(robot, 1)
     opener = lambda: middleware(config, f"{NODE}_commands")  # noqa: E731
-    return RosSink(robot, outlets, lambda _: COMMAND_QUALITY, clock, packed, opener)
+    return RosSink(robot, outlets, lambda _: COMMAND_QUALITY, clock, ros1_serialization, opener)
 
 
 def middleware(config: Link, name: str) -> Middleware:

@@ -16,7 +16,7 @@ from runtime.core.clock import Clock
 from runtime.core.errors import ConfigurationError
 from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
-from runtime.transports.ros import cdr, dds, rcl
+from runtime.transports.ros import cdr, dds_middleware, rclpy_middleware
 from runtime.transports.ros.middleware import COMMAND_QUALITY, SENSOR_QUALITY, Middleware, Quality
 from runtime.transports.ros.settings import RosSettings, camera_keys
 from runtime.transports.ros.sink import RosSink
@@ -47,14 +47,14 @@ class Link(Settings):
 
     @model_validator(mode="after")
     def _stay_on_this_machine(self) -> Link:
-        elsewhere = self.network != dds.LOOPBACK or self.middleware == "rclpy"
+        elsewhere = self.network != dds_middleware.LOOPBACK or self.middleware == "rclpy"
         if elsewhere and not self.insecure_link:
             what = f"network = {self.network!r}" if self.middleware == "dds" else 'middleware = "rclpy"'
             raise ConfigurationError(
                 f"{self.table}.{what} may leave this machine without protection; allowed: "
                 'middleware = "dds" with network = "loopback", or insecure_link = true on a network you trust'
             )
-        if self.peers and self.network in (dds.LOOPBACK, dds.ENVIRONMENT):
+        if self.peers and self.network in (dds_middleware.LOOPBACK, dds_middleware.ENVIRONMENT):
             raise ConfigurationError(
                 f"{self.table}.peers = {self.peers} with network = {self.network!r}; allowed: with an interface"
             )
@@ -74,7 +74,7 @@ class Config(Link, RosSettings):
 
 def capabilities(config: Config) -> Capabilities:
     """Return the abilities of the transport, which commands a robot. Raises SetupError without the middleware."""
-    (dds.require if config.middleware == "dds" else rcl.require)()
+    (dds_middleware.require if config.middleware == "dds" else rclpy_middleware.require)()
     return config.capabilities
 
 
@@ -103,8 +103,8 @@ def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
 def middleware(config: Link, name: str) -> Middleware:
     """Create a node of the chosen middleware. Raises SetupError if it is not installed."""
     if config.middleware == "rclpy":
-        return rcl.RclMiddleware(config.domain, name)
-    return dds.DdsMiddleware(config.domain, config.network, tuple(config.peers))
+        return rclpy_middleware.RclMiddleware(config.domain, name)
+    return dds_middleware.DdsMiddleware(config.domain, config.network, tuple(config.peers))
 
 
 def _checked(config: Config, robot: Robot) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:

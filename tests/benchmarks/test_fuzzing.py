@@ -66,7 +66,7 @@ def test_an_answer_that_comes_twice_answers_no_other_question(seed):
 
 def test_answers_that_are_off_by_one_are_noticed(monkeypatch):
     """As before: what comes next is the answer."""
-    monkeypatch.setattr("runtime.policies.link.WebsocketLink._require_silence", lambda *given: None)
+    monkeypatch.setattr("runtime.policies.websocket_link.WebsocketLink._require_silence", lambda *given: None)
     monkeypatch.setattr("runtime.policies.websocket.WebsocketPolicy._mismatch_reason", lambda *given: "")
     monkeypatch.setattr("runtime.policies.openpi.OpenpiPolicy._mismatch_reason", lambda *given: "")
     found = [text for seed in range(8) for text in answers.once(seed)]

@@ -22,7 +22,7 @@ from runtime.sim import arrays
 from runtime.transports import ros1, ros2
 from runtime.transports import zmq as node
 from runtime.transports.base import Source
-from runtime.transports.ros import cdr, packed
+from runtime.transports.ros import cdr, ros1_serialization
 from runtime.transports.ros.messages import Image, JointState, Message
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Middleware, Publish, Topic
 from runtime.transports.ros.topics import GroupTopics, Topics
@@ -314,7 +314,9 @@ def _ros1(request: pytest.FixtureRequest) -> Played:
     if absent():
         pytest.skip(absent())
     settings = {"master": request.getfixturevalue("ros_master").uri, "python": PYTHON}
-    return RosPlayed(RosWire(ros1, packed.encode, settings, lambda config: ros1.middleware(config, "robot")))
+    return RosPlayed(
+        RosWire(ros1, ros1_serialization.encode, settings, lambda config: ros1.middleware(config, "robot"))
+    )
 
 
 # A further transport joins by a line: what opens it, with the fixtures it needs.

@@ -191,7 +191,7 @@ def test_of_two_operators_at_once_the_second_is_told_who_commands(bench: Bench, 
 def test_a_command_that_waited_too_long_is_stale_and_not_carried_out(
     bench: Bench, script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.clients.channel.lane.LATE_S", -1.0)  # whoever asked has given up
+    monkeypatch.setattr("runtime.clients.channel.request_worker.LATE_S", -1.0)  # whoever asked has given up
     why = refused(lambda: script.cmd("setup"))
     assert why.startswith("it waited ")
     assert why.endswith(" behind others: not carried out")

@@ -147,7 +147,7 @@ def test_a_clock_that_jumps_is_named_and_ages_nothing(robot: Played, jump: float
 def test_a_frozen_camera_is_named_while_all_else_goes_on(
     robot: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("runtime.transports.freshness.FROZEN_S", 0.1)
+    monkeypatch.setattr("runtime.transports.frozen_cameras.FROZEN_S", 0.1)
     still = robot.picture()
     monkeypatch.setattr(robot, "picture", lambda: still)
     mark = 0

@@ -12,7 +12,7 @@ import pytest
 
 from runtime.clients.client import Refused, StationClient
 from runtime.core.errors import TransportError
-from runtime.policies.tunnel.process import free_port
+from runtime.policies.tunnel.ssh_process import free_port
 from runtime.recording.reader import open_episode
 from tests.crash.lab import ROBOT
 from tests.processes import PATIENCE_S, eventually

@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from runtime.policies.tunnel.process import free_port
+from runtime.policies.tunnel.ssh_process import free_port
 from tests.processes import alive, eventually
 from tests.ssh import SshServer, required
 

@@ -22,7 +22,7 @@ STATION = "bench-1"
 DEAD = "dead-policy"
 _MORE = f"""
 import json
-from evaweb.lab.seed import demo_checkpoint, demo_login
+from evaweb.lab.demo_rows import demo_checkpoint, demo_login
 from evaweb.roles import Role
 people = [demo_login(username="ann", role=Role.OPERATOR), demo_login(username="visitor", role=Role.VIEWER)]
 demo_checkpoint(name="{DEAD}", description="", policy={{"url": "ws://127.0.0.1:1"}})

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from evaweb.lab.patience import DemoFailed
-from evaweb.lab.visitor import LivePage, RestClient
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.stall_detection import DemoFailed
 from tests.e2e.lab import STATION
 from tests.processes import PATIENCE_S, eventually
 

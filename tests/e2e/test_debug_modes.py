@@ -13,7 +13,7 @@ from tests.processes import PATIENCE_S, eventually
 pytestmark = pytest.mark.slow
 MUTE = "mute-policy"
 _MUTE = f"""
-from evaweb.lab.seed import demo_checkpoint
+from evaweb.lab.demo_rows import demo_checkpoint
 demo_checkpoint(name="{MUTE}", description="", policy={{{{"url": "ws://127.0.0.1:{{port}}"}}}})
 """
 

@@ -12,7 +12,7 @@ from uuid import UUID
 
 import pytest
 
-from evaweb.lab.patience import DemoFailed
+from evaweb.lab.stall_detection import DemoFailed
 from runtime.clients.client import StationClient
 from tests.e2e.bench_page import BenchPage
 from tests.e2e.lab import DEAD, STATION, WIDE

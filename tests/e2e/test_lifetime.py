@@ -9,7 +9,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.rest_client import RestClient
 from tests.e2e.lab import ROOT, STATION, left
 from tests.e2e.remote import page_of, refusal, reset_station, visitor
 from tests.processes import PATIENCE_S, eventually

@@ -4,8 +4,8 @@ import time
 
 import pytest
 
-from runtime.datasets.journal import read_finished_episode
-from runtime.datasets.published import publish
+from runtime.datasets.finished_episode import read_finished_episode
+from runtime.datasets.publishing import publish
 from tests.e2e.by_hand import DebugPage
 from tests.e2e.lab import STATION, WIDE
 from tests.processes import PATIENCE_S, eventually

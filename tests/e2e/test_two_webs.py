@@ -9,7 +9,7 @@ from urllib.request import Request
 
 import pytest
 
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.rest_client import RestClient
 from tests.e2e.lab import STATION
 from tests.e2e.remote import opened, page_of, refusal, reset_station
 from tests.e2e.two_webs import in_turn, second_web

@@ -14,7 +14,12 @@ from django.test import Client
 from evaweb import computing
 from evaweb.computing import AT_ONCE_S, REFILLED, Beside, Busy, Questions
 from evaweb.plans.models import Plan
-from evaweb.statistics import boundaries, courses, planning, score_courses
+from evaweb.statistics import (
+    boundaries,
+    design_power,
+    planning,
+    score_courses,
+)
 from evaweb.statistics.base import StatisticsError
 from tests.evaweb.blind_lab import BlindLab
 from tests.evaweb.crawling import crawled
@@ -109,9 +114,9 @@ def test_the_process_beside_computes_says_what_fails_and_is_started_anew():
         assert beside.run(os.getpid)[0] not in (os.getpid(), None)
         assert beside.run(os.nice, 0)[0] == 19
         with pytest.raises(StatisticsError, match="allowed: 1 to 250"):
-            beside.run(courses.design_power, "none", 251, 0.2, 0.9, 0.05)
-        here = courses.outlook(0.2, 0.9, 0.8, 0.05, 5, (0.1,))
-        there, seconds = beside.run(courses.outlook, 0.2, 0.9, 0.8, 0.05, 5, (0.1,))
+            beside.run(design_power.design_power, "none", 251, 0.2, 0.9, 0.05)
+        here = design_power.outlook(0.2, 0.9, 0.8, 0.05, 5, (0.1,))
+        there, seconds = beside.run(design_power.outlook, 0.2, 0.9, 0.8, 0.05, 5, (0.1,))
         assert (there, seconds > 0) == (here, True)
         with pytest.raises(Busy, match="has ended"):
             beside.run(signal.raise_signal, signal.SIGKILL)
@@ -132,7 +137,7 @@ def test_a_process_beside_whose_web_is_gone_ends_in_the_middle_of_its_question()
 
 LONG = (  # whatever takes long at the sizes that a question may have
     (boundaries, "_least_extreme"),
-    (courses, "_simulated"),
+    (design_power, "_simulated"),
     (planning, "_barnard_tables"),
     (score_courses, "_flipped"),
     (score_courses, "_stops"),

@@ -19,8 +19,8 @@ from django.urls import reverse
 
 from evaweb.episodes.models import Episode, Tag
 from evaweb.jobs.models import Job
-from evaweb.plans.exchange import export_toml
 from evaweb.plans.models import Slot
+from evaweb.plans.toml_exchange import export_toml
 from evaweb.results.models import Judgement
 from evaweb.stations.models import Command
 from evaweb.trials.models import Checkpoint, Scene, Trial

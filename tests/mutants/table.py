@@ -82,10 +82,10 @@ MUTANTS = (
     ),
     Mutant(
         "timeline/chunk-of-the-past",
-        "runtime/strategies/placing.py",
+        "runtime/strategies/placement.py",
         "if due >= count:",
         "if due > count:",
-        ("tests/runtime/strategies/test_placing.py",),
+        ("tests/runtime/strategies/test_placement.py",),
     ),
     Mutant(
         "timeline/newest-weighs-most",
@@ -304,10 +304,10 @@ MUTANTS = (
     ),
     Mutant(
         "statistics/holm-that-falls",
-        "evaweb/statistics/many.py",
+        "evaweb/statistics/multiple_comparisons.py",
         "highest = max(highest, min(1.0, (len(order) - rank) * probabilities[i]))",
         "highest = min(1.0, (len(order) - rank) * probabilities[i])",
-        ("tests/evaweb/statistics/test_many.py",),
+        ("tests/evaweb/statistics/test_multiple_comparisons.py",),
     ),
     Mutant(
         "statistics/alpha-for-one-side",

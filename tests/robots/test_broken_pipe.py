@@ -24,7 +24,7 @@ NOT_OF_A_TERMINAL = {
     "runtime.processes.coordinator.process",
     "runtime.processes.media.process",
     "runtime.processes.reception.process",
-    "runtime.policies.tunnel.bound",
+    "runtime.policies.tunnel.die_with_parent",
     "runtime.transports.ros.rospy_node.__main__",
     "benchmarks.first_chunk",
     "benchmarks.recording_alone",

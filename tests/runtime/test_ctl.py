@@ -5,7 +5,7 @@ import pytest
 
 from runtime import ctl
 from runtime.clients.client import Refused
-from runtime.clients.terminal import settling
+from runtime.clients.terminal import wait_settled
 from runtime.clients.terminal.keys import NoKeys
 from runtime.core.errors import TransportError
 from tests.runtime.terminal_station import AIM, Script, event, status
@@ -14,7 +14,7 @@ from tests.runtime.terminal_station import AIM, Script, event, status
 @pytest.fixture
 def run(monkeypatch):
     """Runs a command line against a script; nobody is at the terminal, and waits take no time."""
-    monkeypatch.setattr(settling.time, "sleep", lambda _: None)
+    monkeypatch.setattr(wait_settled.time, "sleep", lambda _: None)
     monkeypatch.setattr("runtime.clients.terminal.command_follower.keys", NoKeys)
     monkeypatch.setenv("EVA_DATA_DIR", "/var/eva")
 

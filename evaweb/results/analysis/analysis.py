@@ -20,21 +20,21 @@ from evaweb.results.analysis.outcomes import (
     pair_by_block,
     unbroken,
 )
-from evaweb.statistics import strata
 from evaweb.statistics.base import LEVEL, Interval, StatisticsError
 from evaweb.statistics.bounded import BoundedMean, bounded_mean
 from evaweb.statistics.confidence_sequence import confidence_sequence
 from evaweb.statistics.difference import Difference, ExactTest, barnard, newcombe, probability_better
-from evaweb.statistics.many import holm, letters
 from evaweb.statistics.means import Average, average
+from evaweb.statistics.milestone_funnel import FunnelStep, funnel
+from evaweb.statistics.multiple_comparisons import holm, letters
 from evaweb.statistics.paired import McNemar, mcnemar, over_conditions
 from evaweb.statistics.permutation import SignFlipTest, sign_flip_test
-from evaweb.statistics.progress import FunnelStep, funnel
 from evaweb.statistics.proportions import Posterior, Proportion, clopper_pearson, posterior, proportion
 from evaweb.statistics.rates import Rate, rate
 from evaweb.statistics.sequential import Evidence, score_evidence, success_evidence
+from evaweb.statistics.stratified import Stratified, StratumTable, exact_within, interaction, mantel_haenszel
 from evaweb.statistics.success_times import Curve, RestrictedMean, cumulative_incidence, restricted_mean
-from evaweb.trials.failure_words import UNSPECIFIED, failure_text
+from evaweb.trials.failure_text import UNSPECIFIED, failure_text
 
 SEED = 20_260  # seed of all random draws: equal data give equal intervals
 _RANDOM = "checkpoints came in random order: there are no pairs"
@@ -174,7 +174,7 @@ class Comparison:
     paired: McNemar | None
     scored: SignFlipTest | None
     clustered: Difference | None
-    stratified: strata.Stratified | None
+    stratified: Stratified | None
     within: dict[str, Within]
     scenes: dict[str, Difference]
     interaction: float | None
@@ -500,14 +500,12 @@ def _clustered(first: Sequence[Outcome], second: Sequence[Outcome]) -> Differenc
     return over_conditions(ours, theirs, seed=SEED, level=LEVEL)
 
 
-def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> strata.Stratified | None:
+def _stratified(first: Sequence[Outcome], second: Sequence[Outcome]) -> Stratified | None:
     ours, theirs = _grouped(first, lambda o: o.scene), _grouped(second, lambda o: o.scene)
     shared = sorted(set(ours) & set(theirs))
     if len(set(ours) | set(theirs)) < 2:
         return None  # a single scene cannot be stratified
-    return strata.mantel_haenszel(
-        [strata.StratumTable(*_counts(ours[key]), *_counts(theirs[key])) for key in shared]
-    )
+    return mantel_haenszel([StratumTable(*_counts(ours[key]), *_counts(theirs[key])) for key in shared])
 
 
 STRATA: dict[str, Callable[[Outcome], str]] = {
@@ -520,13 +518,11 @@ STRATA: dict[str, Callable[[Outcome], str]] = {
 
 def _tables(
     first: Sequence[Outcome], second: Sequence[Outcome], key: Callable[[Outcome], str]
-) -> dict[str, strata.StratumTable]:
+) -> dict[str, StratumTable]:
     """Return the tables of the strata in which both were tried."""
     ours, theirs = _grouped(first, key), _grouped(second, key)
     return {
-        name: strata.StratumTable(*_counts(ours[name]), *_counts(theirs[name]))
-        for name in ours
-        if name in theirs
+        name: StratumTable(*_counts(ours[name]), *_counts(theirs[name])) for name in ours if name in theirs
     }
 
 
@@ -534,7 +530,7 @@ def _within(first: Sequence[Outcome], second: Sequence[Outcome]) -> dict[str, Wi
     found = {}
     for name, key in STRATA.items():
         tables = list(_tables(first, second, key).values())
-        p = strata.exact_within(tables)
+        p = exact_within(tables)
         if p is not None:
             found[name] = Within(p, len(tables))
     return found
@@ -547,7 +543,7 @@ def _by_scene(
     if len(tables) < 2:
         return {}, None
     differences = {name: newcombe(t.x1, t.n1, t.x2, t.n2) for name, t in tables.items()}
-    return differences, strata.interaction(list(tables.values()))
+    return differences, interaction(list(tables.values()))
 
 
 def _sooner(pairs: Sequence[Pair], timing: _TimeHorizon) -> SignFlipTest | None:

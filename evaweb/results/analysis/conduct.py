@@ -25,7 +25,7 @@ from evaweb.plans.models import Look as Behind
 from evaweb.plans.selectors import plans_beside
 from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.analysis.integrity import checkpoint_changes, with_changes
-from evaweb.statistics.many import holm
+from evaweb.statistics.multiple_comparisons import holm
 from evaweb.statistics.permutation import sign_flip_test
 from evaweb.trials.endings import ESTOP, INTERRUPTION
 from evaweb.trials.models import Scene, Score, TrialStatus, VoidRequest

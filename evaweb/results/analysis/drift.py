@@ -10,7 +10,7 @@ from django.db.models import Q
 
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis.load_outcomes import load_plan_outcomes
-from evaweb.statistics.strata import StratumTable, exact_within
+from evaweb.statistics.stratified import StratumTable, exact_within
 
 
 class _Tried(NamedTuple):

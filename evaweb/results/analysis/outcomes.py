@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from evaweb.trials.failure_words import failure_text
+from evaweb.trials.failure_text import failure_text
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from evaweb import computing
 from evaweb.errors import EvaError
 from evaweb.plans.models import Comparing
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import DesignPower, Outlook, outlook
+from evaweb.statistics.design_power import DesignPower, Outlook, outlook
 from evaweb.statistics.designs import RULES
 from evaweb.statistics.planning import detectable
 from runtime.core.sentences import Pattern

@@ -20,7 +20,7 @@ from evaweb.results.analysis.planner import Question, told
 from evaweb.statistics import score_courses
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.boundaries import MOST
-from evaweb.statistics.courses import DesignPower, design_power, pairs_needed
+from evaweb.statistics.design_power import DesignPower, design_power, pairs_needed
 from evaweb.statistics.designs import ANYTIME, RULES
 from evaweb.statistics.score_courses import Scores, score_course, score_pairs_needed
 

@@ -20,7 +20,7 @@ from evaweb.plans.schedule import IMBALANCE, Condition, foretold, schedule
 from evaweb.plans.seeded_draws import KEY_BYTES
 from evaweb.results.analysis.planner import Question
 from evaweb.results.analysis.power import Asked, Figures
-from evaweb.results.presentation.drawings import courses
+from evaweb.results.presentation.drawings import time_courses
 from evaweb.results.templatetags.results_tags import design_words
 from evaweb.roles import Role
 from evaweb.stations.models import Station
@@ -327,7 +327,7 @@ def power_page(plan: Plan, asked: Asked, found: Figures) -> dict[str, Any]:
         "asked": asked,
         "found": found,
         "percent": round(100 * found.done / found.of),
-        "figure": courses.power(curves, asked.pairs, question.power, asked.numbers[-1]),
+        "figure": time_courses.power(curves, asked.pairs, question.power, asked.numbers[-1]),
         "planned": at.get(asked.rule),
         "most_hours": size.total * hours,
         "mean_hours": at[asked.rule].mean * size.checkpoints * hours

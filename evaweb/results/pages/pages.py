@@ -17,7 +17,7 @@ from evaweb.results.analysis.filters import TrialFilter, filter_choices
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.analysis.outcomes import by_checkpoint, pair_by_block
 from evaweb.results.presentation.addresses import compare_address, trials_address
-from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.drawings import conditions, rates, time_courses
 from evaweb.results.presentation.drawings.svg import Drawing
 from evaweb.results.presentation.facts import (
     comparison_facts,
@@ -81,7 +81,7 @@ def _summary(
         "intervals": _intervals(plan, "Success rates", analysis, only),
         "violins": rates.draw_violins(analysis.arms, analysis.letters) if analysis.arms else None,
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
-        "success_times": courses.draw_success_times(analysis.arms),
+        "success_times": time_courses.draw_success_times(analysis.arms),
         "grid": conditions.draw_grid(analysis.arms, _grid_links(plan, analysis, only)),
         "declared": declared_failures(plan).keys() & {row.trial for row in only.apply(outcomes)},
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
@@ -142,9 +142,9 @@ def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashab
             for scene in sorted({*arms[0].scenes, *arms[1].scenes})
             if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
         ],
-        "success_times": courses.draw_success_times(arms),
+        "success_times": time_courses.draw_success_times(arms),
         "evidence": found.evidence
-        and courses.draw_evidence(
+        and time_courses.draw_evidence(
             found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
         ),
         "paired": list(enumerate(pair_by_block(runs.get(found.first, []), runs.get(found.second, [])), 1)),
@@ -211,7 +211,11 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
         "found": found,
         "foreseen": design.blocks,
         "by": [
-            (what, courses.draw_evidence(evidence, *names, design.blocks, drawn), evidence_words(evidence))
+            (
+                what,
+                time_courses.draw_evidence(evidence, *names, design.blocks, drawn),
+                evidence_words(evidence),
+            )
             for what, evidence in (
                 ("By success and failure", found.evidence),
                 ("By scores, partial credit included", found.score_evidence),
@@ -249,7 +253,7 @@ def _funnel(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> Dr
         for _, name, funnel in found
         for at, label in enumerate(funnel.labels)
     }
-    return courses.draw_funnel(scene, found, links)
+    return time_courses.draw_funnel(scene, found, links)
 
 
 def _grid_links(plan: Plan, analysis: Analysis, only: TrialFilter) -> dict[tuple[str, str], str]:

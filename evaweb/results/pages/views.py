@@ -29,10 +29,10 @@ from evaweb.results.analysis.filters import parse_filter
 from evaweb.results.analysis.simulated import is_simulated, set_beside, simulated_plans
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
-from evaweb.results.presentation.citing import HEAD, Citation, citation
+from evaweb.results.presentation.citation import HEAD, Citation, citation
 from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_words
 from evaweb.results.ratings.automatic import judges_ready, request_judging
-from evaweb.results.ratings.unblinding import (
+from evaweb.results.ratings.result_visibility import (
     has_results,
     require_visible_results,
     sealed_reason,

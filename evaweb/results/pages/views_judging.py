@@ -14,7 +14,7 @@ from evaweb.episodes.selectors import playback_stage
 from evaweb.errors import EvaError
 from evaweb.plans.models import Handout
 from evaweb.results.models import Preference
-from evaweb.results.ratings import judging
+from evaweb.results.ratings import rating_queue
 from evaweb.results.ratings.video_available import is_watchable
 from evaweb.results.selectors import plan_get
 from evaweb.roles import Role, role_of
@@ -42,7 +42,7 @@ def rate(request: HttpRequest) -> HttpResponse:
         else:
             return redirect("rate")
     user: Any = request.user
-    offer = judging.next_to_rate(user)
+    offer = rating_queue.next_to_rate(user)
     handout = offer.found
     milestones = list(handout.trial.scene.milestones.order_by("order")) if handout else []
     typed = request.POST if handout and request.POST.get("code") == handout.code else QueryDict()
@@ -77,7 +77,7 @@ def prefer(request: HttpRequest) -> HttpResponse:
         else:
             return redirect("prefer")
     user: Any = request.user
-    offer = judging.next_to_compare(user)
+    offer = rating_queue.next_to_compare(user)
     pair = offer.found
     codes = (pair.first.code, pair.second.code) if pair else ()
     views = [_view(pair.first), _view(pair.second)] if pair else []
@@ -102,7 +102,7 @@ def _rated(request: HttpRequest) -> None:
     ticked = set(request.POST.getlist("milestone"))
     keys = handout.trial.scene.milestones.values_list("pk", flat=True) if handout else ()
     user: Any = request.user
-    judging.save_rating(
+    rating_queue.save_rating(
         user=user,
         plan=plan,
         code=code,
@@ -114,7 +114,7 @@ def _rated(request: HttpRequest) -> None:
 
 def _preferred(request: HttpRequest) -> None:
     user: Any = request.user
-    judging.save_preference(
+    rating_queue.save_preference(
         user=user,
         plan=plan_get(name=request.POST.get("plan", ""), version=_version(request)),
         **{name: request.POST.get(name, "") for name in ("first", "second", "outcome", "why")},

@@ -16,7 +16,7 @@ from evaweb.plans.models import Comparing, PlanState
 from evaweb.refusals import retrying
 from evaweb.results import selectors
 from evaweb.results.analysis.planner import Question, question_of, table_of
-from evaweb.results.ratings.unblinding import sealed_reason
+from evaweb.results.ratings.result_visibility import sealed_reason
 from evaweb.roles import Role, role_of
 
 RUNNING = 12  # plans on one page; the list has all

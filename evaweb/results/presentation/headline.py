@@ -35,7 +35,7 @@ from evaweb.statistics.designs import (
     unbeaten,
 )
 from evaweb.statistics.difference import newcombe
-from evaweb.statistics.many import letters
+from evaweb.statistics.multiple_comparisons import letters
 
 # Plan format from which sign-flip tests of scores are worded as "differ": they test exchangeability, which scores with
 # different spreads around one mean violate too.

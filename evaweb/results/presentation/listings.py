@@ -22,10 +22,10 @@ from evaweb.results.ratings.video_available import is_watchable
 from evaweb.results.selectors import TrialQuery
 from evaweb.statistics.bounded import BoundedMean
 from evaweb.statistics.proportions import Proportion
-from evaweb.trials.failure_words import UNSPECIFIED
+from evaweb.trials.failure_text import UNSPECIFIED
 from evaweb.trials.failures import FIELDS
-from evaweb.trials.figures import average_words
 from evaweb.trials.models import Trial, TrialStatus
+from evaweb.trials.rate_bars import average_words
 
 MOST_PAIRS = 200
 

@@ -21,7 +21,7 @@ from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState
 from evaweb.results.judges.base import MilestoneJudgement, MilestonePrompt, NoVerdict, TrialCase
-from evaweb.results.judges.finding import UsableJudge, build_judge
+from evaweb.results.judges.loading import UsableJudge, build_judge
 from evaweb.results.models import AutomaticJudge, Judgement
 from evaweb.results.ratings.record import RATINGS, JudgementLine
 from evaweb.results.ratings.stills import trial_stills
@@ -29,8 +29,8 @@ from evaweb.results.ratings.video_available import is_watchable
 from evaweb.roles import Role, require_role
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import journal_uuid
+from evaweb.trials.scoring import reached_in_truth
 from evaweb.trials.services import run_checks
-from evaweb.trials.verdicts import reached_in_truth
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 

@@ -6,7 +6,7 @@ from evaweb.episodes.models import Episode
 from evaweb.episodes.preview import jpeg_of
 from evaweb.episodes.videos import video_file
 from evaweb.results.judges.base import StillImage
-from runtime.datasets.pictures import VideoFrames
+from runtime.datasets.video_frames import VideoFrames
 
 CAMERAS = 4  # first cameras of the recording
 OF_EACH = 8  # images per camera, evenly spaced, including first and last

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evaweb.errors import NotFound
-from evaweb.plans import pictures
+from evaweb.plans import image_store
 from evaweb.plans.models import Achieved, Plan
 
 COLUMNS = ("trial", "camera", "picture", "reference", "match", "regions", "override", "by", "at")
@@ -44,7 +44,7 @@ def write_pictures(plan: Plan, folder: Path, most: int | None) -> int:
     left, written = 0, 0
     for name in names:
         try:
-            jpeg = pictures.load_image(name)
+            jpeg = image_store.load_image(name)
         except NotFound:
             left += 1
             continue

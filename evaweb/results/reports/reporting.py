@@ -24,7 +24,7 @@ from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation import facts, listings
-from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.drawings import conditions, rates, time_courses
 from evaweb.results.presentation.headline import headline, with_planned_letters
 from evaweb.results.presentation.integrity import delays_banner, integrity_document
 from evaweb.results.presentation.setting import setting_of
@@ -184,7 +184,7 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         else None,
         "violins": rates.draw_violins(arms, analysis.letters) if arms else None,
         "funnels": [
-            courses.draw_funnel(
+            time_courses.draw_funnel(
                 scene,
                 [(a.series, a.checkpoint, f) for a in arms for f in a.funnels if f.scene == scene],
                 {},
@@ -192,11 +192,11 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
             for scene in scenes
             if any(f.scene == scene for a in arms for f in a.funnels)
         ],
-        "success_times": courses.draw_success_times(arms),
+        "success_times": time_courses.draw_success_times(arms),
         "grid": conditions.draw_grid(arms, {}),
         "failures": listings.failure_tables(analysis, ordered_terms(), lambda **named: ""),
         "evidence": [
-            courses.draw_evidence(
+            time_courses.draw_evidence(
                 found.evidence,
                 found.first,
                 found.second,

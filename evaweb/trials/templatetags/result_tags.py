@@ -9,7 +9,7 @@ from django import template
 
 from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
-from evaweb.trials import figures
+from evaweb.trials import rate_bars
 from evaweb.trials.lifecycle import advice
 from evaweb.trials.models import Evaluation, TrialStatus
 
@@ -19,7 +19,7 @@ register = template.Library()
 @register.filter
 def percent(share: float | str | None) -> str:
     """Return a fraction as whole percent; a dash if it is unknown (templates pass "" then)."""
-    return figures.format_percent(share) if isinstance(share, float | int) else "–"
+    return rate_bars.format_percent(share) if isinstance(share, float | int) else "–"
 
 
 @register.filter
@@ -52,13 +52,13 @@ def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
 @register.filter
 def interval(found: Proportion) -> str:
     """Return the ends of the interval in whole percent."""
-    return figures.format_interval(found)
+    return rate_bars.format_interval(found)
 
 
 @register.filter
 def averaged(found: Average | None, of: int) -> str:
     """Return a mean with its interval and count; a dash if there is none."""
-    return figures.average_words(found, of) or "–"
+    return rate_bars.average_words(found, of) or "–"
 
 
 @register.filter

@@ -19,7 +19,7 @@ from pathlib import Path
 import zmq
 
 from robots.broken_pipe import exit_on_broken_pipe
-from runtime.clients.channel.names import HolderNames
+from runtime.clients.channel.holder_names import HolderNames
 from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.config import loader as deployment

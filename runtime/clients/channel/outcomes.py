@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runtime.clients.terminal.settling import CALM_TICKS, Settled, is_busy
+from runtime.clients.terminal.wait_settled import CALM_TICKS, Settled, is_busy
 
 KEPT = 1000
 # What the session is while each goes on; the rest goes on within the state it was given in.

@@ -12,13 +12,18 @@ from typing import Any
 import zmq
 
 from runtime.clients.channel import answers, strict
-from runtime.clients.channel.brake import EStopHandler, StopHandler, is_estop, is_stop
 from runtime.clients.channel.executor import CommandExecutor
-from runtime.clients.channel.lane import Job, RequestWorker
+from runtime.clients.channel.holder_names import HolderNames
 from runtime.clients.channel.message import LARGEST, Malformed, Message, read
-from runtime.clients.channel.names import HolderNames
 from runtime.clients.channel.outcomes import Outcomes
+from runtime.clients.channel.request_worker import Job, RequestWorker
 from runtime.clients.channel.scripts import ScriptActivity
+from runtime.clients.channel.stop_handlers import (
+    EStopHandler,
+    StopHandler,
+    is_estop,
+    is_stop,
+)
 from runtime.clients.client import StationClient
 from runtime.core.errors import TransportError
 

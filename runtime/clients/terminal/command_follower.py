@@ -11,8 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 from runtime.clients.client import Refused, StationClient
-from runtime.clients.terminal.figures import distance_text, status_line
 from runtime.clients.terminal.keys import Keys, NoKeys, keys
+from runtime.clients.terminal.status_text import distance_text, status_line
 
 # Commands that go on after they were accepted, and what the session is while they do.
 LASTING = {

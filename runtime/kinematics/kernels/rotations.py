@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from runtime.core.types import Float64
-from runtime.kinematics.kernels.compiling import device_function
+from runtime.kinematics.kernels.compilation import device_function
 
 _SMALL = 0.02  # sine below which four terms of the arc sine's series are exact to the last digit
 _TURNED = -0.5  # cosine below which the antisymmetric part no longer determines the axis

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from runtime.core.types import Float64
-from runtime.kinematics.kernels.compiling import device_function
+from runtime.kinematics.kernels.compilation import device_function
 
 # A quarter turn in three parts, the first two of 33 bits, so that multiples of them are exact (Cody and Waite
 # 1980).

@@ -13,12 +13,12 @@ from runtime.core.errors import ConfigurationError, PolicyError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.core.types import EEF_WIDTH, Float32, Observation, UInt8
-from runtime.policies.arena.cameras import Cameras, Numbering, Slot
-from runtime.policies.arena.history import History
-from runtime.policies.arena.wants import ServerRequirements
+from runtime.policies.arena.camera_slots import Cameras, Numbering, Slot
+from runtime.policies.arena.frame_history import History
+from runtime.policies.arena.requirements import ServerRequirements
 from runtime.policies.gripper_convention import Convention, GripperConvention
 from runtime.policies.pictures import resize_image
-from runtime.policies.request import Size
+from runtime.policies.request_layout import Size
 from runtime.spaces.pose_rows import PoseRows
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from pydantic import Field
 from runtime.core.errors import ConfigurationError, ContradictionError, ShapeError, WrongProtocolError
 from runtime.core.types import Float32, Observation
 from runtime.policies.action_layout import ActionLayoutSettings
+from runtime.policies.action_rows import parse_action_rows
 from runtime.policies.async_inference.pickles import (
     MODULES,
     RemotePolicyConfig,
@@ -20,8 +21,7 @@ from runtime.policies.async_inference.pickles import (
     dump,
 )
 from runtime.policies.gripper_convention import Convention, GripperConvention
-from runtime.policies.request import Dims, pose_rows_for
-from runtime.policies.rows import parse_action_rows
+from runtime.policies.request_layout import Dims, pose_rows_for
 
 if TYPE_CHECKING:
     from robots import Robot

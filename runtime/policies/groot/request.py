@@ -20,10 +20,10 @@ from runtime.core.errors import (
 )
 from runtime.core.types import Float32, Observation, UInt8
 from runtime.policies.action_layout import ActionLayoutSettings
+from runtime.policies.action_rows import parse_action_rows
 from runtime.policies.gripper_convention import Convention, GripperConvention
 from runtime.policies.groot.modality import ActionFormat, Modalities, Modality, join_names
-from runtime.policies.request import Dims, pose_rows_for
-from runtime.policies.rows import parse_action_rows
+from runtime.policies.request_layout import Dims, pose_rows_for
 
 if TYPE_CHECKING:
     from robots import Robot

@@ -9,8 +9,8 @@ import numpy as np
 
 from runtime.core.errors import ServerReportedError, WrongProtocolError
 from runtime.core.types import Conditioning
-from runtime.policies.link import error_headline
 from runtime.policies.rtc.base import Dialect, Message
+from runtime.policies.websocket_link import error_headline
 
 NAME = "openpi-async-rtc"
 VERSION = 2

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from runtime.core.backoff import BackOff
-from runtime.policies.tunnel.process import Ssh
-from runtime.policies.tunnel.sentences import explain_exit, explain_session_refused, port_was_taken
+from runtime.policies.tunnel.ssh_messages import explain_exit, explain_session_refused, port_was_taken
+from runtime.policies.tunnel.ssh_process import Ssh
 
 log = logging.getLogger(__name__)
 _POLL_S = 0.05

@@ -21,9 +21,9 @@ from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.connection import Place
 from runtime.policies.tunnel.command import command, far_end, require_files
 from runtime.policies.tunnel.keeper import Status, TunnelKeeper
-from runtime.policies.tunnel.process import Ssh, free_port
-from runtime.policies.tunnel.sentences import explain_forward_refused
 from runtime.policies.tunnel.settings import TunnelSettings
+from runtime.policies.tunnel.ssh_messages import explain_forward_refused
+from runtime.policies.tunnel.ssh_process import Ssh, free_port
 
 _SLACK_S = 3.0  # beyond the keeper's own deadline, whose message is better [s]
 _HEARD_S = 0.3  # time until ssh's end or its messages are known [s]

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
-from runtime.core.machine_names import HostReference
+from runtime.core.host_references import HostReference
 from runtime.core.settings import Settings
 
 # Values must not begin with "-", which ssh would take for an option, nor have a meaning for a shell, which ssh itself

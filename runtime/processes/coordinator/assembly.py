@@ -11,7 +11,7 @@ from runtime.ipc.messages import Event, ReceptionReport
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
 from runtime.kinematics.forward import ChainForward
-from runtime.kinematics.loading import LazyKinematics
+from runtime.kinematics.lazy import LazyKinematics
 from runtime.processes.coordinator.builders import (
     MakePolicy,
     kinematics_compiled,
@@ -27,12 +27,12 @@ from runtime.processes.coordinator.inference.inference import FaultTimeouts, Inf
 from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, StalenessLimits
 from runtime.processes.coordinator.inference.requests import MissBound, PolicyRequests
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.processes.coordinator.inference.worker import Runner
+from runtime.processes.coordinator.inference.runners import Runner
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.manual.targets import Targets
 from runtime.processes.coordinator.operations import SessionActions, SessionComponents
-from runtime.processes.coordinator.preflight_desk import PreflightService
+from runtime.processes.coordinator.preflight_service import PreflightService
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import SessionMachine
 from runtime.processes.coordinator.session.tuning import strategy_of

@@ -70,7 +70,7 @@ def make_policy(
 
 def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpec, Clock], Leader]) -> Policy:
     """Return the policy that is queried while the operator drives the robot."""
-    from runtime.teleoperators.relay import LeaderPolicy, NodeDrivenPolicy
+    from runtime.teleoperators.leader_policy import LeaderPolicy, NodeDrivenPolicy
 
     wanted = spec.deployment.collection
     if wanted is None:

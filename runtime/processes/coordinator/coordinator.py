@@ -29,7 +29,7 @@ from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.lease import Lease
 from runtime.processes.coordinator.manual.manual_control import ManualControl
 from runtime.processes.coordinator.operations import SessionActions
-from runtime.processes.coordinator.preflight_desk import PreflightService
+from runtime.processes.coordinator.preflight_service import PreflightService
 from runtime.processes.coordinator.queries import QUERIES, Queries
 from runtime.processes.coordinator.runs import Runs
 from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine

@@ -26,7 +26,7 @@ from runtime.recording.labels import Label, append_label, latest_label
 from runtime.recording.schema import Schema
 from runtime.station.run import Run
 from runtime.station.spec import StationSpec
-from runtime.teleoperators.relay import LeaderPolicy
+from runtime.teleoperators.leader_policy import LeaderPolicy
 
 _NOT_YET = fixed("collect.not_armed_yet", "nobody has armed it since it was set up")
 _NOT_SET_UP = fixed("collect.not_set_up", "the station is not set up to collect")

@@ -31,7 +31,7 @@ from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.command_journal import CommandJournal
 from runtime.processes.coordinator.coordinator import Coordinator
 from runtime.processes.coordinator.inference.inference import DisplayedChunk
-from runtime.processes.coordinator.inference.worker import ThreadRunner
+from runtime.processes.coordinator.inference.runners import ThreadRunner
 from runtime.processes.coordinator.session.transitions import STOPPING
 
 _REFUSED = Pattern("commands.refused", "{kind} by {who}: refused, {reason}")

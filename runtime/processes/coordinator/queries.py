@@ -7,7 +7,7 @@ from runtime.core.sentences import Pattern
 from runtime.ipc.bus import EventLog
 from runtime.ipc.messages import Ack, Command
 from runtime.processes.coordinator.manual.manual_control import ManualControl
-from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightService
+from runtime.processes.coordinator.preflight_service import PREFLIGHT_QUERIES, PreflightService
 
 _EVENTS_SINCE_NUMBER = Pattern(
     "queries.events_since_number",

@@ -24,7 +24,7 @@ from runtime.ipc.shared_state import SharedState
 from runtime.processes.control.process import make_sink, make_tick
 from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.builders import MakePolicy, make_policy
-from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner
+from runtime.processes.coordinator.inference.runners import LockstepRunner, Runner
 from runtime.processes.guard.process import Guard
 from runtime.processes.media.episode_closing import Close, at_once
 from runtime.processes.media.process import Media, make_recorder

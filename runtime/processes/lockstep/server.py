@@ -24,7 +24,7 @@ from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.session_state import SessionState
 from runtime.processes.control.process import Lateness
 from runtime.processes.coordinator.inference.requests import PolicyResponse
-from runtime.processes.coordinator.inference.worker import DeclaredRunner
+from runtime.processes.coordinator.inference.runners import DeclaredRunner
 from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import EStopServer
 from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment, Peers

@@ -39,10 +39,10 @@ from runtime.ipc.shared_memory import TornReadError
 from runtime.ipc.shared_state import RecorderStage, SharedState
 from runtime.kinematics.forward import ChainForward
 from runtime.processes.child import join_station
-from runtime.processes.media.background import LowPriorityWorker
 from runtime.processes.media.crash_repair import start_repair
 from runtime.processes.media.episode_closing import Close, at_once, in_background
 from runtime.processes.media.export_jobs import ExportQueue
+from runtime.processes.media.low_priority_worker import LowPriorityWorker
 from runtime.processes.media.previews import Previews
 from runtime.processes.media.recorder import ClosedEpisode, DatasetGrid, Recorder
 from runtime.processes.media.unclosed_episodes import UnclosedEpisodes

@@ -153,7 +153,7 @@ def make_source(
     source = build(settings.transport, robot, clock)
     if not settings.cameras:
         return source
-    from runtime.cameras.attaching import attach_cameras
+    from runtime.cameras.attach import attach_cameras
 
     return attach_cameras(source, settings.cameras, clock)
 

@@ -10,7 +10,7 @@ from runtime.core.errors import ConfigurationError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.transports.base import Capabilities
-from runtime.transports.ros.reading import Names
+from runtime.transports.ros.message_reading import Names
 from runtime.transports.ros.source import AcceptanceLimits
 from runtime.transports.ros.topics import CommandTopic, StreamSpec, Target, TopicPlan, Topics
 

@@ -15,13 +15,13 @@ from runtime.core.sentences import Pattern, fixed, series
 from runtime.core.types import Observation
 from runtime.ipc.messages import Event
 from runtime.transports.base import Source
-from runtime.transports.freshness import FROZEN_S
+from runtime.transports.frozen_cameras import FROZEN_S
 from runtime.transports.ros.alignment import Aligned, Alignment, Sample
 from runtime.transports.ros.clock import RosClock
-from runtime.transports.ros.frames import Assembly, MessageReaders, StampedValue
+from runtime.transports.ros.message_reading import Names, UnusableMessage
 from runtime.transports.ros.messages import Message, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality, Topic
-from runtime.transports.ros.reading import Names, UnusableMessage
+from runtime.transports.ros.observation_assembly import Assembly, MessageReaders, StampedValue
 from runtime.transports.ros.topics import StreamSpec
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-// How well two pictures match: the correlation of their grey values at 64 x 48, as evaweb/plans/pictures.py computes it.
+// How well two pictures match: the correlation of their grey values at 64 x 48, as evaweb/plans/image_store.py computes it.
 
 export const WIDTH = 64;
 export const HEIGHT = 48;

@@ -7,7 +7,7 @@ import pytest
 from asgiref.sync import async_to_sync
 from django.test import AsyncClient
 
-from evaweb.episodes import services, verifying
+from evaweb.episodes import services, verification
 from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell
 from evaweb.jobs.models import Job
@@ -52,7 +52,7 @@ def test_damage_is_told_with_its_rows_and_can_be_asked_for(rest, episode, tmp_pa
     assert rest.get("episodes", damaged=True)[1]["total"] == 0
     path = tmp_path / f"episodes/{episode.uuid}/ticks.arrow"
     path.write_bytes(path.read_bytes()[:-100])
-    verifying.record_verification(verify_episode(path.parent))
+    verification.record_verification(verify_episode(path.parent))
     _, found = rest.get("episodes", damaged=True)
     (damage,) = found["items"][0]["damage"]
     assert (damage["file"], damage["text"][:16]) == ("ticks.arrow", "ticks.arrow has ")

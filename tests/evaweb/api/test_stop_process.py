@@ -13,13 +13,13 @@ from django.db import connections
 from django.test import Client
 from django.utils import timezone
 
-from evaweb.api.door import stop_application
+from evaweb.api.stop_gateway import stop_application
 from evaweb.api.tokens import create_token
 from evaweb.credentials import SESSION, credentials
 from evaweb.stations import leases
 from evaweb.stations.models import Command
 from runtime.ipc.session_state import SessionState
-from tests.evaweb.api.test_door import asked, written
+from tests.evaweb.api.test_stop_gateway import asked, written
 from tests.evaweb.noted import wait_for_stop_records
 
 pytestmark = pytest.mark.django_db(transaction=True)

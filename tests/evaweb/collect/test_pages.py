@@ -12,7 +12,7 @@ from django.test import Client
 
 from evaweb.collect import services
 from evaweb.collect.models import CollectSession, Demonstration
-from evaweb.console import changes
+from evaweb.console import change_marks
 from evaweb.console.event_ingest import StationEventIngester, ingest_events
 from evaweb.console.feed import Feeds, History
 from evaweb.jobs.models import Job
@@ -113,11 +113,11 @@ def test_a_task_is_a_text_and_no_markup(
 def test_who_watches_is_told_that_something_has_changed(
     session: CollectSession, demonstrate: Demonstrate, ann: User
 ) -> None:
-    before = changes.change_marks("bench")
+    before = change_marks.change_marks("bench")
     services.set_session_target(user=ann, session=session, target=3)
-    assert changes.changed_names(before, after := changes.change_marks("bench")) == ["collect"]
+    assert change_marks.changed_names(before, after := change_marks.change_marks("bench")) == ["collect"]
     demonstrate("success")
-    assert "collect" in changes.changed_names(after, changes.change_marks("bench"))
+    assert "collect" in change_marks.changed_names(after, change_marks.change_marks("bench"))
 
 
 def test_a_label_comes_from_the_event_log_into_the_row(demonstrate: Demonstrate, data: Path) -> None:

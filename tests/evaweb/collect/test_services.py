@@ -12,7 +12,7 @@ from django.db import IntegrityError, connection, transaction
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
 from evaweb.collect.record import SESSIONS
-from evaweb.datasets import listing
+from evaweb.datasets import episode_list
 from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue
@@ -140,9 +140,9 @@ def test_accepted_episodes_go_to_the_sessions_dataset_in_the_version_that_is_ask
     assert not Job.objects.exclude(error="").exists()
     dataset = open_dataset(data / "datasets" / "cups")
     assert len(dataset.episodes) == 2
-    said = [(row.success, row.result) for row in listing.list_rows("datasets/cups")]
+    said = [(row.success, row.result) for row in episode_list.list_rows("datasets/cups")]
     assert sorted(said) == [(False, "partial"), (True, "success")]  # whichever was written first
-    assert [row.result for row in listing.list_rows("datasets/cups", result="partial")] == ["partial"]
+    assert [row.result for row in episode_list.list_rows("datasets/cups", result="partial")] == ["partial"]
     assert selectors.dataset_of(session=session).version == "v3.0"
     with pytest.raises(Conflict, match="nothing to publish"):
         services.publish_session(user=ann, session=session)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaweb.binary_frames import decode
-from evaweb.console import parts
+from evaweb.console import frame_parts
 from evaweb.console.chunks import GHOSTS, encode_chunk
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.robot_geometry import drawn_robot
@@ -30,7 +30,7 @@ def chunk(count=16, **changes):
 
 
 def shown(content, looks=LOOKS):
-    frame = decode(parts.build_frame([encode_chunk(content, looks, 0.0)], 1, 0.0))
+    frame = decode(frame_parts.build_frame([encode_chunk(content, looks, 0.0)], 1, 0.0))
     return frame, frame.header["streams"]["chunk"]
 
 

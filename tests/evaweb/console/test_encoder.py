@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaweb.binary_frames import decode
-from evaweb.console import parts
+from evaweb.console import frame_parts
 from evaweb.console.encoder import StreamEncoder
 from evaweb.stations.robot_geometry import drawn_robot
 
@@ -15,7 +15,7 @@ Q = np.full(14, 0.1, np.float32)
 
 def encoded(content, robot="agilex_piper", stream="joints"):
     made = StreamEncoder(robot).encode(stream, content)
-    return decode(parts.build_frame(made, 1, 0.0))
+    return decode(frame_parts.build_frame(made, 1, 0.0))
 
 
 def joints(measured=Q, commanded=Q, engaged=True):
@@ -84,7 +84,7 @@ def test_a_robot_is_drawn_in_the_groups_that_its_station_says_it_has():
     assert [part.stream for part in encoder.encode("joints", one)] == ["joints", "recent"]
     encoder.encode("state", {"facts": {"groups": ["right_arm"]}})
     poses = [part for part in encoder.encode("joints", one) if part.stream == "poses"]
-    assert decode(parts.build_frame(poses, 1, 0.0)).array("poses").shape == (2, 10, 16)
+    assert decode(frame_parts.build_frame(poses, 1, 0.0)).array("poses").shape == (2, 10, 16)
     assert encoder.looks is drawn_robot("agilex_piper", ["right_arm"])
 
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from evaweb.console import parts
+from evaweb.console import frame_parts
 from evaweb.console.feed import History, LinkState
 from evaweb.console.mailbox import CREDITS, EVENTS_AT_ONCE, Mailbox
 
@@ -41,7 +41,7 @@ class Page:
 
 
 def part(stream, body):
-    return parts.EncodedPart(stream, (), body, 0.0)
+    return frame_parts.EncodedPart(stream, (), body, 0.0)
 
 
 def history(count, boot="b"):

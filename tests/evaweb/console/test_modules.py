@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaweb.console import parts
+from evaweb.console import frame_parts
 from tests.standing import state_flags
 
 MODULES = Path(__file__).parents[3] / "static" / "console"
@@ -45,12 +45,14 @@ def run(module: str, body: str, given: Any = None) -> Any:
 def test_a_frame_of_the_server_is_read_with_every_number_and_picture() -> None:
     rows = np.arange(14, dtype=np.float32) / 8
     poses = np.arange(2 * 3 * 16, dtype=np.float32).reshape(2, 3, 16)
-    frame = parts.build_frame(
+    frame = frame_parts.build_frame(
         [
-            parts.encode_facts("state", {"state": "running", "nothing": float("nan")}, 1.0),
-            parts.encode_numbers("joints", {"engaged": True}, {"measured": rows, "commanded": -rows}, 1.0),
-            parts.encode_picture("camera/cam_high", b"\xff\xd8jpeg", 1.0),
-            parts.encode_array("poses", poses, 1.0),
+            frame_parts.encode_facts("state", {"state": "running", "nothing": float("nan")}, 1.0),
+            frame_parts.encode_numbers(
+                "joints", {"engaged": True}, {"measured": rows, "commanded": -rows}, 1.0
+            ),
+            frame_parts.encode_picture("camera/cam_high", b"\xff\xd8jpeg", 1.0),
+            frame_parts.encode_array("poses", poses, 1.0),
         ],
         7,
         1.25,

@@ -11,8 +11,13 @@ from twisted.internet.abstract import FileDescriptor
 
 from evaweb.console.quota import AT_ONCE, MessageQuota
 from evaweb.console.reading import AHEAD, STALLED_S, until_read
-from evaweb.console.sockets import _MOST_PARTS, PING, LimitedWebSocket, unsent
 from evaweb.console.turns import TurnScheduler
+from evaweb.console.websocket_limits import (
+    _MOST_PARTS,
+    PING,
+    LimitedWebSocket,
+    unsent,
+)
 
 
 @pytest.fixture
@@ -59,13 +64,20 @@ def test_work_that_fails_or_brings_more_keeps_no_other_waiting(loop):
 def socket(monkeypatch):
     """One that is open, on a clock that stands; `cut` says whether it was cut off."""
     monkeypatch.setattr(
-        "evaweb.console.sockets.WebSocketProtocol.onPing", lambda self, payload: self.heard.append(payload)
+        "evaweb.console.websocket_limits.WebSocketProtocol.onPing",
+        lambda self, payload: self.heard.append(payload),
     )
-    monkeypatch.setattr("evaweb.console.sockets.WebSocketProtocol.onPong", lambda self, payload: None)
-    monkeypatch.setattr("evaweb.console.sockets.WebSocketProtocol.onMessageFrameBegin", lambda self, n: None)
-    monkeypatch.setattr("evaweb.console.sockets.WebSocketProtocol.onMessage", lambda self, *message: None)
     monkeypatch.setattr(
-        "evaweb.console.sockets.WebSocketProtocol.dropConnection",
+        "evaweb.console.websocket_limits.WebSocketProtocol.onPong", lambda self, payload: None
+    )
+    monkeypatch.setattr(
+        "evaweb.console.websocket_limits.WebSocketProtocol.onMessageFrameBegin", lambda self, n: None
+    )
+    monkeypatch.setattr(
+        "evaweb.console.websocket_limits.WebSocketProtocol.onMessage", lambda self, *message: None
+    )
+    monkeypatch.setattr(
+        "evaweb.console.websocket_limits.WebSocketProtocol.dropConnection",
         lambda self, abort: self.cut.append(self.wasNotCleanReason),
     )
     made = LimitedWebSocket()

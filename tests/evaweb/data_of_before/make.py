@@ -20,10 +20,10 @@ from evaweb.collect.record import SESSIONS
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.plans.allocation import allocate_trial
-from evaweb.plans.exchange import export_toml
+from evaweb.plans.toml_exchange import export_toml
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan
-from evaweb.results.ratings import judging
+from evaweb.results.ratings import rating_queue
 from evaweb.reviews import services as reviews
 from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint
@@ -31,7 +31,7 @@ from evaweb.trials.selectors import trial_open
 from runtime.core.types import Result
 from runtime.recording.labels import Label, append_label
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import digests_of, seal_outcome, without_digests, write_outcome
+from runtime.recording.outcome_seal import digests_of, seal_outcome, without_digests, write_outcome
 from tests.evaweb.collect.conftest import collecting as collects
 from tests.evaweb.data_of_before.reading import HERE, answers, restored, rows
 from tests.evaweb.trials import builders
@@ -163,20 +163,20 @@ def _planned(lab):  # noqa: F811
             failure="" if ok else "=dropped",
         )
     for reached in (True, False):
-        handout = judging.next_to_rate(rater).found
+        handout = rating_queue.next_to_rate(rater).found
         assert handout is not None
         ticks = lab.bench.ticks(True, reached, reached)
-        judging.save_rating(
+        rating_queue.save_rating(
             user=rater,
             plan=plan,
             code=handout.code,
             milestones=ticks,
             failure="" if reached else "wölbt sich",
         )
-    pair = judging.next_to_compare(rater).found
+    pair = rating_queue.next_to_compare(rater).found
     assert pair is not None
     codes = {"first": pair.first.code, "second": pair.second.code}
-    judging.save_preference(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
+    rating_queue.save_preference(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
     return text
 
 

@@ -14,7 +14,7 @@ from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs import doorbell
-from evaweb.plans.exchange import import_file
+from evaweb.plans.toml_exchange import import_file
 from evaweb.plans.models import Plan
 from evaweb.results.models import Preference, Rating
 from evaweb.reviews.models import Review, Segment, Standing

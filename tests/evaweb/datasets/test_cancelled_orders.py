@@ -9,8 +9,8 @@ import pytest
 from django.contrib.auth.models import User
 from django.test import Client
 
-from evaweb.datasets import orders
-from evaweb.datasets.finding import dataset_names, overview
+from evaweb.datasets import dataset_orders
+from evaweb.datasets.overview import dataset_names, overview
 from evaweb.episodes.models import Episode
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
@@ -27,7 +27,7 @@ def root(data: Path) -> User:
 
 
 def ordered(root: User, **given: Any) -> Job:
-    job = orders.submit_order(user=root, given=given)
+    job = dataset_orders.submit_order(user=root, given=given)
     services.run_queue("cpu")
     job.refresh_from_db()
     return job
@@ -37,7 +37,7 @@ def test_what_only_administrators_order_only_they_ask_for_again(
     foreign: Foreign, root: User, client: Client
 ) -> None:
     foreign("cups", version="v3.0")
-    job = orders.submit_order(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0]})
+    job = dataset_orders.submit_order(user=root, given={"what": "delete", "dataset": "cups", "episodes": [0]})
     services.cancel(user=root, job=job)
     client.force_login(person("ann", "operator"))
     client.post("/jobs/repeat", {"job": job.pk})

@@ -20,7 +20,7 @@ import robots
 from evaweb.binary_frames import decode
 from evaweb.datasets.importing import import_dataset
 from evaweb.datasets.job_kinds import dataset as run_order
-from evaweb.datasets.on_robot import playable_episode
+from evaweb.datasets.robot_replay import playable_episode
 from evaweb.episodes.job_kinds import preview, publish_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
@@ -39,7 +39,7 @@ from evaweb.stations.models import Station
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError, RecordingError
 from runtime.datasets.consistency import check
-from runtime.datasets.journal import read_finished_episode
+from runtime.datasets.finished_episode import read_finished_episode
 from runtime.datasets.operations import convert
 from runtime.datasets.reader import open_dataset
 from runtime.policies import replay

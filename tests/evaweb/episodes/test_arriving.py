@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from django.db import OperationalError
 
-from evaweb.episodes import arriving, services, verifying
+from evaweb.episodes import arriving, services, verification
 from evaweb.episodes.job_kinds import look_for_arrived
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile
@@ -64,7 +64,7 @@ def test_one_that_is_away_is_what_its_station_said_and_nothing_looks_for_its_fol
     assert may_become_watchable(away)
     assert not unchecked_episodes().exists()
     assert services.request_smoothness(most=9) == 0
-    assert verifying.request_scrub() is None
+    assert verification.request_scrub() is None
     assert reconcile().missing == 0
     assert Episode.objects.get().status == EpisodeStatus.FINISHED
     assert not Job.objects.exists()

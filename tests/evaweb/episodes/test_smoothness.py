@@ -10,8 +10,8 @@ import pytest
 
 from evaweb.episodes import services
 from evaweb.episodes.job_kinds import find_unmeasured_episodes
+from evaweb.episodes.manifest_robot import robot_for
 from evaweb.episodes.models import Episode
-from evaweb.episodes.robot import robot_for
 from evaweb.episodes.smoothness import smoothness_in, smoothness_of
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue

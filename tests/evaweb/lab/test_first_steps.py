@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from evaweb.lab import deployments, first_steps, seed
+from evaweb.lab import demo_rows, deployments, first_steps
 from evaweb.lab.deployments import Standing
 from evaweb.lab.first_steps import Progress, walk
 from evaweb.plans.models import CameraCheck
@@ -54,7 +54,9 @@ def test_an_empty_lab_begins_with_a_station_and_everything_else_comes_later():
 def test_each_step_is_done_by_what_the_lab_has(monkeypatch, alma):
     deployments.write_simulated(name="bench-2", robot="agilex_piper")
     assert now() == "station"  # the database does not know it yet
-    station = seed.station_registered(name="bench-2", robot="agilex_piper", deployment="d", simulated=True)
+    station = demo_rows.station_registered(
+        name="bench-2", robot="agilex_piper", deployment="d", simulated=True
+    )
     assert now() == "station"
     monkeypatch.setattr(first_steps, "_snapshot", lambda station: {"state": "idle"})
     assert now() == "cameras"
@@ -66,7 +68,7 @@ def test_each_step_is_done_by_what_the_lab_has(monkeypatch, alma):
     assert now() == "scene"
     scene = first_steps.starter_scene()
     assert now() == "trial"
-    checkpoint = seed.demo_checkpoint(name="c", description="", policy={"url": "ws://127.0.0.1:1"})
+    checkpoint = demo_rows.demo_checkpoint(name="c", description="", policy={"url": "ws://127.0.0.1:1"})
     bench = builders.TrialBench(station, scene, checkpoint, builders.user("ann"))
     trial = bench.ended()
     assert now() == "trial"
@@ -83,7 +85,7 @@ def test_a_scene_without_a_milestone_is_none_yet(alma):
 
 def test_the_newest_station_is_walked_and_another_one_by_its_name():
     for name in ("bench-1", "bench-2"):
-        seed.station_registered(name=name, robot="ur5e", deployment="", simulated=False)
+        demo_rows.station_registered(name=name, robot="ur5e", deployment="", simulated=False)
     assert walk().name == "bench-2"
     assert walk(name="bench-1").name == "bench-1"
     assert [one.name for one in walk().others] == ["bench-1"]
@@ -209,7 +211,7 @@ def test_a_camera_that_has_another_ones_name_is_exchanged_in_the_deployment(lea,
 
 
 def test_a_station_that_shows_no_picture_is_not_confirmed(lea):
-    seed.station_registered(name="bench-1", robot="ur5e", deployment="", simulated=True)
+    demo_rows.station_registered(name="bench-1", robot="ur5e", deployment="", simulated=True)
     assert lea.post("/first-steps/bench-1/cameras", {}).status_code >= 400
     assert not CameraCheck.objects.exists()
     assert lea.get("/first-steps/bench-1/cameras/nothing.jpg").status_code == 404

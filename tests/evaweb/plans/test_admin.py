@@ -6,9 +6,9 @@ from django.forms import JSONField
 from django.urls import reverse
 
 from evaweb.plans.counting import ENDS
-from evaweb.plans.exchange import export_toml
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan
+from evaweb.plans.toml_exchange import export_toml
 from evaweb.trials.admin import Table
 from tests.evaweb.trials import builders
 

@@ -5,7 +5,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.plans import bench_checks as looking
-from evaweb.plans import pictures
+from evaweb.plans import image_store
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference
 from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.trials import services as trials
@@ -38,21 +38,21 @@ def plan(draft, owner):
 
 
 def test_a_match_is_one_for_the_same_and_falls_with_what_differs():
-    assert pictures.image_match(jpeg(1), jpeg(1)) == 1.0
-    assert 0.9 < pictures.image_match(jpeg(1), jpeg(1, noise=40)) < 1.0
-    assert pictures.image_match(jpeg(1), jpeg(2)) < 0.6
-    flat = jpeg(1).__class__(pictures.simplejpeg.encode_jpeg(pictures.np.full((48, 64, 3), 90, "u1")))
-    assert pictures.image_match(flat, jpeg(1)) == 0.0
+    assert image_store.image_match(jpeg(1), jpeg(1)) == 1.0
+    assert 0.9 < image_store.image_match(jpeg(1), jpeg(1, noise=40)) < 1.0
+    assert image_store.image_match(jpeg(1), jpeg(2)) < 0.6
+    flat = jpeg(1).__class__(image_store.simplejpeg.encode_jpeg(image_store.np.full((48, 64, 3), 90, "u1")))
+    assert image_store.image_match(flat, jpeg(1)) == 0.0
     with pytest.raises(EvaError, match="no JPEG"):
-        pictures.image_match(b"nothing", jpeg(1))
+        image_store.image_match(b"nothing", jpeg(1))
 
 
 def test_a_picture_is_kept_once_under_its_digest():
-    name = pictures.store_image(jpeg(3))
-    assert pictures.store_image(jpeg(3)) == name
-    assert pictures.load_image(name) == jpeg(3)
+    name = image_store.store_image(jpeg(3))
+    assert image_store.store_image(jpeg(3)) == name
+    assert image_store.load_image(name) == jpeg(3)
     with pytest.raises(NotFound, match="is not on this disk"):
-        pictures.load_image("0" * 64)
+        image_store.load_image("0" * 64)
 
 
 def test_no_trial_is_handed_out_before_the_cameras_were_looked_at(bench, plan, shown):
@@ -93,8 +93,8 @@ def test_a_bench_that_does_not_match_needs_a_reason_and_both_pictures_are_kept(b
     row = Achieved.objects.filter(trial=trial, camera="cam_high").latest("pk")
     assert row.override == "the lamp is another one"
     assert row.match < 0.8
-    assert pictures.load_image(row.picture) == jpeg(77)
-    assert pictures.load_image(row.reference.picture) == jpeg(0)
+    assert image_store.load_image(row.picture) == jpeg(77)
+    assert image_store.load_image(row.reference.picture) == jpeg(0)
 
 
 def test_after_the_reveal_nothing_is_voided(bench, plan, owner, shown):
@@ -144,16 +144,16 @@ def high(trial):
 
 def without_block(picture):
     """The same picture but for the region, which is of one grey."""
-    pixels = pictures.simplejpeg.decode_jpeg(picture)
+    pixels = image_store.simplejpeg.decode_jpeg(picture)
     pixels[78:166, 76:164] = 128
-    return pictures.simplejpeg.encode_jpeg(pixels, quality=85)
+    return image_store.simplejpeg.encode_jpeg(pixels, quality=85)
 
 
 def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, shown, client):
     user = bench.operator
     looking.save_regions(user=user, reference=high(laid), drawn=[CORNER, CORNER | {"name": "cup", "x": 0.7}])
     shown["cam_high"] = without_block(shown["cam_high"])
-    assert pictures.image_match(jpeg(0), shown["cam_high"]) > 0.8  # the whole picture sees nothing of it
+    assert image_store.image_match(jpeg(0), shown["cam_high"]) > 0.8  # the whole picture sees nothing of it
     with pytest.raises(
         Conflict, match=r"cam_high, block 0\.\d\d \(not recognised here or nearby\), wanted 0\.80"
     ):
@@ -161,7 +161,7 @@ def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, sh
     looking.record_layout(user=user, trial=laid, override="the block is lost")
     row = Achieved.objects.get(trial=laid, camera="cam_high")
     assert [(one["name"], one["match"] < 0.8) for one in row.regions] == [("block", True), ("cup", False)]
-    assert row.match == pictures.image_match(jpeg(0), shown["cam_high"])
+    assert row.match == image_store.image_match(jpeg(0), shown["cam_high"])
     assert row.reference.regions[0] == CORNER
     assert Achieved.objects.get(trial=laid, camera="cam_left_wrist").regions == []
     client.force_login(user)
@@ -171,10 +171,10 @@ def test_the_least_match_is_of_the_worst_region_and_each_is_kept(bench, laid, sh
 
 def test_regions_that_match_let_a_run_begin_although_the_rest_of_the_picture_is_another(bench, laid, shown):
     looking.save_regions(user=bench.operator, reference=high(laid), drawn=[CORNER])
-    pixels = pictures.simplejpeg.decode_jpeg(jpeg(0))
+    pixels = image_store.simplejpeg.decode_jpeg(jpeg(0))
     pixels[:, 220:] = 255 - pixels[:, 220:]  # further away than anything that a region looks at
-    shown["cam_high"] = pictures.simplejpeg.encode_jpeg(pixels, quality=85)
-    assert pictures.image_match(jpeg(0), shown["cam_high"]) < 0.8
+    shown["cam_high"] = image_store.simplejpeg.encode_jpeg(pixels, quality=85)
+    assert image_store.image_match(jpeg(0), shown["cam_high"]) < 0.8
     assert len(looking.record_layout(user=bench.operator, trial=laid)) == 3
 
 

@@ -7,9 +7,9 @@ import pytest
 from evaweb.errors import Conflict
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.draft_checks import problems
-from evaweb.plans.exchange import export_toml, import_file
 from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan
+from evaweb.plans.toml_exchange import export_toml, import_file
 from evaweb.results.reports.recompute.scenes import ending_faults, scene_faults
 from evaweb.results.reports.tables import outcome_pages, score_pages
 from evaweb.tabular_export import plain

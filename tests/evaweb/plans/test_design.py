@@ -9,13 +9,13 @@ from evaweb.plans import services
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.design import current_pairs, dropped_of, findings_of, frozen_design
-from evaweb.plans.documents import UnevenError, document_of
+from evaweb.plans.frozen_document import UnevenError, document_of
 from evaweb.plans.models import Plan, PlanState
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
 from evaweb.results.analysis.caching import cached_analysis, corrected_of
 from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.presentation.alternatives import headline_alternatives
 from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.would_be import headline_alternatives
 from evaweb.stations.models import Station
 from evaweb.statistics.designs import evaluate_design, in_blocks
 from evaweb.trials import services as trials

@@ -9,7 +9,7 @@ from evaweb.episodes.selectors import episode_get, episode_list, tag_counts
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
 from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
-from evaweb.results.ratings import judging
+from evaweb.results.ratings import rating_queue
 from evaweb.reviews.services import add_review, save_segment, tags_change
 from evaweb.trials import services
 from tests.evaweb.trials import builders
@@ -85,7 +85,7 @@ def test_whoever_may_be_asked_to_rate_it_again_reads_their_own_first(bench, draf
     services.score_trial(user=bench.operator, trial=made, milestones=bench.ticks(True, False, False))
     vic = builders.user("vic", "viewer")
     assert [words(user, made.episode)[0] for user in (bob, vic)] == [[], ["it slips"]]
-    judging.Rating.objects.create(
+    rating_queue.Rating.objects.create(
         trial=made, rater=bob, success=False, score=0.25, milestones=[], blind=False
     )
     assert words(bob, made.episode)[0] == ["it slips"]

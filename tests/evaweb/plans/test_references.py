@@ -12,10 +12,10 @@ from django.core.management import call_command
 from django.urls import reverse
 
 from evaweb.errors import EvaError
-from evaweb.plans import pictures, references
-from evaweb.plans.exchange import export_archive, export_toml, import_file
+from evaweb.plans import image_store, references
 from evaweb.plans.models import Reference
 from evaweb.plans.references import unpacked
+from evaweb.plans.toml_exchange import export_archive, export_toml, import_file
 from tests.evaweb.plans.lab import jpeg
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import without_triggers
@@ -36,7 +36,7 @@ def taken(bench, owner):
         ("left", 3, first),
         ("top", 4, None),
     ):
-        name = pictures.store_image(jpeg(seed))
+        name = image_store.store_image(jpeg(seed))
         Reference.objects.create(
             station=bench.station, position=position, camera=camera, picture=name, by=owner
         )
@@ -85,7 +85,7 @@ def test_another_lab_gets_them_with_the_archive(taken, admin, settings, tmp_path
     line = f"reference pictures of scene {taken.scene.name}: "
     assert take(content, admin) == [f"scene {taken.scene.name}: the same", line + "2 new"]
     found = {row.camera: row for row in Reference.objects.all()}
-    assert pictures.load_image(found["top"].picture) == jpeg(2)
+    assert image_store.load_image(found["top"].picture) == jpeg(2)
     assert (found["top"].by, found["top"].position.number) == (admin, 1)
     assert take(content, admin)[1] == line + "2 the same"
     assert Reference.objects.count() == 2
@@ -93,7 +93,7 @@ def test_another_lab_gets_them_with_the_archive(taken, admin, settings, tmp_path
 
 def test_what_a_lab_has_itself_stays(taken, admin):
     content = export_archive(scenes=[taken.scene])
-    own = pictures.store_image(jpeg(9))
+    own = image_store.store_image(jpeg(9))
     first = taken.scene.positions.get(number=1)
     Reference.objects.create(station=taken.station, position=first, camera="top", picture=own, by=admin)
     assert take(content, admin)[1].endswith(": 1 the same, 1 left out, because this lab has its own")

@@ -10,7 +10,7 @@ from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import allocate_trial, plan_progress, release_slots
 from evaweb.plans.blinding_rules import is_sealed_for, record_unblinding
 from evaweb.plans.commitment import make_commitment, schedule_digest
-from evaweb.plans.documents import conditions_of, scene_of
+from evaweb.plans.frozen_document import conditions_of, scene_of
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import schedule
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan

@@ -5,11 +5,11 @@ import pytest
 from evaweb.errors import Conflict
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.design import planned
-from evaweb.plans.documents import document_of
 from evaweb.plans.draft_checks import problems
-from evaweb.plans.exchange import export_toml, import_file
+from evaweb.plans.frozen_document import document_of
 from evaweb.plans.models import Plan
 from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
+from evaweb.plans.toml_exchange import export_toml, import_file
 from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.trials import services

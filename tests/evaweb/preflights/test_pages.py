@@ -12,7 +12,7 @@ from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan, reveal_plan
 from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight
-from evaweb.preflights.reading import STAGES, time_since, view_report
+from evaweb.preflights.report_view import STAGES, time_since, view_report
 from evaweb.preflights.services import start_preflight
 from evaweb.trials.models import Checkpoint
 from runtime.preflight.verdict import PreflightStage

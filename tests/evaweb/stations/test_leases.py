@@ -11,7 +11,7 @@ from django.utils import timezone
 
 from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.stations import leases
-from evaweb.stations.holders import holder_display_name
+from evaweb.stations.lease_holders import holder_display_name
 from evaweb.stations.models import Lease, LeaseRequest
 from evaweb.stations.runtime_client import connection_to
 from evaweb.stations.selectors import lease_open, request_list

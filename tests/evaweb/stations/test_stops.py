@@ -6,7 +6,7 @@ from uuid import uuid4
 import pytest
 
 from evaweb.stations import stops
-from evaweb.stations.holders import with_display_names
+from evaweb.stations.lease_holders import with_display_names
 from evaweb.stations.models import CommandStatus
 from evaweb.stations.runtime_client import StationConnection
 from evaweb.stations.stops import HARDWARE_STOP

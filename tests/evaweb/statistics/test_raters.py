@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.progress import funnel
+from evaweb.statistics.milestone_funnel import funnel
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha, weighted_kappa
 
 RATED = st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1, max_size=40)

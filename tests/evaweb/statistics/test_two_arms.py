@@ -13,7 +13,12 @@ from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.difference import barnard, newcombe, probability_better
 from evaweb.statistics.paired import mcnemar, over_conditions
 from evaweb.statistics.proportions import posterior
-from evaweb.statistics.strata import StratumTable, exact_within, interaction, mantel_haenszel
+from evaweb.statistics.stratified import (
+    StratumTable,
+    exact_within,
+    interaction,
+    mantel_haenszel,
+)
 from tests.examples import some
 
 COUNTS = st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n)))

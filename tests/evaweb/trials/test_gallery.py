@@ -13,7 +13,7 @@ from evaweb.trials.clips import clip_of
 from evaweb.trials.gallery import FailureFilters, failed_list, failure_groups, shown_group
 from evaweb.trials.models import Checkpoint, FailureTerm, Trial
 from evaweb.trials.selectors import TrialFilters
-from runtime.datasets.pictures import VideoFrames
+from runtime.datasets.video_frames import VideoFrames
 from tests.evaweb.trials import builders
 from tests.runtime.datasets.small import write_video
 

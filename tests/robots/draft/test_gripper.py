@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from robots import load_robot, shapes, urdf
-from robots.draft.anatomy import guess_groups
 from robots.draft.geometry import corners
 from robots.draft.gripper import GripperDraft, end_link, guess_gripper
+from robots.draft.group_guessing import guess_groups
 from robots.rotations import matrix_of_quaternion
 from tests.robots.draft.urdfs import BOX, arm, base, jaws, joint, link, single, write
 

@@ -11,7 +11,7 @@ import pytest
 
 from runtime.cameras import mjpeg, rtsp
 from runtime.cameras.base import CameraCondition
-from runtime.cameras.live import LiveCamera
+from runtime.cameras.live_camera import LiveCamera
 from runtime.core.clock import MonotonicClock
 from runtime.sim.camera_server import CameraServer
 from runtime.sim.mjpeg_server import MjpegServer

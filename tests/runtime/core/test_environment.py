@@ -16,7 +16,7 @@ from runtime.core.environment import (
     without_web_secrets,
 )
 from runtime.core.errors import ConfigurationError, RuntimeFault
-from runtime.policies.tunnel.process import Ssh
+from runtime.policies.tunnel.ssh_process import Ssh
 from runtime.preflight.__main__ import _asked_for
 from runtime.station import preflight_child as child
 from tests.processes import PATIENCE_S, eventually

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from runtime.core.errors import RecordingError
 from runtime.datasets.__main__ import main
 from runtime.datasets.consistency import check, check_with_remarks, is_rounding_error
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.datasets.rows import read_rows, write_table
 from tests.runtime.datasets.small import record, write_video
 

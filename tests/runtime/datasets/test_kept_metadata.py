@@ -13,9 +13,9 @@ import pytest
 from runtime.core.errors import RecordingError
 from runtime.datasets import parquet_lists
 from runtime.datasets.consistency import check
-from runtime.datasets.identities import copy_with_uuids
+from runtime.datasets.episode_uuids import copy_with_uuids
 from runtime.datasets.operations import convert, delete, merge, split
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.datasets.reader import open_dataset
 from runtime.datasets.splits import episodes_of, written
 from tests.runtime.datasets.foreign import Plan, write

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from runtime.datasets.operations import convert, delete, merge
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.datasets.reader import open_dataset
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import picture, record, row

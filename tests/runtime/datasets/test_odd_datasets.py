@@ -20,12 +20,12 @@ from PIL import Image
 from runtime.core.errors import RecordingError
 from runtime.datasets.catalog import Catalog
 from runtime.datasets.consistency import check
-from runtime.datasets.cut import encode_segment
 from runtime.datasets.entries import Span
 from runtime.datasets.operations import convert, delete
-from runtime.datasets.pictures import StoredImages
 from runtime.datasets.reader import open_dataset
 from runtime.datasets.stats import video_statistic
+from runtime.datasets.video_frames import StoredImages
+from runtime.datasets.video_segments import encode_segment
 from tests.runtime.datasets.foreign import Plan, write
 from tests.runtime.datasets.small import HEIGHT, WIDTH, seen, write_video
 

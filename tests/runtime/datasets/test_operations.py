@@ -19,9 +19,9 @@ from runtime.core.errors import RecordingError
 from runtime.datasets import operations, staging
 from runtime.datasets.consistency import check
 from runtime.datasets.operations import convert, delete, merge, repair, split
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.datasets.reader import open_dataset
-from runtime.datasets.sides import attach_sidecar, sidecar_paths
+from runtime.datasets.sidecars import attach_sidecar, sidecar_paths
 from tests.runtime.datasets.foreign import Plan, column, shown, write
 from tests.runtime.datasets.small import record, seen
 

@@ -8,8 +8,8 @@ import av
 import pytest
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.pictures import VideoFrames
 from runtime.datasets.remux import VideoFacts, cut, remux
+from runtime.datasets.video_frames import VideoFrames
 from tests.runtime.datasets.small import record, seen, write_video
 
 

@@ -21,8 +21,8 @@ from robots.rotations import transform_of
 from runtime.kinematics import kernel_cache
 from runtime.kinematics.base import IkFlag, IkResult, KinematicsError
 from runtime.kinematics.compiled import CompiledKinematics, Config, build
-from runtime.kinematics.kernels.chains import compute_poses
-from runtime.kinematics.kernels.chunks import solve_chunk
+from runtime.kinematics.kernels.chunk_solver import solve_chunk
+from runtime.kinematics.kernels.forward_kinematics import compute_poses
 from tests.examples import some
 from tests.runtime.kinematics.crane import crane
 from tests.sources import ROOT
@@ -459,7 +459,7 @@ def test_without_a_folder_to_write_kernels_are_kept_in_memory_and_that_is_said(t
     code = """if True:
         import numpy as np, robots
         from runtime.kinematics.links import LinkPoses
-        from runtime.kinematics.kernels.compiling import CACHE
+        from runtime.kinematics.kernels.compilation import CACHE
         print(CACHE, LinkPoses(robots.Body(robots.load_robot("agilex_piper"))).poses(np.zeros(14)).shape[1:])
     """
     done = python(code, NUMBA_CACHE_DIR=str(file / "below"))

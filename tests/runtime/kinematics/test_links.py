@@ -7,7 +7,7 @@ import pytest
 
 import robots
 from runtime.kinematics.base import KinematicsError
-from runtime.kinematics.kernels.bodies import compute_link_poses
+from runtime.kinematics.kernels.link_poses import compute_link_poses
 from runtime.kinematics.links import LinkPoses
 
 

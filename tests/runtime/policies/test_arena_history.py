@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runtime.core.types import Observation
-from runtime.policies.arena.history import History
+from runtime.policies.arena.frame_history import History
 from tests.runtime.policies.peers import FRANKA, seen
 
 STEPS = (23, 16, 8, 0)

@@ -32,8 +32,8 @@ from runtime.core.errors import (
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Conditioning, Observation
 from runtime.policies import openpi
-from runtime.policies.link import WebsocketLink, error_headline
 from runtime.policies.openpi import Config, OpenpiPolicy
+from runtime.policies.websocket_link import WebsocketLink, error_headline
 from runtime.sim.faults import NONE, TOO_LARGE, Fault
 from runtime.sim.in_poses import PoseScript
 from runtime.sim.openpi_server import Behaviour, OpenpiServer

@@ -13,7 +13,7 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Observation
-from runtime.datasets.journal import read_finished_episode
+from runtime.datasets.finished_episode import read_finished_episode
 from runtime.datasets.mapping import ColumnMapping
 from runtime.policies import replay
 from runtime.policies.replay import Config, ReplayPolicy

@@ -40,7 +40,7 @@ def recorded(station: Station, root: Path) -> tuple[Path, np.ndarray]:
 
 
 def set_up(folder: Path) -> dict[str, Any]:
-    """What evaweb.datasets.on_robot asks for."""
+    """What evaweb.datasets.robot_replay asks for."""
     policy = {"kind": "replay", "path": str(folder), "episode": 0, "space": "joint", "horizon": 30}
     return {"policy": policy, "strategy": {"kind": "naive", "inference_rate": 5.0}}
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from robots import Robot
 from runtime.config import loader
-from runtime.preflight.course import PreflightRunner
 from runtime.preflight.report import Report
+from runtime.preflight.runner import PreflightRunner
 from runtime.sim.faults import NONE, Fault
 from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec

@@ -19,7 +19,7 @@ from runtime.config.loader import server_address
 from runtime.core import msgpack_arrays
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.command_arguments import PreflightRequest
-from runtime.policies.link import CLOSING, wait_closed
+from runtime.policies.websocket_link import CLOSING, wait_closed
 from runtime.station import preflight_child as module
 from runtime.station.preflight_child import Preflights
 from tests.processes import PATIENCE_S, eventually

@@ -10,7 +10,7 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import RuntimeFault
 from runtime.ipc.messages import Command, Event
 from runtime.ipc.session_state import SessionState
-from runtime.processes.coordinator.preflight_desk import PREFLIGHT_QUERIES, PreflightService
+from runtime.processes.coordinator.preflight_service import PREFLIGHT_QUERIES, PreflightService
 from runtime.station.preflight_child import PreflightRun
 from tests.runtime.lockstep_station import Station, stubbed
 from tests.runtime.preflight.bench import LEROBOT, WIRES, planned

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from runtime.config.loader import server_address
-from runtime.policies.tunnel.process import free_port
-from runtime.preflight.course import PreflightRunner
+from runtime.policies.tunnel.ssh_process import free_port
+from runtime.preflight.runner import PreflightRunner
 from runtime.station.preflight_child import default_deadline
 from tests.processes import joined
 from tests.runtime.preflight.bench import WIRES, planned, served

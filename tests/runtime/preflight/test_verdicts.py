@@ -11,7 +11,7 @@ import pytest
 from websockets.sync.server import serve
 
 from runtime.core.errors import PolicyError, PolicyLostError, RuntimeFault, SetupError
-from runtime.preflight.course import PreflightRunner
+from runtime.preflight.runner import PreflightRunner
 from runtime.preflight.verdict import PreflightStage, PreflightVerdict, stage_of, verdict_of
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.runtime.policies.peers import PIPER

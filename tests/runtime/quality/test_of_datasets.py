@@ -11,7 +11,7 @@ import pytest
 
 from runtime.core.errors import RecordingError
 from runtime.datasets.operations import convert
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.quality.__main__ import main
 from runtime.quality.inspection import check_dataset_episode, check_episode
 from tests.runtime.quality import built

@@ -13,7 +13,7 @@ import numpy as np
 
 from runtime.recording.base import ExecutedTick, RawChunk, Row
 from runtime.recording.layout import Layout
-from runtime.recording.sealing import (
+from runtime.recording.outcome_seal import (
     OUTCOME,
     OUTCOME_COPY,
     digests_of,

@@ -487,7 +487,7 @@ def test_an_outcome_that_alone_finds_no_room_is_written_once_there_is_some(
     def full(path: Path, data: bytes) -> None:
         raise DiskFullError(f"disk full while writing {path}")
 
-    monkeypatch.setattr("runtime.recording.sealing.write_atomic", full)
+    monkeypatch.setattr("runtime.recording.outcome_seal.write_atomic", full)
     with pytest.raises(UnclosedError, match=r"disk full while writing .*sealed\.json") as waits:
         journal.end(FINISHED)
     monkeypatch.undo()

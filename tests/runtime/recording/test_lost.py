@@ -15,20 +15,20 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from runtime.core.errors import RecordingError
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.recording.__main__ import main
 from runtime.recording.base import Outcome
+from runtime.recording.damage_marks import mark_file
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.export import write_export
 from runtime.recording.files import write_atomic
+from runtime.recording.integrity import UNSEALED, DamagedError
 from runtime.recording.labels import Label, append_label
-from runtime.recording.marks import mark_file
+from runtime.recording.outcome_seal import OUTCOME, OUTCOME_COPY, read_outcome
 from runtime.recording.quarantine import marked_damage, update_mark
 from runtime.recording.repair import repair
 from runtime.recording.scrub import require_intact, verify_episode
-from runtime.recording.sealing import OUTCOME, OUTCOME_COPY, read_outcome
 from runtime.recording.tables import SCHEMAS
-from runtime.recording.verdict import UNSEALED, DamagedError
 from tests.examples import some
 
 from .samples import CAMERAS, SETTINGS, chunk, manifest, resealed, row, tick, unended, unsealed

@@ -25,20 +25,26 @@ from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError, RecordingError
 from runtime.datasets.__main__ import main as datasets
 from runtime.datasets.importing import SourceRobot, import_episode
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.datasets.reader import Dataset, open_dataset
 from runtime.policies.replay import Config, ReplayPolicy
 from runtime.recording.__main__ import main
 from runtime.recording.base import ExecutedTick, Outcome, RawChunk
 from runtime.recording.episode import EpisodeJournal
+from runtime.recording.integrity import UNSEALED, DamagedError
 from runtime.recording.layout import Layout
+from runtime.recording.outcome_seal import (
+    DIGESTS,
+    SEAL,
+    digest_of,
+    digests_of,
+    read_outcome,
+)
 from runtime.recording.quarantine import marked_damage, update_mark
 from runtime.recording.repair import PLAN, repair, repair_all
 from runtime.recording.scrub import verify_episode
-from runtime.recording.sealing import DIGESTS, SEAL, digest_of, digests_of, read_outcome
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, read_table
-from runtime.recording.verdict import UNSEALED, DamagedError
 from tests.processes import PATIENCE_S
 from tests.runtime.datasets.small import manifest, robot, row
 

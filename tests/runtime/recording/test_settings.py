@@ -1,7 +1,7 @@
 import pytest
 
 from runtime.core.errors import ConfigurationError
-from runtime.recording import trial
+from runtime.recording import encoder_check
 from runtime.recording.codecs import CODECS
 from runtime.recording.settings import RecordingSettings
 
@@ -66,14 +66,14 @@ def test_an_encoder_that_this_machine_lacks_is_named_with_those_that_it_has(
     def create(name: str, mode: str) -> object:
         raise ValueError(f"no such codec {name!r}")
 
-    trial.require_encoder(RecordingSettings())
-    real = trial.av.CodecContext.create
+    encoder_check.require_encoder(RecordingSettings())
+    real = encoder_check.av.CodecContext.create
     monkeypatch.setattr(
-        trial.av.CodecContext,
+        encoder_check.av.CodecContext,
         "create",
         lambda name, mode: real(name, mode) if name == "libx264" else create(name, mode),
     )
     with pytest.raises(
         ConfigurationError, match=r"recording.codec = 'libx265' does not work .*allowed here: libx264$"
     ):
-        trial.require_encoder(RecordingSettings(codec="libx265"))
+        encoder_check.require_encoder(RecordingSettings(codec="libx265"))

@@ -9,12 +9,12 @@ import pytest
 import zmq
 
 from runtime.datasets.remux import remux
-from runtime.recording.backlog import RUN, encode_count
 from runtime.recording.codecs import CODECS, CodecName
+from runtime.recording.encoder_check import is_encoder_usable
+from runtime.recording.encoder_queue import RUN, encode_count
 from runtime.recording.files import AppendFile
 from runtime.recording.fragments import count_frames
 from runtime.recording.settings import RecordingSettings
-from runtime.recording.trial import is_encoder_usable
 from runtime.recording.video import FragmentedVideo
 
 from .samples import HEIGHT, SETTINGS, WIDTH, decoded, number_of, numbered, numbers

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from runtime.cameras import mjpeg, rtsp
-from runtime.cameras.feed import VideoStream
+from runtime.cameras.video_stream import VideoStream
 from runtime.sim.camera import main
 from runtime.sim.camera_server import FAULTS, picture
 from runtime.sim.mjpeg_server import MjpegServer

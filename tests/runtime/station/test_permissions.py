@@ -6,7 +6,7 @@ import pytest
 
 from runtime.config.loader import resolve_deployment
 from runtime.core.errors import RuntimeFault
-from runtime.core.machine_names import HostReference, find_host_references
+from runtime.core.host_references import HostReference, find_host_references
 from runtime.core.plugins import variants
 from runtime.core.settings import Settings
 from runtime.ipc.messages import Command

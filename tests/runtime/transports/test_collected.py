@@ -22,7 +22,7 @@ from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.station.checks import check_deployment
 from runtime.transports import ros1, ros2
-from runtime.transports.ros import cdr, packed
+from runtime.transports.ros import cdr, ros1_serialization
 from runtime.transports.ros.messages import JointState, Wire
 from runtime.transports.ros.middleware import SENSOR_QUALITY, Middleware, Topic
 from tests.processes import PATIENCE_S
@@ -232,7 +232,7 @@ def test_over_ros_1_a_leader_is_relayed(
 ) -> None:
     start("runtime.sim.ros1_node", "--robot", "agilex_piper", "--master", ros_master.uri, *SMALL)
     link = ros1.Link(master=ros_master.uri)
-    with Waving("agilex_piper", lambda: ros1.middleware(link, "leader"), packed) as leader:
+    with Waving("agilex_piper", lambda: ros1.middleware(link, "leader"), ros1_serialization) as leader:
         collection = led("ros1", leader, master=ros_master.uri)
         transport = {"kind": "ros1", "master": ros_master.uri}
         moved(demonstration(tmp_path, monkeypatch, "agilex_piper", transport, collection))

@@ -10,7 +10,7 @@ import pytest
 
 from runtime.config import loader
 from runtime.core.errors import TransportError
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.datasets.reader import open_dataset
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import lockstep
@@ -58,7 +58,7 @@ def stacked(table: Any, name: str) -> np.ndarray:
 def played(episode: Episode) -> dict[str, list[int]]:
     numbers = {}
     for camera, path in episode.videos.items():
-        from runtime.datasets.pictures import VideoFrames
+        from runtime.datasets.video_frames import VideoFrames
 
         with VideoFrames(path) as pictures:
             numbers[camera] = [seen(pictures[k]) for k in range(episode.frames)]

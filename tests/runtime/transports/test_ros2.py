@@ -19,7 +19,7 @@ from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.types import Observation, RobotCommand
 from runtime.transports import ros2
-from runtime.transports.ros import rcl
+from runtime.transports.ros import rclpy_middleware
 from runtime.transports.ros.middleware import Quality
 from runtime.transports.ros.source import RosSource
 from runtime.transports.ros.topics import GroupTopics, Topics
@@ -253,4 +253,4 @@ def test_an_absent_middleware_is_an_error_that_says_what_to_install(monkeypatch:
     ):
         ros2.capabilities(ros2.Config(middleware="rclpy", insecure_link=True))
     with pytest.raises(SetupError, match="source its"):
-        rcl.RclMiddleware(0, "eva_web")
+        rclpy_middleware.RclMiddleware(0, "eva_web")

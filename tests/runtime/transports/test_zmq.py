@@ -567,7 +567,7 @@ def test_a_picture_that_does_not_change_keeps_its_time_while_all_else_goes_on(no
 
 
 def test_a_frozen_camera_is_a_fault_with_its_name(node: Node, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.transports.freshness.FROZEN_S", 0.05)
+    monkeypatch.setattr("runtime.transports.frozen_cameras.FROZEN_S", 0.05)
     with listening(node) as source:
         joined(node, source)
         mark = 0

@@ -40,9 +40,9 @@ class Command(BaseCommand):
         lifeline: bool,
         **options: Any,
     ) -> None:
-        from evaweb.api.door import stop_application  # imported here, after the models are loaded
+        from evaweb.api.stop_gateway import stop_application  # imported here, after the models are loaded
         from evaweb.console import server
-        from evaweb.console.arrivals import StopRequest
+        from evaweb.console.connection_limits import StopRequest
         from evaweb.listening import PortTaken, open_listener
         from evaweb.stop_port import StopPort
 

@@ -10,9 +10,9 @@ from uuid import UUID
 from django.core.management.base import BaseCommand, CommandError
 
 from evaweb.datasets import dataset_jobs
-from evaweb.datasets.finding import folder_named, overviews
+from evaweb.datasets.dataset_orders import full_name
 from evaweb.datasets.importing import import_dataset
-from evaweb.datasets.orders import full_name
+from evaweb.datasets.overview import folder_named, overviews
 from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir
 from evaweb.episodes.job_kinds import publish_episode

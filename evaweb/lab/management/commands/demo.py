@@ -17,15 +17,15 @@ from django.core.management.base import BaseCommand, CommandError
 import robots
 from evaweb.binary_frames import to_json_value
 from evaweb.errors import EvaError
-from evaweb.lab import evaluate, programs, seed
+from evaweb.lab import demo_rows, plan_runner, programs
 from evaweb.lab.benches import Bench
+from evaweb.lab.demo_rows import DemoLogin
 from evaweb.lab.lab import Lab, open_lab
 from evaweb.lab.lifetime import StopRequested
-from evaweb.lab.once import TrialChoice, report, run_one_trial
 from evaweb.lab.progress import Progress, on_terminal
-from evaweb.lab.seed import DemoLogin
+from evaweb.lab.rest_client import RestClient
 from evaweb.lab.simulated import CLUMSY, POLICIES, SKILLED, benches_of, known_port, simulated_options
-from evaweb.lab.visitor import RestClient
+from evaweb.lab.single_trial import TrialChoice, report, run_one_trial
 from evaweb.plans.models import Allocation, Plan, StoppingRule
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.caching import cached_analysis
@@ -121,13 +121,13 @@ class Command(BaseCommand):
 
     def _up(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> tuple[str, list[DemoLogin]]:
         with lab.progress.step("the simulated bench and its policies"):
-            seed.demo_scene()
+            demo_rows.demo_scene()
             in_lockstep = options["evaluate"] or options["lockstep"]
             bench = (self._lockstep if in_lockstep else self._bench)(lab, deployment, options)
         url = lab.start([bench])
         with lab.progress.step("accounts and a plan"):
             roles = {"operator": Role.OPERATOR, "admin": Role.ADMIN}
-            logins = [seed.demo_login(username=name, role=role) for name, role in roles.items()]
+            logins = [demo_rows.demo_login(username=name, role=role) for name, role in roles.items()]
             try:
                 self._plan("block-on-plate-blind", "Block on plate", "evaluated", repetitions=3)
             except EvaError as error:
@@ -143,7 +143,7 @@ class Command(BaseCommand):
         paced = () if options["evaluate"] else ("--paced",)  # in real time for people who watch
         program = programs.lockstep(str(deployment), assignments, robot, policies, (*how.options, *paced))
         for name, url in lab.processes.start(program)["policies"].items():
-            seed.demo_checkpoint(name=name, description=POLICIES[name][0], policy={"url": url})
+            demo_rows.demo_checkpoint(name=name, description=POLICIES[name][0], policy={"url": url})
         return Bench(deployment, assignments, runs=True)
 
     def _bench(self, lab: Lab, deployment: Path, options: dict[str, Any]) -> Bench:
@@ -156,7 +156,7 @@ class Command(BaseCommand):
         }
         node, served = bench(), {name: server()["url"] for name, server in servers.items()}
         for name, (description, _) in POLICIES.items():
-            seed.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
+            demo_rows.demo_checkpoint(name=name, description=description, policy={"url": served[name]})
         assignments = [
             f'robot="{robot}"',
             f'transport.sub_endpoint="{node["obs_endpoint"]}"',
@@ -173,11 +173,13 @@ class Command(BaseCommand):
         # The checkpoints of a blind plan are hidden from operators: single trials have their own.
         served = [Checkpoint.objects.get(name=policy) for policy in (SKILLED, CLUMSY)]
         checkpoints = [
-            seed.demo_checkpoint(name=f"{row.name}-{use}", description=row.description, policy=row.policy)
+            demo_rows.demo_checkpoint(
+                name=f"{row.name}-{use}", description=row.description, policy=row.policy
+            )
             for row in served
         ]
-        given = {"owner": "admin", "scene": seed.demo_scene(), "checkpoints": checkpoints}
-        return seed.demo_plan(name=name, title=title, repetitions=repetitions, **given, **design)
+        given = {"owner": "admin", "scene": demo_rows.demo_scene(), "checkpoints": checkpoints}
+        return demo_rows.demo_plan(name=name, title=title, repetitions=repetitions, **given, **design)
 
     def _welcome(self, url: str, logins: list[DemoLogin]) -> None:
         self.stdout.write(f"\nEVA Web is at {url}\n")
@@ -192,7 +194,7 @@ class Command(BaseCommand):
     ) -> None:
         begun, count = time.monotonic(), options["evaluate"]
         name = f"evaluate-{time.strftime('%Y%m%d-%H%M%S')}"
-        positions = seed.demo_scene().positions.count()
+        positions = demo_rows.demo_scene().positions.count()
         plan = self._plan(
             name,
             f"{count} trials by the script",
@@ -205,9 +207,9 @@ class Command(BaseCommand):
         visitors = [RestClient(url) for _ in logins]
         for visitor, login in zip(visitors, logins, strict=True):
             visitor.login(login.username, login.password)
-        made = evaluate.run_plan(visitors[0], _STATION, name, count, self.stderr.write, progress)
+        made = plan_runner.run_plan(visitors[0], _STATION, name, count, self.stderr.write, progress)
         with progress.during("the reveal, and what came out"):
-            result = evaluate.close_and_reveal(visitors[1], name, made)
+            result = plan_runner.close_and_reveal(visitors[1], name, made)
             plan.refresh_from_db()
             found = cached_analysis(plan)
         said = headline(plan)

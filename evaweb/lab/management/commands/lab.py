@@ -12,10 +12,10 @@ from django.core.management.base import BaseCommand, CommandError
 from evaweb.errors import EvaError
 from evaweb.lab import first_account
 from evaweb.lab.benches import Bench
+from evaweb.lab.demo_rows import has_no_accounts
 from evaweb.lab.lab import Lab, open_lab
 from evaweb.lab.lifetime import StopRequested
 from evaweb.lab.progress import on_terminal
-from evaweb.lab.seed import has_no_accounts
 from evaweb.lab.simulated import benches_of, simulated_options
 
 _FIRST_ACCOUNT = "Nobody can log in yet. Open {url}/first-account/ and type this code:  {code}"

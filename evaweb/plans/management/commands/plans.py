@@ -10,9 +10,9 @@ from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 from evaweb.errors import EvaError
-from evaweb.plans.exchange import export_archive, export_toml, import_file
 from evaweb.plans.models import Plan
 from evaweb.plans.references import unpacked
+from evaweb.plans.toml_exchange import export_archive, export_toml, import_file
 from evaweb.trials.models import Checkpoint, Scene
 
 

@@ -23,7 +23,7 @@ from runtime.processes.coordinator.inference.policy_observation import StaleObse
 from runtime.processes.coordinator.inference.requests import PolicyRequests, PolicyResponse
 from runtime.processes.coordinator.inference.retry import Retry
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.processes.coordinator.inference.worker import as_policy_errors
+from runtime.processes.coordinator.inference.runners import as_policy_errors
 from runtime.strategies.base import Progress, Query, StrategyParameters
 
 _NOT_ANSWERED_YET = Pattern(

@@ -19,7 +19,7 @@ from runtime.ipc.messages import Event
 from runtime.kinematics.base import IkFlag, IkResult
 from runtime.policies.base import Policy
 from runtime.processes.coordinator.inference.policy_observation import ObservationProvider
-from runtime.processes.coordinator.inference.worker import Runner
+from runtime.processes.coordinator.inference.runners import Runner
 from runtime.spaces.conversion import ActionSpaces, ChunkStart, CommandRows
 
 log = logging.getLogger(__name__)

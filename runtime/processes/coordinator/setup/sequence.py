@@ -25,7 +25,7 @@ from runtime.processes.coordinator.control_queue import ControlQueue
 from runtime.processes.coordinator.health_monitor import SIBLING_PROCESSES
 from runtime.processes.coordinator.inference.inference import Inference
 from runtime.processes.coordinator.inference.requests import PolicyResponse
-from runtime.processes.coordinator.inference.worker import as_policy_errors
+from runtime.processes.coordinator.inference.runners import as_policy_errors
 from runtime.processes.coordinator.setup.bench_reset import BenchReset
 from runtime.processes.coordinator.setup.motion import SetupMotion
 from runtime.station.spec import StationSpec

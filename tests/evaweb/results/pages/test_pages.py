@@ -18,7 +18,7 @@ from evaweb.episodes.models import Episode
 from evaweb.plans.services import close_plan
 from evaweb.results.analysis import caching
 from evaweb.results.presentation.facts import comparison_facts
-from evaweb.results.ratings import judging
+from evaweb.results.ratings import rating_queue
 from evaweb.results.selectors import PlanRow
 from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
@@ -356,7 +356,7 @@ def test_rating_again_shows_the_code_and_nothing_that_was_said(plan, carry_out, 
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    handout, _ = judging.next_to_rate(rater)[:2]
+    handout, _ = rating_queue.next_to_rate(rater)[:2]
     text = client.get("/result/rate/").content.decode()
     assert handout.code in text
     for secret in ("pi0-new", "pi0-block", "=dropped", f"/result/trials/{handout.trial_id}"):
@@ -375,7 +375,7 @@ def test_a_rating_that_is_refused_keeps_its_ticks_and_another_trial_gets_none_of
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    handout, _ = judging.next_to_rate(rater)[:2]
+    handout, _ = rating_queue.next_to_rate(rater)[:2]
     first = bench.scene.milestones.order_by("order").first()
     given = {
         "plan": "blocks",
@@ -416,7 +416,7 @@ def test_preferring_asks_why(plan, carry_out, as_):
     carry_out(plan, 16)
     rater = builders.user("rita")
     client = as_(rater)
-    pair, _ = judging.next_to_compare(rater)[:2]
+    pair, _ = rating_queue.next_to_compare(rater)[:2]
     text = client.get("/result/prefer/").content.decode()
     assert pair.first.code in text
     assert "pi0" not in text

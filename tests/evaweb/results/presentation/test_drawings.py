@@ -10,7 +10,7 @@ import pytest
 from django.template import Context, Template
 
 from evaweb.results.analysis.analysis import analyse
-from evaweb.results.presentation.drawings import conditions, courses, rates
+from evaweb.results.presentation.drawings import conditions, rates, time_courses
 from evaweb.results.presentation.drawings.svg import SERIES, printable, ticks, wrapped
 from evaweb.statistics.proportions import proportion
 from tests.evaweb.results.reports.test_recompute import outcomes
@@ -39,11 +39,11 @@ def figures(analysis):
         ),
         "violins": rates.draw_violins(analysis.arms, analysis.letters),
         "difference": rates.draw_difference(found),
-        "funnel": courses.draw_funnel(
+        "funnel": time_courses.draw_funnel(
             "s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(analysis.arms)], {}
         ),
-        "success_times": courses.draw_success_times(analysis.arms),
-        "evidence": courses.draw_evidence(found.evidence, found.first, found.second, 40),
+        "success_times": time_courses.draw_success_times(analysis.arms),
+        "evidence": time_courses.draw_evidence(found.evidence, found.first, found.second, 40),
         "grid": conditions.draw_grid(analysis.arms, {}),
         "pareto": conditions.draw_pareto(analysis.arms[0], {("", NASTY): "/trials/?failure=1&x=2"}),
     }
@@ -91,7 +91,7 @@ def test_every_figure_carries_the_numbers_that_it_was_drawn_from(analysis):
 
 def test_legend_and_bars_are_in_the_order_of_series_whoever_is_best(analysis):
     found = [(arm.series, arm.checkpoint, arm.funnels[0]) for arm in analysis.arms]
-    named = [row["checkpoint"] for row in rows_of(courses.draw_funnel("s0", found[::-1], {}))]
+    named = [row["checkpoint"] for row in rows_of(time_courses.draw_funnel("s0", found[::-1], {}))]
     assert list(dict.fromkeys(named)) == [name for _, name, _ in sorted(found)]
 
 
@@ -206,11 +206,11 @@ def test_checkpoints_whose_names_begin_alike_are_told_apart_in_every_figure(anal
     drawn = {
         "intervals": rates.draw_intervals("Rates", [(a.checkpoint, a.success, "") for a in arms], {}),
         "violins": rates.draw_violins(arms, letters),
-        "funnel": courses.draw_funnel(
+        "funnel": time_courses.draw_funnel(
             "s0", [(i, a.checkpoint, a.funnels[0]) for i, a in enumerate(arms)], {}
         ),
-        "success_times": courses.draw_success_times(arms),
-        "evidence": courses.draw_evidence(one, *LONG),
+        "success_times": time_courses.draw_success_times(arms),
+        "evidence": time_courses.draw_evidence(one, *LONG),
         "grid": conditions.draw_grid(arms, {}),
     }
     for figure, markup in drawn.items():
@@ -231,5 +231,5 @@ def test_a_checkpoint_has_one_colour_whichever_of_them_are_chosen_and_whichever_
         }
         (found,) = some.comparisons
         places = (whole[found.first], whole[found.second])
-        drawn = courses.draw_evidence(found.evidence, found.first, found.second, drawn=places)
+        drawn = time_courses.draw_evidence(found.evidence, found.first, found.second, drawn=places)
         assert set(re.findall(r"series-[0-9]+", drawn)) == {f"series-{at + 1}" for at in places}

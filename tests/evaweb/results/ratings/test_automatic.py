@@ -15,14 +15,14 @@ from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import cancel, retry_job, run_queue
 from evaweb.plans.commitment import make_commitment
-from evaweb.plans.documents import scene_of, units_of
+from evaweb.plans.frozen_document import scene_of, units_of
 from evaweb.plans.models import Plan, PlanEvent
 from evaweb.plans.services import reveal_plan
 from evaweb.results import job_kinds
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import judge_agreement, rater_agreement
 from evaweb.results.models import AutomaticJudge, Judgement
-from evaweb.results.ratings import automatic, judging
+from evaweb.results.ratings import automatic, rating_queue
 from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, trial_stills
 from evaweb.results.reports.reporting import report_numbers
 from evaweb.results.reports.tables import outcome_pages
@@ -350,9 +350,9 @@ def everything(plan):
 def test_with_and_without_judges_the_analysis_is_the_same_to_the_byte(truth, owner, chat, bench):
     rater = builders.user("rita")
     for reached in (True, False, True):
-        handout = judging.next_to_rate(rater).found
+        handout = rating_queue.next_to_rate(rater).found
         ticks = bench.ticks(True, reached, reached)
-        judging.save_rating(user=rater, plan=truth, code=handout.code, milestones=ticks)
+        rating_queue.save_rating(user=rater, plan=truth, code=handout.code, milestones=ticks)
     reveal_plan(user=owner, plan=truth)
     before = everything(truth)
     with serving(SAID) as server:
@@ -379,10 +379,10 @@ def test_a_judge_is_held_against_the_score_that_stood_then(truth, owner, bench):
 
 def test_neither_a_judge_nor_a_second_rater_judges_by_another_scene_than_the_frozen_one(filmed, owner, chat):
     Milestone.objects.filter(order=1).update(required=True)
-    handout, _ = judging.next_to_rate(rita := builders.user("rita"))[:2]
+    handout, _ = rating_queue.next_to_rate(rita := builders.user("rita"))[:2]
     ticks = dict.fromkeys(handout.trial.scene.milestones.values_list("pk", flat=True), True)
     with pytest.raises(Conflict, match="milestone 1: required was False, is True"):
-        judging.save_rating(user=rita, plan=filmed, code=handout.code, milestones=ticks)
+        rating_queue.save_rating(user=rita, plan=filmed, code=handout.code, milestones=ticks)
     with serving(SAID) as server:
         chat(server.address)
         job = asked(filmed, owner, "seer")

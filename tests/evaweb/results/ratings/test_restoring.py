@@ -11,7 +11,7 @@ from evaweb.journal import read_numbered_lines
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.agreement import preference_ranking, rater_agreement
 from evaweb.results.models import Preference, Rating
-from evaweb.results.ratings import judging
+from evaweb.results.ratings import rating_queue
 from tests.evaweb.trials import builders
 from tests.evaweb.unguarded import without_triggers
 
@@ -27,15 +27,15 @@ def judged(plan, carry_out, rater, bench):
     carry_out(plan, 16)
     builders.failure_terms()
     for reached in (True, False):
-        handout = judging.next_to_rate(rater).found
+        handout = rating_queue.next_to_rate(rater).found
         ticks = bench.ticks(True, reached, reached)
         said = {} if reached else {"failure": "dropped", "failure_phase": "grasp"}
-        judging.save_rating(
+        rating_queue.save_rating(
             user=rater, plan=plan, code=handout.code, milestones=ticks, note="wölbt sich", **said
         )
-    pair = judging.next_to_compare(rater).found
+    pair = rating_queue.next_to_compare(rater).found
     codes = {"first": pair.first.code, "second": pair.second.code}
-    judging.save_preference(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
+    rating_queue.save_preference(user=rater, plan=plan, outcome="second", why="sanfter ⟂", **codes)
     return plan
 
 

@@ -13,7 +13,7 @@ from evaweb.results.reports.recompute import judged, methods
 from evaweb.results.reports.recompute.__main__ import differences
 from evaweb.results.reports.recompute.numbers import Trial, numbers
 from evaweb.statistics.confidence_sequence import confidence_sequence
-from evaweb.statistics.many import holm, letters
+from evaweb.statistics.multiple_comparisons import holm, letters
 from evaweb.statistics.preference import Comparison, NotIdentifiedError, preferences
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
 from evaweb.statistics.sequential import score_evidence

@@ -11,7 +11,7 @@ from django.core.management import CommandError, call_command
 
 from evaweb.canonical import digest
 from evaweb.errors import Conflict
-from evaweb.plans import pictures
+from evaweb.plans import image_store
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Achieved, Plan, Reference
 from evaweb.plans.services import freeze_plan, reveal_plan
@@ -19,7 +19,7 @@ from evaweb.results.analysis.agreement import preference_comparisons
 from evaweb.results.analysis.caching import cached_analysis
 from evaweb.results.models import Judgement
 from evaweb.results.presentation.headline import headline
-from evaweb.results.ratings import judging
+from evaweb.results.ratings import rating_queue
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.recompute.sealed import faults
 from evaweb.results.reports.reporting import plan_seal, write_report
@@ -46,22 +46,24 @@ def report(revealed, tmp_path, bench):
 def _reported(revealed, tmp_path, bench):
     rater = builders.user("rita")
     for index, handout in enumerate(
-        revealed.handouts.filter(slot__index__in=judging.rating_sample(revealed))
+        revealed.handouts.filter(slot__index__in=rating_queue.rating_sample(revealed))
     ):
         last = (
             index % 2 == 0 if index else not handout.trial.scores.latest("pk").success
         )  # which trials they are is drawn: one differs
         milestones = bench.ticks(True, True, last)
-        judging.save_rating(user=rater, plan=revealed, code=handout.code, milestones=milestones)
+        rating_queue.save_rating(user=rater, plan=revealed, code=handout.code, milestones=milestones)
     for index in range(8):
-        pair, _ = judging.next_to_compare(rater, [revealed])[:2]
+        pair, _ = rating_queue.next_to_compare(rater, [revealed])[:2]
         codes = {"first": pair.first.code, "second": pair.second.code}
         # By checkpoint and not by place, which is drawn: where one wins every time, there is nothing to fit.
         won_by_new = index % 4 in (0, 3)
         new_is_first = pair.first.slot.checkpoint.name == "pi0-new"
         outcome = "tie" if index % 4 == 2 else "first" if won_by_new == new_is_first else "second"
-        judging.save_preference(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
-    judging.save_preference(user=builders.user("rob"), plan=revealed, outcome="tie", why="alike", **codes)
+        rating_queue.save_preference(user=rater, plan=revealed, outcome=outcome, why="smoother", **codes)
+    rating_queue.save_preference(
+        user=builders.user("rob"), plan=revealed, outcome="tie", why="alike", **codes
+    )
     for number, handout in enumerate(revealed.handouts.order_by("number")):
         judged_by_machine(handout.trial, number)
     call_command("eval_report", "blocks", "--out", str(tmp_path / "report"))
@@ -596,7 +598,7 @@ REGION = {"name": "block", "at": [0.1, 0.2, 0.1, 0.1], "match": 0.41, "dx": None
 def laid_out(revealed, bench, owner):
     """The first trial's bench, with its reference, and another's whose picture was lost."""
     first, second = (handout.trial for handout in revealed.handouts.order_by("number")[:2])
-    before, now, lost = (pictures.store_image(jpeg(seed)) for seed in (1, 2, 3))
+    before, now, lost = (image_store.store_image(jpeg(seed)) for seed in (1, 2, 3))
     row = {"station": bench.station, "position": first.position, "camera": "top", "by": owner}
     reference = Reference.objects.create(picture=before, **row)
     seen = {"camera": "top", "by": bench.operator}
@@ -604,7 +606,7 @@ def laid_out(revealed, bench, owner):
         trial=first, picture=now, reference=reference, match=0.93, regions=[REGION], **seen
     )
     Achieved.objects.create(trial=second, picture=lost, override="the lamp", **seen)
-    pictures._path(lost).unlink()
+    image_store._path(lost).unlink()
     return first, before, now, lost
 
 

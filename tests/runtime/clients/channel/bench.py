@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import zmq
 
-from runtime.clients.channel.names import HolderNames
+from runtime.clients.channel.holder_names import HolderNames
 from runtime.clients.channel.server import ChannelServer
 from runtime.clients.client import StationClient
 from runtime.ipc.bus import CommandServer, Endpoints

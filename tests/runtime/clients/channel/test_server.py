@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runtime.clients.channel.names import HolderNames
+from runtime.clients.channel.holder_names import HolderNames
 from runtime.clients.client import Refused, StationClient
 from runtime.ipc.session_state import SessionState
 from tests import presses

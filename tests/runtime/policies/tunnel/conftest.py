@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from runtime.policies.tunnel.process import free_port
+from runtime.policies.tunnel.ssh_process import free_port
 from tests.ssh import SshServer
 
 

@@ -27,8 +27,8 @@ from runtime.ipc.session_state import SessionState
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.policies.tunnel import policy as tunnelled
 from runtime.policies.tunnel.policy import TunnelledPolicy
-from runtime.policies.tunnel.process import free_port
 from runtime.policies.tunnel.settings import TunnelSettings
+from runtime.policies.tunnel.ssh_process import free_port
 from runtime.processes.coordinator.builders import make_policy
 from runtime.sim.faults import Fault
 from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer

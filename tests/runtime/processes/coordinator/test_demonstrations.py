@@ -11,7 +11,7 @@ import pytest
 
 from runtime.config import loader
 from runtime.core.errors import RecordingError, SetupError
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.ipc.session_state import SessionState
 from runtime.processes.control.process import Loop, hold_then_end, make_tick
 from runtime.recording.labels import read_labels

@@ -12,7 +12,7 @@ from runtime import __main__ as command_line
 from runtime.config import loader
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Float64, Observation
-from runtime.datasets.published import publish
+from runtime.datasets.publishing import publish
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop

@@ -21,7 +21,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from runtime.sim import ros2_types as types
-from runtime.transports.ros.dds import LOOPBACK, configuration
+from runtime.transports.ros.dds_middleware import LOOPBACK, configuration
 from tests.processes import eventually
 
 _own = itertools.count(120)

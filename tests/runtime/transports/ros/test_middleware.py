@@ -27,14 +27,14 @@ RELIABLE_READER = Quality(reliability="reliable", depth=5)
 
 
 def dds(domain: int) -> Middleware:
-    from runtime.transports.ros.dds import DdsMiddleware
+    from runtime.transports.ros.dds_middleware import DdsMiddleware
 
     return DdsMiddleware(domain, "loopback")
 
 
 def rclpy(domain: int) -> Middleware:
-    from runtime.transports.ros.dds import configuration
-    from runtime.transports.ros.rcl import RclMiddleware
+    from runtime.transports.ros.dds_middleware import configuration
+    from runtime.transports.ros.rclpy_middleware import RclMiddleware
 
     os.environ["CYCLONEDDS_URI"] = configuration("loopback") or ""
     return RclMiddleware(domain, "eva_web_test")
@@ -204,7 +204,7 @@ def test_what_fails_on_one_message_does_not_end_the_next(opened: Middleware, pee
 
 
 def test_an_interface_that_is_not_there_is_named(domain: int) -> None:
-    from runtime.transports.ros.dds import DdsMiddleware
+    from runtime.transports.ros.dds_middleware import DdsMiddleware
 
     with pytest.raises(TransportError, match=r"cannot be joined over 'nosuch0'.*transport\.network"):
         DdsMiddleware(domain, "nosuch0")
@@ -212,7 +212,7 @@ def test_an_interface_that_is_not_there_is_named(domain: int) -> None:
 
 
 def test_a_domain_has_one_network_in_a_process(domain: int) -> None:
-    from runtime.transports.ros.dds import DdsMiddleware
+    from runtime.transports.ros.dds_middleware import DdsMiddleware
 
     with (
         contextlib.closing(dds(domain)),

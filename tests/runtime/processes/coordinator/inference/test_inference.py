@@ -20,7 +20,7 @@ from runtime.processes.coordinator.inference.inference import FaultTimeouts, Inf
 from runtime.processes.coordinator.inference.policy_observation import PolicyObservation, StalenessLimits
 from runtime.processes.coordinator.inference.requests import PolicyRequests
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.processes.coordinator.inference.worker import LockstepRunner, Runner, ThreadRunner
+from runtime.processes.coordinator.inference.runners import LockstepRunner, Runner, ThreadRunner
 from runtime.spaces.conversion import ActionSpaces, ChunkStart, CommandRows
 from runtime.strategies import overlap, rtc, sync
 from tests.processes import PATIENCE_S

@@ -12,7 +12,7 @@ from runtime.core.types import ActionChunk, Conditioning, Observation
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.inference.requests import MissBound, PolicyRequests, PolicyResponse
-from runtime.processes.coordinator.inference.worker import LockstepRunner
+from runtime.processes.coordinator.inference.runners import LockstepRunner
 from runtime.spaces.conversion import ActionSpaces
 
 ROBOT = load_robot("agilex_piper")

@@ -15,7 +15,7 @@ from runtime.ipc.session_state import SessionState
 from runtime.kinematics.forward import ChainForward
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator import assembly
-from runtime.processes.coordinator.inference.worker import LockstepRunner
+from runtime.processes.coordinator.inference.runners import LockstepRunner
 from runtime.processes.coordinator.setup.sequence import Stage
 from runtime.spaces.conversion import CommandRows
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, on_time, ramp, stubbed

@@ -1,0 +1,276 @@
+"""Collecting sessions: open, close, resume, publish; their episodes, and the worker's jobs for them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from django.http import HttpRequest
+from ninja import Field, Query, Router, Schema, Status
+
+from evaweb.api.jobs import JobOut
+from evaweb.api.responses import (
+    FAILURES,
+    Body,
+    Page,
+    Paging,
+)
+from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.collect import selectors, services
+from evaweb.collect.models import CollectSession
+from evaweb.collect.work import QueueItem, session_queue
+from evaweb.stations.selectors import station_get
+
+router = Router(tags=["collecting"])
+_Target = Annotated[
+    int | None, Field(description="Episodes that are wanted, null for as many as there will be")
+]
+
+
+class SessionOut(Schema):
+    """One task demonstrated at one station for one dataset; `closed_at` null while it goes on."""
+
+    uuid: UUID
+    station: str
+    dataset: str
+    task: str
+    operator: str
+    target: int | None
+    opened_at: datetime
+    closed_at: datetime | None
+
+    @staticmethod
+    def of(session: CollectSession) -> dict[str, Any]:
+        """Return the session with names of station and operator."""
+        plain = ("uuid", "dataset", "task", "target", "opened_at", "closed_at")
+        names = {"station": session.station.name, "operator": session.operator.get_username()}
+        return {**{name: getattr(session, name) for name in plain}, **names}
+
+
+class CountsOut(Schema):
+    """Episodes: `saved` are whole and not discarded, those by result among them; `cut` ended in a fault."""
+
+    saved: int
+    success: int
+    partial: int
+    fail: int
+    unlabelled: int
+    discarded: int
+    cut: int
+    published: int
+
+
+class SessionEventOut(Schema):
+    """One event of a session."""
+
+    kind: str
+    text: str
+    by: str
+    at: datetime
+
+
+class DemonstrationOut(Schema):
+    """An episode of the session with its newest label, "" while it has none."""
+
+    episode: UUID
+    status: str
+    frames: int
+    duration_s: float | None
+    started_at: datetime | None
+    result: str
+    note: str
+    discarded: bool
+    dataset: str
+    dataset_index: int | None
+
+
+class SessionDetail(SessionOut):
+    """With set-up, counts, history and episodes, the newest first; `folder` is its dataset's, `version` "" if new."""
+
+    setup: dict[str, Any]
+    counts: CountsOut
+    folder: str
+    version: str
+    events: list[SessionEventOut]
+    episodes: list[DemonstrationOut]
+
+    @staticmethod
+    def of(session: CollectSession) -> dict[str, Any]:
+        """Return the session with all details."""
+        dataset = selectors.dataset_of(session=session)
+        return {
+            **SessionOut.of(session),
+            "setup": session.setup,
+            "counts": selectors.session_counts(session=session),
+            "folder": dataset.name,
+            "version": dataset.version,
+            "events": [
+                {"kind": event.kind, "text": event.text, "by": event.by.get_username(), "at": event.at}
+                for event in session.events.select_related("by")
+            ],
+            "episodes": [
+                {
+                    **{name: getattr(one, name) for name in ("result", "note", "discarded")},
+                    **{
+                        name: getattr(one.episode, name)
+                        for name in (
+                            "status",
+                            "frames",
+                            "duration_s",
+                            "started_at",
+                            "dataset",
+                            "dataset_index",
+                        )
+                    },
+                    "episode": one.pk,
+                }
+                for one in selectors.demonstrations_of(session=session)
+            ],
+        }
+
+
+class SessionIn(Body):
+    """Task to be demonstrated; `dataset` "" takes the one that the deployment names."""
+
+    task: str
+    dataset: str = ""
+    target: _Target = None
+
+
+class TargetIn(Body):
+    """Number of episodes wanted."""
+
+    target: _Target
+
+
+class PublishIn(Body):
+    """Which results are published, and the version of a dataset that is new, "" for the usual one."""
+
+    results: Annotated[
+        list[Literal["success", "partial", "fail"]],
+        Field(default_factory=lambda: list(selectors.PUBLISHED_RESULTS)),
+    ]
+    version: str = ""
+
+
+class QueuedOut(JobOut):
+    """A job that is not done, with how long it still takes [s] where that is known."""
+
+    episode: UUID
+    left_s: float | None
+
+    @staticmethod
+    def of(item: QueueItem, sight: Visibility) -> dict[str, Any]:
+        """Return the job with the queue's additional facts."""
+        return {**JobOut.of(item.job, sight), "episode": item.episode, "left_s": item.left_s}
+
+
+class QueueOut(Schema):
+    """Failed, running and waiting work for the session's episodes; `left_s` of all that runs and waits."""
+
+    done: int
+    total: int
+    left_s: float | None
+    items: list[QueuedOut]
+
+
+@router.get(
+    "/sessions", response={200: Page[SessionOut], **FAILURES}, summary="Sessions", url_name="sessions"
+)
+def sessions(
+    request: HttpRequest,
+    paging: Query[Paging],
+    station: str = "",
+    dataset: str = "",
+    open: bool | None = None,
+) -> Any:
+    """The newest first."""
+    return paging.page(selectors.session_list(station=station, dataset=dataset, is_open=open), SessionOut)
+
+
+@router.get(
+    "/sessions/{uuid:uuid}",
+    response={200: SessionDetail, **FAILURES},
+    summary="One session",
+    url_name="session",
+)
+def session(request: HttpRequest, uuid: UUID) -> Any:
+    """With its episodes and history."""
+    return SessionDetail.of(selectors.session_get(uuid=uuid))
+
+
+@router.get(
+    "/sessions/{uuid:uuid}/queue",
+    response={200: QueueOut, **FAILURES},
+    summary="Work for its episodes",
+    url_name="session-queue",
+)
+def queue(request: HttpRequest, uuid: UUID) -> Any:
+    """Quality, previews, tables, publication; `POST /jobs/ID/retry` tries one again that has failed."""
+    found = session_queue(session=selectors.session_get(uuid=uuid))
+    return {
+        "done": found.done,
+        "total": found.total,
+        "left_s": found.left_s,
+        "items": [QueuedOut.of(item, visibility_for_request(request)) for item in found.items],
+    }
+
+
+@router.post(
+    "/stations/{name}/sessions",
+    response={201: SessionOut, **FAILURES},
+    summary="Open a session",
+    url_name="session-open",
+)
+def open_session(request: HttpRequest, name: str, given: SessionIn) -> Any:
+    """With the station's present set-up; operators, while no other user commands it."""
+    made = services.open_session(user=request.auth, station=station_get(name=name), **given.model_dump())
+    return Status(201, SessionOut.of(made))
+
+
+@router.post(
+    "/sessions/{uuid:uuid}/close",
+    response={200: SessionOut, **FAILURES},
+    summary="Close",
+    url_name="session-close",
+)
+def close_session(request: HttpRequest, uuid: UUID) -> Any:
+    """For now: it can be resumed."""
+    return SessionOut.of(services.close_session(user=request.auth, session=selectors.session_get(uuid=uuid)))
+
+
+@router.post(
+    "/sessions/{uuid:uuid}/resume",
+    response={200: SessionOut, **FAILURES},
+    summary="Resume",
+    url_name="session-resume",
+)
+def resume_session(request: HttpRequest, uuid: UUID) -> Any:
+    """Refused with every difference where the station's set-up is not as it was."""
+    return SessionOut.of(services.resume_session(user=request.auth, session=selectors.session_get(uuid=uuid)))
+
+
+@router.post(
+    "/sessions/{uuid:uuid}/target",
+    response={200: SessionOut, **FAILURES},
+    summary="Target",
+    url_name="session-target",
+)
+def set_target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
+    """Set the number of episodes wanted."""
+    found = selectors.session_get(uuid=uuid)
+    return SessionOut.of(services.set_session_target(user=request.auth, session=found, target=given.target))
+
+
+@router.post(
+    "/sessions/{uuid:uuid}/publish",
+    response={202: list[JobOut], **FAILURES},
+    summary="Publish its episodes",
+    url_name="session-publish",
+)
+def publish(request: HttpRequest, uuid: UUID, given: PublishIn) -> Any:
+    """Those that are accepted and in no dataset yet; the jobs that do it."""
+    found = selectors.session_get(uuid=uuid)
+    asked = services.publish_session(user=request.auth, session=found, **given.model_dump())
+    return Status(202, [JobOut.of(job, visibility_for_request(request)) for job in asked])

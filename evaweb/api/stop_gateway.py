@@ -1,0 +1,355 @@
+"""Stops over REST, answered in front of Django: without the database and without a thread of a page.
+
+It answers e-stop, stop and halt of a station, and whether this path to them works. All other requests are passed to
+the application; evaweb.api.stations documents the requests. It runs in front of the web, and alone in the process for
+stops (`stop_application`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import re
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from io import BytesIO
+from typing import Any
+from uuid import uuid4
+
+from django.conf import settings
+from django.core.exceptions import DisallowedHost
+from django.core.handlers.asgi import ASGIRequest
+from django.http.request import split_domain_port, validate_host
+from django.utils import timezone
+from ninja.utils import check_csrf
+from pydantic import ValidationError
+
+from evaweb import audit
+from evaweb.api.auth import NOT_LOGGED_IN
+from evaweb.api.responses import describe_errors
+from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
+from evaweb.api.tokens import UNKNOWN
+from evaweb.callers import client_address, client_key
+from evaweb.cookies import MOST, cookie_values, session_keys
+from evaweb.credentials import (
+    RETRY_AFTER_S,
+    SESSION,
+    TOKEN,
+    UNVERIFIED,
+    Credential,
+    Login,
+    LookupOverload,
+    Unverifiable,
+    credentials,
+)
+from evaweb.errors import EvaError, NotAllowed, refusal
+from evaweb.headers import DEFAULT_HEADERS
+from evaweb.origins import is_own_origin, scheme_of
+from evaweb.roles import Role
+from evaweb.stations import commands, stops
+from evaweb.stations import redaction as veil
+from evaweb.stations.models import Station
+from runtime.core.sentences import Pattern, fixed, identity
+from runtime.ipc import estop_requests as pressing
+
+log = logging.getLogger(__name__)
+_UNKNOWN_TOKEN = Pattern(
+    "api.door.unknown_token",
+    "the token {unknown}: make one with manage.py api_token USER NAME",
+)
+_CSRF_CHECK_FAILED = fixed("api.door.csrf_check_failed", "CSRF check Failed")
+_PATH = re.compile(r"/api/v1/stations/([^/]+)/(estop|commands)")
+_LARGEST = 64 * 1024  # [bytes] of a stop; longer bodies are other commands, except e-stop presses
+_ASKED = {
+    ("POST", "estop"),
+    ("POST", "commands"),
+    ("GET", "estop"),
+    ("OPTIONS", "estop"),
+    ("OPTIONS", "commands"),
+}
+_PREFLIGHT = [  # CORS answer: what pages of the web's port may send to another port, cached for 7200 s
+    (b"access-control-allow-methods", b"GET, POST"),
+    (b"access-control-allow-headers", b"content-type, x-csrftoken"),
+    (b"access-control-max-age", b"7200"),
+]
+_BUSY = (b"retry-after", b"%d" % RETRY_AFTER_S)
+_MOST_TOKENS = 4  # per request
+_STOP_AGAIN = Pattern("api.door.stop_again", "{why}: stop again; the e-stop works")
+_STOPS_ALONE = Pattern(
+    "api.door.stops_alone",
+    "this process answers stop, halt and e-stop alone; the web is at port {port}",
+)
+_UNKNOWN_HOST = Pattern(
+    "api.door.unknown_host",
+    "the host {host!r} is none of this lab's: EVA_ALLOWED_HOSTS names them",
+)
+_Receive = Callable[[], Awaitable[Any]]
+_Headers = Sequence[tuple[bytes, bytes]]
+Answered = tuple[int, dict[str, Any]]
+
+
+class Refused(EvaError):
+    """Refusal with an HTTP status."""
+
+    def __init__(self, sentence: str, status: int) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class StopGateway:
+    """ASGI application for stops in front of another one; `web_port` is set in the separate process for stops."""
+
+    def __init__(self, application: Callable[..., Awaitable[Any]], web_port: int | None = None) -> None:
+        self._application, self._web_port = application, web_port
+
+    async def __call__(self, scope: dict[str, Any], receive: _Receive, send: Any) -> None:
+        asked = _PATH.fullmatch(scope["path"])
+        if asked is None or (scope["method"], asked[2]) not in _ASKED:
+            await self._application(scope, receive, send)
+            return
+        presses = (scope["method"], asked[2]) == ("POST", "estop")
+        if not presses and self._web_port is not None and not _is_known(_header(scope, b"host")):
+            await _send(send, 400, refusal(_UNKNOWN_HOST(host=_header(scope, b"host")[:200])))
+            return
+        body = await _body(receive)
+        if body is None:
+            return
+        told = list(self._told_browsers(scope))
+        if scope["method"] == "OPTIONS":
+            await _send(send, 200, {}, [*told, *_PREFLIGHT])
+            return
+        try:
+            answered = await self._answered(scope, asked, body)
+        except EvaError as fault:
+            answered = (fault.status, refusal(str(fault)))
+        except LookupOverload as fault:
+            answered = (503, refusal(_STOP_AGAIN(why=fault)))
+            told.append(_BUSY)
+        except Exception as fault:  # whatever fails, the caller must get an answer
+            log.exception("a stop at %s was not answered", scope["path"][:200])
+            answered = (500, refusal(f"{stops.HARDWARE_STOP}: {fault.__class__.__name__}"))
+        if answered is None:
+            await self._application(scope, _replay_body(body, receive), send)
+        else:
+            await _send(send, *answered, told)
+
+    async def _answered(self, scope: dict[str, Any], asked: re.Match[str], body: bytes) -> Answered | None:
+        if scope["method"] == "GET":
+            return await self._ready(scope)
+        return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
+
+    async def _ready(self, scope: dict[str, Any]) -> Answered:
+        """Return the caller's name, which also caches their credentials, so that a first press needs no lookup."""
+        try:
+            user = (await _resolve_presser(scope)).username
+        except Unverifiable:
+            user = UNVERIFIED
+        return 200, {"user": user, "alone": self._web_port is not None}
+
+    def _told_browsers(self, scope: dict[str, Any]) -> _Headers:
+        """Return the CORS headers that allow only our own pages to read the answer."""
+        origin, host = _header(scope, b"origin"), _header(scope, b"host")
+        if not _is_known(host) or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
+            return [(b"vary", b"origin")]
+        return [
+            (b"vary", b"origin"),
+            (b"access-control-allow-origin", origin.encode("latin-1")),
+            (b"access-control-allow-credentials", b"true"),
+        ]
+
+    def _as_of_here(self, scope: dict[str, Any]) -> dict[str, Any]:
+        """Return the scope with the origin of this port for requests of the web's pages, because Django knows
+        one origin only.
+        """
+        host = _header(scope, b"host")
+        origin = _header(scope, b"origin")
+        if self._web_port is None or not is_own_origin(origin, host, scheme_of(scope), self._web_port):
+            return scope
+        others = [(name, value) for name, value in scope["headers"] if name != b"origin"]
+        here = f"{scope['scheme']}://{host}".encode("latin-1")
+        return {**scope, "headers": [*others, (b"origin", here)]}
+
+
+def stop_application(web_port: int) -> StopGateway:
+    """Return the application of the process for stops, for pages of the web at that port."""
+    said = refusal(_STOPS_ALONE(port=web_port))
+
+    async def nothing_else(scope: dict[str, Any], receive: _Receive, send: Any) -> None:
+        await _send(send, 404, said)
+
+    return StopGateway(nothing_else, web_port)
+
+
+async def _answered(scope: dict[str, Any], station: str, what: str, body: bytes) -> Answered | None:
+    """Return status and answer; None for a command that is not a stop."""
+    if what == "estop":
+        return await _estop(scope, station, _parse_body(body))
+    press = pressing.parse_json_press(body, "kind")
+    if press is not None:
+        return await _estop(scope, station, press)
+    said = _parse_body(body) if len(body) <= _LARGEST else {}
+    return await _stop(scope, station, said, body) if said.get("kind") in commands.STOPPING else None
+
+
+async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -> Answered:
+    given, at = EStopIn(uuid=said.get("uuid"), why=pressing.json_reason(said)), timezone.now()
+    unverified, username, user = "", UNVERIFIED, None
+    try:
+        login = await _resolve_presser(scope)
+    except (Unverifiable, LookupOverload) as fault:  # overload must not refuse an e-stop
+        unverified = str(fault)
+        audit.estop_unverified(station, fault)
+    else:
+        username, user = login.username, login.account
+    uuid = given.uuid or uuid4()
+    press = stops.press_estop(station=station, username=username, why=given.why, uuid=uuid)
+    answer = await asyncio.wrap_future(press)
+    place = Station(name=station)
+    commands.record_estop(
+        user=user, station=place, why=given.why, uuid=uuid, answer=answer, at=at, unverified=unverified
+    )
+    return HTTP_OF[answer.status], _answer_body(str(uuid), answer, answer.data)
+
+
+async def _stop(scope: dict[str, Any], station: str, said: Mapping[str, Any], body: bytes) -> Answered:
+    at = timezone.now()
+    kind, login = await _resolve_stopper(scope)
+    if kind == SESSION:
+        _require_csrf(scope, body)
+    if login.role is Role.VIEWER:
+        raise NotAllowed(stops.refused_to_a_viewer(login.username))
+    try:
+        given = CommandIn(**said)
+    except ValidationError as fault:
+        raise Refused(describe_errors(fault.errors(include_url=False)), 422) from None
+    named = {"kind": given.kind, "page": given.page, "epoch": given.epoch, "uuid": given.uuid}
+    order = stops.stop_command(username=login.username, **named)
+    answer = await asyncio.wrap_future(stops.request_stop(order, station))
+    commands.record_stop(user=login.account, station=Station(name=station), answer=answer, at=at, **named)
+    return HTTP_OF[answer.status], _answer_body(str(given.uuid), answer, veil.redact_answer(answer.data))
+
+
+def _answer_body(uuid: str, answer: stops.Answer, data: Mapping[str, Any]) -> dict[str, Any]:
+    said = {"status": answer.status.value, "reason": answer.reason, **identity(answer.reason)}
+    return {"uuid": uuid, **said, "allowed": answer.allowed, "data": data}
+
+
+async def _resolve_presser(scope: dict[str, Any]) -> Login:
+    """Return the login of the client that presses, by any of its credentials.
+
+    Raises:
+        Refused: If they are missing or unknown.
+        Unverifiable: If the database does not answer.
+        LookupOverload: If this client's share of lookups is used up.
+    """
+    found = _credentials(scope)
+    login = await credentials.resolve_presser(found, client_key(scope))
+    if login is None:
+        raise _unknown_credentials(found, scope)
+    return login
+
+
+async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
+    """Return kind of credential and login of the client that stops.
+
+    Raises:
+        Refused: If they are missing, unknown, or cannot be verified.
+        LookupOverload: If this client's share of lookups is used up.
+    """
+    found = _credentials(scope)
+    try:
+        known = await credentials.resolve_stopper(found, client_key(scope))
+    except Unverifiable as fault:
+        raise Refused(stops.UNKNOWN_STOPPER(why=fault), 503) from None
+    if known is None:
+        raise _unknown_credentials(found, scope)
+    return known
+
+
+def _unknown_credentials(found: list[Credential], scope: dict[str, Any]) -> Refused:
+    if all(kind != TOKEN for kind, _ in found):
+        return Refused(NOT_LOGGED_IN, 401)
+    audit.log_token_refused(client_address(ASGIRequest(scope, BytesIO())), UNKNOWN)
+    return Refused(_UNKNOWN_TOKEN(unknown=UNKNOWN), 401)
+
+
+def _credentials(scope: dict[str, Any]) -> list[Credential]:
+    """Return (kind, secret) of all credentials, tokens first; a proxy's header or a foreign cookie must not
+    hide a session.
+    """
+    found = []
+    for header in _headers(scope, b"authorization")[:_MOST_TOKENS]:
+        scheme, _, secret = header.strip().partition(" ")
+        found.append((TOKEN, secret.strip() if scheme.lower() == "bearer" else header))
+    found += [(SESSION, key) for key in session_keys(_headers(scope, b"cookie"))]
+    if not found:
+        raise Refused(NOT_LOGGED_IN, 401)
+    return found
+
+
+def _require_csrf(scope: dict[str, Any], body: bytes) -> None:
+    """Check CSRF; of several cookies any valid one is accepted."""
+    name = settings.CSRF_COOKIE_NAME
+    try:
+        for token in cookie_values(_headers(scope, b"cookie"), name)[:MOST] or [""]:
+            request = ASGIRequest(scope, BytesIO(body))
+            request.COOKIES[name] = token
+            if check_csrf(request) is None:
+                return
+    except DisallowedHost as fault:
+        raise Refused(str(fault), 400) from None
+    raise Refused(_CSRF_CHECK_FAILED, 403)
+
+
+def _parse_body(body: bytes) -> dict[str, Any]:
+    try:
+        said = json.loads(body)
+    except (ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) else {}
+
+
+async def _body(receive: _Receive) -> bytes | None:
+    """Return the complete body, which the server has already received; None if the client has disconnected."""
+    parts, more = [], True
+    while more:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return None
+        parts.append(message.get("body", b""))
+        more = message.get("more_body", False)
+    return b"".join(parts)
+
+
+def _replay_body(body: bytes, receive: _Receive) -> _Receive:
+    """Return a receiver that repeats the body that was read, then continues with `receive`."""
+    first = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def read() -> Any:
+        return first.pop() if first else await receive()
+
+    return read
+
+
+def _is_known(host: str) -> bool:
+    """Return True if `host` is a name of the lab; pages of other names that lead here are not ours.
+
+    An e-stop is never refused because of the host name.
+    """
+    return validate_host(split_domain_port(host)[0], settings.ALLOWED_HOSTS)
+
+
+def _header(scope: dict[str, Any], wanted: bytes) -> str:
+    return next(iter(_headers(scope, wanted)), "")
+
+
+def _headers(scope: dict[str, Any], wanted: bytes) -> list[str]:
+    return [value.decode("latin-1") for name, value in scope["headers"] if name == wanted]
+
+
+async def _send(send: Any, status: int, answer: Mapping[str, Any], more: _Headers = ()) -> None:
+    body = json.dumps(answer).encode()
+    headers = [(b"content-type", b"application/json; charset=utf-8"), (b"content-length", b"%d" % len(body))]
+    headers += [*DEFAULT_HEADERS, *more]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,216 @@
+"""Orders for operations on datasets: validated here, executed by a worker as jobs of one kind."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
+
+import robots
+from evaweb.datasets.overview import dataset_found, dataset_names, folder_named
+from evaweb.errors import Conflict, EvaError
+from evaweb.jobs.models import Job, JobStatus
+from evaweb.jobs.services import enqueue
+from evaweb.roles import Role, require_role
+from runtime.core.sentences import Pattern
+from runtime.datasets.layout import INFO
+from runtime.datasets.operations import fingerprint
+from runtime.recording.files import RecordingError
+
+_ROBOT_ALLOWED_NONE = Pattern(
+    "datasets.orders.robot_allowed_none",
+    "robot = {robot!r}; allowed: {names}, or none",
+)
+_WOULD_LIE_WITHIN_DATASET_CHOOSE = Pattern(
+    "datasets.orders.would_lie_within_dataset_choose",
+    "{wanted} would lie within the dataset {name}: choose another name",
+)
+_THERE_ALREADY_NOT_EMPTY_CHOOSE = Pattern(
+    "datasets.orders.there_already_not_empty_choose",
+    "{wanted} is there already and not empty: choose another name",
+)
+_EPISODES_BEING_DELETED_WAIT_UNTIL = Pattern(
+    "datasets.orders.episodes_being_deleted_wait_until",
+    "episodes of {dataset} are being deleted: wait until that is done",
+)
+
+KIND = "dataset"
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+Version = Literal["v2.1", "v3.0"]
+
+
+class _Order(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Check(_Order):
+    """Look whether a dataset is what its own metadata promise."""
+
+    what: Literal["check"]
+    dataset: Name
+
+
+class Repair(_Order):
+    """Take back what a crash left."""
+
+    what: Literal["repair"]
+    dataset: Name
+
+
+class Convert(_Order):
+    """Write a dataset as a new one of that version; features may get new names."""
+
+    what: Literal["convert"]
+    dataset: Name
+    to: Name
+    version: Version
+    rename: dict[Name, Name] = Field(default_factory=dict, max_length=100)
+    reencode: StrictBool = False
+
+
+class Import(_Order):
+    """Make its episodes ones of this lab, to be checked, reviewed and annotated; `robot` is whose numbers they are."""
+
+    what: Literal["import"]
+    dataset: Name
+    robot: Annotated[str, Field(max_length=63)] = ""
+    state: Annotated[str, Field(max_length=200)] = ""
+
+
+class Merge(_Order):
+    """Write the episodes of several datasets, in this order, as a new one."""
+
+    what: Literal["merge"]
+    datasets: Annotated[list[Name], Field(min_length=2, max_length=100)]
+    to: Name
+    version: Version | None = None
+    reencode: StrictBool = False
+
+
+class Split(_Order):
+    """Write some episodes of a dataset as new ones below the folder `to`."""
+
+    what: Literal["split"]
+    dataset: Name
+    to: Name
+    parts: Annotated[dict[Name, list[Index]], Field(min_length=1, max_length=100)]
+    version: Version | None = None
+    reencode: StrictBool = False
+
+
+class Delete(_Order):
+    """Take episodes out of a dataset; later ones move up. Administrators."""
+
+    what: Literal["delete"]
+    dataset: Name
+    episodes: Annotated[list[Index], Field(min_length=1)]
+    reencode: StrictBool = False
+
+
+class Push(_Order):
+    """Upload a dataset to the Hugging Face hub. Administrators."""
+
+    what: Literal["push"]
+    dataset: Name
+    repository: Name
+    private: StrictBool = True
+
+
+Order = Annotated[
+    Check | Repair | Convert | Import | Merge | Split | Delete | Push, Field(discriminator="what")
+]
+_ADAPTER: TypeAdapter[Check | Repair | Convert | Import | Merge | Split | Delete | Push] = TypeAdapter(Order)
+_OF_ADMINS = ("delete", "push")
+
+
+def least_for(what: str) -> Role:
+    """Return the lowest role that may submit this order."""
+    return Role.ADMIN if what in _OF_ADMINS else Role.OPERATOR
+
+
+def parse_order(given: Mapping[str, Any]) -> Any:
+    """Return the validated order. Raises: EvaError with the first problem."""
+    try:
+        return _ADAPTER.validate_python(dict(given))
+    except ValidationError as invalid:
+        error = invalid.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in error["loc"] if part != given.get("what")) or "what"
+        raise EvaError(f"{place}: {error['msg']}; given: {error.get('input')!r:.120}") from None
+
+
+def full_name(given: str) -> str:
+    """Return the full name of a dataset, whose usual folder may be omitted: cups is datasets/cups if that exists."""
+    usual = f"datasets/{given}"
+    names = dataset_names()
+    return usual if usual in names or (given not in names and "/" not in given) else given
+
+
+def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
+    """Queue an order; deleting and pushing need an administrator, other orders an operator.
+
+    Raises: EvaError if a source does not exist, a target exists, or a name is outside the data folder.
+    """
+    order = parse_order(given)
+    require_role(user, least_for(order.what))
+    sources = list(order.datasets) if isinstance(order, Merge) else [order.dataset]
+    names = [full_name(name) for name in sources]
+    for name in names:
+        dataset_found(name)
+    args = order.model_dump()
+    if isinstance(order, Merge):
+        args["datasets"] = names
+    else:
+        args["dataset"] = names[0]
+    if isinstance(order, Convert | Merge | Split):
+        args["to"] = _new(order.to, order.parts if isinstance(order, Split) else ())
+    if isinstance(order, Delete):
+        args |= {"episodes": sorted(set(order.episodes)), "known": _known(names[0])}
+    if isinstance(order, Import) and order.robot and order.robot not in robots.robot_names():
+        raise EvaError(_ROBOT_ALLOWED_NONE(robot=order.robot, names=", ".join(robots.robot_names())))
+    _require_no_deletion(names)
+    return enqueue(kind=KIND, key=key_of(order.what, names[0], args), args=args)
+
+
+def key_of(what: str, name: str, args: Mapping[str, Any]) -> str:
+    """Return the job's key: one check or repair per dataset at a time, but different keys for other orders."""
+    if what in ("check", "repair"):
+        return f"dataset:{what}:{_short(name)}"
+    rest = hashlib.sha256(json.dumps(dict(args), sort_keys=True).encode()).hexdigest()[:12]
+    return f"dataset:{what}:{_short(name)}:{rest}"
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 100 else f"{name[:80]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+
+
+def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
+    """Return the full name of a new dataset. Raises: Conflict if it exists or is inside another dataset."""
+    name = to if "/" in to else f"datasets/{to}"
+    for wanted in [f"{name}/{part}" for part in parts] or [name]:
+        folder = folder_named(wanted)
+        around = next((above for above in folder.parents if (above / INFO).is_file()), None)
+        if around is not None:
+            raise Conflict(_WOULD_LIE_WITHIN_DATASET_CHOOSE(wanted=wanted, name=around.name))
+        if folder.exists() and any(folder.iterdir()):
+            raise Conflict(_THERE_ALREADY_NOT_EMPTY_CHOOSE(wanted=wanted))
+    return name
+
+
+def _known(name: str) -> str:
+    try:
+        return fingerprint(dataset_found(name))
+    except RecordingError as fault:
+        raise Conflict(str(fault)) from None
+
+
+def _require_no_deletion(names: Sequence[str]) -> None:
+    """Raise Conflict during a deletion, which changes the episode indices that a waiting order refers to."""
+    for job in Job.objects.filter(
+        kind=KIND, status__in=(JobStatus.QUEUED, JobStatus.RUNNING), args__what="delete"
+    ):
+        if job.args.get("dataset") in names:
+            raise Conflict(_EPISODES_BEING_DELETED_WAIT_UNTIL(dataset=job.args["dataset"]))

@@ -1,0 +1,117 @@
+"""Episodes of one dataset for a page: data of the dataset, and what the lab knows about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+from evaweb.datasets.overview import open_cached
+from evaweb.episodes.models import Episode
+from evaweb.lists import words_of
+from runtime.datasets import layout
+from runtime.datasets.reader import Dataset
+from runtime.recording.files import RecordingError
+
+SUCCESSES = ("yes", "no", "unknown")
+RESULTS = ("success", "partial", "fail", "unknown")
+VERDICTS = ("pass", "fail", "unreviewed")
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetRow:
+    """Episode of a dataset; `recording` is the lab's row, if it was recorded here."""
+
+    index: int
+    length: int
+    seconds: float
+    task: str
+    uuid: str = ""
+    success: bool | None = None
+    result: str = ""  # label by the operator; unlike `success` it can be partial
+    outcome: str = ""
+    station: str = ""
+    recording: Episode | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Verdict of its review: "pass", "fail", or "" if undecided."""
+        review = getattr(getattr(self.recording, "standing", None), "review", None)
+        return str(review.verdict) if review else ""
+
+
+def list_rows(
+    name: str, *, words: str = "", success: str = "", result: str = "", verdict: str = ""
+) -> list[DatasetRow]:
+    """Return the episodes of a dataset whose task, uuid or station contain all `words`, filtered further.
+
+    `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; other values have no effect.
+    Raises: RecordingError; EvaError for too many words.
+    """
+    wanted = words_of(words.lower())
+    dataset = open_cached(name)
+    told = recorded_lines(dataset)
+    known = _known([str(line.get("uuid")) for line in told.values()])
+    found = [_row(dataset, listed, told.get(listed.index, {}), known) for listed in dataset.episodes]
+    return [row for row in found if _fits(row, wanted, success, result, verdict)]
+
+
+def recorded_lines(dataset: Dataset) -> dict[int, Mapping[str, Any]]:
+    """Return this program's own lines about the episodes of a dataset, by index; {} for a foreign dataset."""
+    lines = layout.read_lines(dataset.root / layout.EVA_EPISODES)
+    try:
+        return {int(line["episode_index"]): line for line in lines}
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError(
+            f"{dataset.root / layout.EVA_EPISODES} has a line of no episode: {error!r}"
+        ) from error
+
+
+def _known(uuids: Sequence[str]) -> dict[str, Episode]:
+    """Return the rows of these episodes in the database, by uuid."""
+    wanted = []
+    for uuid in uuids:
+        try:
+            wanted.append(UUID(uuid))
+        except ValueError:
+            continue
+    found: dict[str, Episode] = {}
+    for first in range(0, len(wanted), 500):  # limit of query parameters
+        chosen = Episode.objects.select_related("trial", "standing__review__reviewer")
+        found |= {str(row.uuid): row for row in chosen.filter(uuid__in=wanted[first : first + 500])}
+    return found
+
+
+def _row(dataset: Dataset, listed: Any, told: Mapping[str, Any], known: Mapping[str, Episode]) -> DatasetRow:
+    uuid, success, outcome = str(told.get("uuid", "")), told.get("success"), told.get("outcome")
+    return DatasetRow(
+        index=listed.index,
+        length=listed.length,
+        seconds=listed.length / dataset.fps,
+        task=", ".join(listed.tasks),
+        uuid=uuid,
+        success=success if isinstance(success, bool) else None,
+        result=result_of(told),
+        outcome=str(outcome.get("status", "")) if isinstance(outcome, Mapping) else "",
+        station=str(told.get("station", "")),
+        recording=known.get(uuid),
+    )
+
+
+def result_of(told: Mapping[str, Any]) -> str:
+    """Return "success", "partial", "fail" or "" from the line of an episode; older lines have only `success`."""
+    if told.get("result") in RESULTS[:3]:
+        return str(told["result"])
+    return {True: "success", False: "fail"}.get(told.get("success"), "")  # type: ignore[call-overload,no-any-return]
+
+
+def _fits(row: DatasetRow, words: Sequence[str], success: str, result: str, verdict: str) -> bool:
+    text = f"{row.task} {row.uuid} {row.station}".lower()
+    wanted = {"yes": True, "no": False, "unknown": None}
+    return (
+        all(word in text for word in words)
+        and (success not in wanted or row.success is wanted[success])
+        and (result not in RESULTS or (row.result or "unknown") == result)
+        and (verdict not in VERDICTS or (row.verdict or "unreviewed") == verdict)
+    )

@@ -1,0 +1,288 @@
+"""Replay of a recorded episode on a robot: values to be sent, suitability of a station, set-up arguments."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+from uuid import UUID
+
+from django.urls import reverse
+
+import robots
+from evaweb.datasets.dataset_orders import full_name
+from evaweb.datasets.playback import PlayedEpisode, load_played_episode
+from evaweb.episodes.folders import journal_folder
+from evaweb.episodes.models import EpisodeStatus
+from evaweb.episodes.selectors import episode_get
+from evaweb.errors import Conflict, EvaError, NotFound, StationGone
+from evaweb.roles import Role, require_role
+from evaweb.stations.commands import issue_command
+from evaweb.stations.models import Command, Station
+from evaweb.stations.robot_geometry import describe_robot
+from evaweb.stations.runtime_client import connection_to
+from runtime.core.sentences import Pattern
+from runtime.recording.base import IMPORTED
+from runtime.recording.files import RecordingError
+from runtime.recording.reader import open_episode
+
+_TAKES_NO_REPLAY_SETUP_DOES = Pattern(
+    "datasets.on_robot.takes_no_replay_setup_does",
+    "{kind} takes no replay: setup does",
+)
+_ARGS_SAY_BESIDE_REPLAY_WHICH = Pattern(
+    "datasets.on_robot.args_say_beside_replay_which",
+    "args say {doubled} beside the replay, which has its own: leave it out",
+)
+_NO_EPISODE_ALLOWED_UUID_DATASET = Pattern(
+    "datasets.on_robot.no_episode_allowed_uuid_dataset",
+    "{source!r:.120} is no episode; allowed: a uuid, or DATASET:INDEX",
+)
+_EPISODE_STILL_BEING_RECORDED = Pattern(
+    "datasets.on_robot.episode_still_being_recorded",
+    "episode {uuid} is still being recorded",
+)
+_EPISODE_DAMAGED = Pattern("datasets.on_robot.episode_damaged", "episode {uuid} is damaged: {damage}")
+_SPACE_ALLOWED = Pattern("datasets.on_robot.space_allowed", "space = {space!r:.40}; allowed: {spaces}")
+
+SPACES = {"joint": "joints", "eef": "end-effector poses"}
+TAIL_S = 1.0  # time for which the last row is held before the run ends
+RATE = 5.0  # inference rate [Hz]; each chunk covers at least a second
+
+
+@dataclass(frozen=True, slots=True)
+class PlayableEpisode:
+    """Episode for replay on a robot; `columns` maps spaces to the dataset's columns."""
+
+    source: str  # name in URLs
+    title: str
+    path: str  # folder of the dataset or recording
+    index: int
+    rows: int
+    fps: float
+    task: str
+    robot: str
+    joints: Sequence[str]
+    poses: Sequence[str]
+    columns: Mapping[str, str]  # columns of a dataset by space; {} for a recording
+    ours: bool  # recorded by this program, so that the frames of its poses are known
+
+    @property
+    def seconds(self) -> float:
+        return self.rows / self.fps
+
+    @property
+    def page(self) -> str:
+        """URL of its replay without a robot."""
+        if not self.columns:
+            return reverse("replay", args=[self.source])
+        name, _, index = self.source.rpartition(":")
+        path = reverse("dataset-replay", args=[name, int(index)])
+        said = not self.ours and self.robot in robots.robot_names()
+        return f"{path}?{urlencode({'robot': self.robot})}" if said else path
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayOffer:
+    """Replay of an episode at one station in one space; `differences` are the reasons why it is impossible."""
+
+    recorded: PlayableEpisode
+    station: Station
+    space: str
+    differences: tuple[str, ...]
+    running: bool  # the station responds
+
+    @property
+    def sent(self) -> str:
+        """Description of the values that are sent."""
+        return SPACES[self.space]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the values that are sent."""
+        return self.recorded.joints if self.space == "joint" else self.recorded.poses
+
+    @property
+    def asked(self) -> str:
+        """Arguments of the page's request for the set-up, as JSON."""
+        recorded = self.recorded
+        return json.dumps({"episode": recorded.source, "space": self.space, **_assumed(recorded)})
+
+    @property
+    def set_up(self) -> dict[str, Any]:
+        """Arguments of the set-up command."""
+        recorded = self.recorded
+        policy: dict[str, Any] = {
+            "kind": "replay",
+            "path": recorded.path,
+            "episode": recorded.index,
+            "space": self.space,
+            "horizon": max(10, round(recorded.fps)),
+        }
+        if recorded.columns:
+            key = "action" if self.space == "joint" else "action_eef"
+            policy["mapping"] = {key: recorded.columns[self.space]}
+        args = {"policy": policy, "strategy": {"kind": "naive", "inference_rate": RATE}}
+        return args | ({"task": recorded.task[:2000]} if recorded.task else {})
+
+    @property
+    def run(self) -> str:
+        """Arguments of the run command, as JSON: it ends by itself after the last row."""
+        return json.dumps({"duration_s": round(self.recorded.seconds + TAIL_S, 3)})
+
+    @property
+    def address(self) -> str:
+        """URL of the station's own page, on which it is set up and run."""
+        return f"{reverse('station-debug', args=[self.station.name])}?{query(self.recorded, self.space)}"
+
+
+def query(recorded: PlayableEpisode, space: str) -> str:
+    """Return the query string that selects the episode and space."""
+    return urlencode({"replay": recorded.source, "space": space, **_assumed(recorded)})
+
+
+def _assumed(recorded: PlayableEpisode) -> dict[str, str]:
+    return {"robot": recorded.robot} if recorded.columns else {}
+
+
+def replay_command(
+    *,
+    user: Any,
+    station: Station,
+    episode: str,
+    space: str = "joint",
+    robot: str = "",
+    kind: str,
+    args: Mapping[str, Any] | None = None,
+    **given: Any,
+) -> Command:
+    """Set a station up to play an episode, given by uuid or DATASET:INDEX; `given` as in `issue_command`.
+
+    Raises: EvaError for other commands; Conflict if the station's robot is not the episode's.
+    """
+    require_role(user, Role.OPERATOR)
+    if kind != "setup":
+        raise EvaError(_TAKES_NO_REPLAY_SETUP_DOES(kind=kind))
+    found = make_offer(playable_episode(episode, robot), station, space)
+    if found.differences:
+        raise Conflict("; ".join(found.differences))
+    beside = dict(args or {})
+    doubled = sorted(found.set_up.keys() & beside.keys() - {"task"})
+    if doubled:
+        raise EvaError(_ARGS_SAY_BESIDE_REPLAY_WHICH(doubled=", ".join(doubled)))
+    args = {**found.set_up, **beside}
+    return issue_command(user=user, station=station, kind=kind, args=args, vouched=("policy",), **given)
+
+
+def playable_episode(source: str, robot: str = "") -> PlayableEpisode:
+    """Return the episode of that name, interpreted for `robot` if given. Raises: NotFound, Conflict."""
+    try:
+        uuid = UUID(source)
+    except ValueError:
+        name, _, index = source.rpartition(":")
+        if not (name and index.isascii() and index.isdecimal() and len(index) < 10):
+            raise NotFound(_NO_EPISODE_ALLOWED_UUID_DATASET(source=source)) from None
+        try:
+            return _of_dataset(load_played_episode(full_name(name), int(index), robot))
+        except RecordingError as error:
+            raise Conflict(str(error)) from None
+    return _recording(uuid)
+
+
+def _recording(uuid: UUID) -> PlayableEpisode:
+    row = episode_get(uuid=uuid)
+    if row.status == EpisodeStatus.RECORDING:
+        raise Conflict(_EPISODE_STILL_BEING_RECORDED(uuid=uuid))
+    if row.damage:
+        raise Conflict(_EPISODE_DAMAGED(uuid=uuid, damage="; ".join(one["text"] for one in row.damage)))
+    try:
+        episode = open_episode(journal_folder(uuid))
+    except RecordingError as error:
+        raise Conflict(str(error)) from None
+    told = episode.manifest["robot"]
+    robot = told if isinstance(told, Mapping) else {}
+    has_poses = "eef_action" in episode.layout.streams
+    return PlayableEpisode(
+        source=str(uuid),
+        title=row.task or "Episode without a task",
+        path=str(episode.path.absolute()),
+        index=0,
+        rows=episode.frames,
+        fps=episode.layout.fps,
+        task=row.task,
+        robot=str(robot.get("name", "")),
+        joints=[str(name) for name in robot.get("joint_names") or ()],
+        poses=[str(name) for name in robot.get("eef_names") or ()] if has_poses else (),
+        columns={},
+        ours=row.kind != IMPORTED,
+    )
+
+
+def _of_dataset(shown: PlayedEpisode) -> PlayableEpisode:
+    features = shown.dataset.features
+    action = shown.action
+    poses = next((name for name in ("eef_action", "action_eef") if name in features), "")
+    joints = shown.names(action) if action else []
+    if shown.robot_is_assumed:
+        known = describe_robot(shown.robot)["joint_names"]
+        joints = known if len(known) == len(joints) else joints
+    return PlayableEpisode(
+        source=f"{shown.name}:{shown.index}",
+        title=shown.task or "Episode without a task",
+        path=str(shown.dataset.root.absolute()),
+        index=shown.index,
+        rows=shown.frames,
+        fps=shown.fps,
+        task=shown.task,
+        robot=shown.robot,
+        joints=joints,
+        poses=shown.names(poses) if poses else (),
+        columns={"joint": action, "eef": poses},
+        ours=bool(shown.uuid) and shown.told.get("kind") != IMPORTED and not shown.robot_is_assumed,
+    )
+
+
+def make_offer(recorded: PlayableEpisode, station: Station, space: str) -> ReplayOffer:
+    """Return the station's offer for the episode. Raises: EvaError for an unknown space."""
+    if space not in SPACES:
+        raise EvaError(_SPACE_ALLOWED(space=space, spaces=", ".join(SPACES)))
+    facts, running = _facts(station)
+    return ReplayOffer(recorded, station, space, tuple(_differences(recorded, facts, space)), running)
+
+
+def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
+    """Return the facts of the station's robot and True; else those of its description and False."""
+    try:
+        return connection_to(station.name).status()["facts"], True
+    except (StationGone, KeyError):
+        return describe_robot(station.robot), False
+
+
+def _differences(recorded: PlayableEpisode, facts: Mapping[str, Any], space: str) -> list[str]:
+    """Return all differences between the episode's robot and the station's; [] if there are none."""
+    found = []
+    own = str(facts.get("robot", ""))
+    if recorded.robot not in robots.robot_names():
+        called = f"calls its robot {recorded.robot!r}" if recorded.robot else "names no robot"
+        return [f"the episode {called}: choose its robot on its page in Replay, then come back"]
+    if recorded.robot != own:
+        found.append(f"the episode is of the robot {recorded.robot}, the station has {own}")
+    theirs, ours = list(recorded.joints), [str(name) for name in facts.get("joint_names", ())]
+    groups = [list(dict.fromkeys(name.partition(".")[0] for name in names)) for names in (theirs, ours)]
+    if groups[0] != groups[1]:
+        found.append(
+            f"the episode has the groups {', '.join(groups[0]) or 'none'}, the station {', '.join(groups[1])}"
+        )
+    elif theirs != ours:
+        found.append(
+            f"the episode has the joints {', '.join(theirs) or 'none'}, the station {', '.join(ours)}"
+        )
+    if space == "eef" and not recorded.poses:
+        found.append("the episode has no poses of its actions: send joints")
+    elif space == "eef" and not recorded.ours:
+        found.append("the frames of its poses are not known, because it was not recorded here: send joints")
+    elif space == "eef" and list(facts.get("eef_names", recorded.poses)) != list(recorded.poses):
+        found.append(f"the episode has the poses {', '.join(recorded.poses)}, the station others")
+    return found

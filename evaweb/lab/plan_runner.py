@@ -1,0 +1,130 @@
+"""Automated blind evaluation in lockstep: trial by trial as by an operator, scored by the bench's ground truth.
+
+The operator's session takes the station, confirms its cameras, requests trials, sets up, runs and scores, all over
+REST and the live socket; it never learns the checkpoint. Then the plan's owner closes and reveals the plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from evaweb.lab.progress import Progress
+from evaweb.lab.rest_client import LivePage, RestClient
+from evaweb.lab.single_trial import (
+    run_to_its_end,
+    score_by_truth,
+    set_up_and_run,
+    take_station,
+    wait_for_recorded,
+)
+from evaweb.lab.stall_detection import DemoFailed, wait_until
+
+_TRIES = 3  # attempts of a trial whose set-up or run is interrupted
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class CompletedTrial:
+    """Trial that counts, as known to the operator; `times` maps milestones to the time when they were reached
+    [s of the run].
+    """
+
+    code: str
+    trial: int
+    attempt: int
+    scene: str
+    position: int
+    success: bool
+    score: float
+    duration_s: float
+    times: Mapping[str, float]
+
+
+def run_plan(
+    operator: RestClient, station: str, plan: str, count: int, tell: Tell, progress: Progress
+) -> list[CompletedTrial]:
+    """Run the next `count` trials of a plan, or fewer if its design ends.
+
+    Raises:
+        DemoFailed: If a trial cannot be completed, or reveals its checkpoint.
+    """
+    made = []
+    with closing(LivePage(operator, station)) as page:
+        take_station(page)
+        operator.post(f"stations/{station}/cameras", {"first": True})
+        for number in range(1, count + 1):
+            try:
+                with progress.during(f"trial {number} of {count}"):
+                    one = _run_trial(operator, page, station, plan)
+            except DemoFailed:
+                if operator.get(f"plans/{plan}")["state"] == "frozen":
+                    raise
+                tell(f"the plan's design has ended after {number - 1} trials")
+                break
+            made.append(one)
+            verdict = "success" if one.success else "no success"
+            tell(f"{number:>3} of {count}  {one.code}  position {one.position}  {verdict}, {one.score:.0%}")
+    return [replace(one, duration_s=wait_for_recorded(operator, one.trial)["duration_s"]) for one in made]
+
+
+def close_and_reveal(owner: RestClient, plan: str, made: list[CompletedTrial]) -> dict[str, Any]:
+    """Close and reveal the plan; return commitment, key, and the trials with the names of their checkpoints."""
+    if owner.get(f"plans/{plan}")["state"] == "frozen":  # else its design has ended it
+        owner.post(f"plans/{plan}/close", {"reason": f"{len(made)} trials were made"})
+    told = owner.post(f"plans/{plan}/reveal", {})
+    trials = [{**asdict(one), "checkpoint": owner.get(f"trials/{one.trial}")["checkpoint"]} for one in made]
+    return {
+        "plan": told["name"],
+        "version": told["version"],
+        "digest": told["digest"],
+        "commitment": told["commitment"],
+        "key": told["key"],
+        "trials": trials,
+    }
+
+
+def _run_trial(operator: RestClient, page: LivePage, station: str, plan: str) -> CompletedTrial:
+    fault = ""
+    for _ in range(_TRIES):
+        handed = operator.post(f"plans/{plan}/next", {"station": station})
+        code, trial = handed["code"], handed["trial"]
+        _require_blind(code, trial)
+        try:
+            set_up_and_run(page, trial["id"], lockstep=True)
+            run_to_its_end(page, trial["id"], float(trial["time_limit_s"]), lockstep=True)
+            scored = score_by_truth(operator, trial["id"])
+        except DemoFailed as failed:
+            fault = str(failed)
+            _give_up(operator, page, trial["id"], fault)
+            continue
+        facts = {name: scored[name] for name in ("scene", "position", "success", "score", "duration_s")}
+        times = operator.get(f"trials/{trial['id']}")["truth"].get("reached", {})
+        return CompletedTrial(code=code, trial=trial["id"], attempt=handed["attempt"], times=times, **facts)
+    raise DemoFailed(f"a trial of {plan} was not made in {_TRIES} attempts: {fault}")
+
+
+def _require_blind(code: str, trial: Mapping[str, Any]) -> None:
+    if trial["checkpoint"] != code:
+        raise DemoFailed(
+            f"the plan is not blind for its operator, who was told {trial['checkpoint']!r} of {code}: nothing is run"
+        )
+
+
+def _give_up(operator: RestClient, page: LivePage, trial: int, fault: str) -> None:
+    """Free the station for the next attempt, whatever the trial's status."""
+    status = operator.get(f"trials/{trial}")["status"]
+    if status in ("running", "paused"):
+        page.command("stop")
+        over = wait_until(
+            lambda: operator.get(f"trials/{trial}"),
+            lambda found: found["status"] not in ("running", "paused"),
+            "waiting for the end of the trial",
+        )
+        status = over["status"]
+    if status == "prepared":
+        operator.post(f"trials/{trial}/abandon", {"reason": fault[:200]})
+    elif status in ("ended", "scored"):
+        operator.post(f"trials/{trial}/void", {"reason": fault[:200]})

@@ -1,0 +1,321 @@
+"""Selection of trials to rate again, and of pairs to compare, for each rater, without revealing checkpoints."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, tee
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from django.contrib.auth.models import User
+from django.db import IntegrityError, transaction
+from django.db.models import Exists, OuterRef, QuerySet
+
+from evaweb.episodes.models import Episode, EpisodeStatus
+from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.journal import clean_text
+from evaweb.plans.blinding_rules import has_looked_at_the_same
+from evaweb.plans.models import Handout, Plan, PlanState
+from evaweb.plans.seeded_draws import SeededDraws
+from evaweb.results.models import Preference, Rating
+from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
+from evaweb.results.ratings.video_available import is_watchable, may_become_watchable, require_video
+from evaweb.reviews.selectors import still_judges
+from evaweb.roles import Role, require_role, role_of
+from evaweb.trials import failures
+from evaweb.trials.models import Score, Trial, TrialStatus
+from evaweb.trials.record import journal_uuid
+from evaweb.trials.scoring import LONGEST_NOTE, score_outcome
+from evaweb.trials.services import failing, register_check, run_checks
+from runtime.core.sentences import Pattern, fixed
+
+_TRIAL_RATED_BY_SECOND_PERSON = Pattern(
+    "results.ratings.judging.trial_rated_by_second_person",
+    "trial {trial} is to be rated by a second person, and that may be you: rate it first (Result, Rate "
+    "again), then correct what is said of it",
+)
+_TRIAL_NOT_ONE_THOSE_RATED = Pattern(
+    "results.ratings.judging.trial_not_one_those_rated",
+    "trial {code} of {plan} is not one of those that are rated again",
+)
+_YOU_RAN_SCORED_TRIAL_SOMEONE = Pattern(
+    "results.ratings.judging.you_ran_scored_trial_someone",
+    "you ran or scored trial {code}: someone else rates it again",
+)
+_YOU_HAVE_SEEN_RESULTS_SECOND = Pattern(
+    "results.ratings.judging.you_have_seen_results_second",
+    "you have seen results of {plan}: a second rater must not know them",
+)
+_OUTCOME_ALLOWED = Pattern(
+    "results.ratings.judging.outcome_allowed",
+    "outcome = {outcome!r:.80}; allowed: {values}",
+)
+_WHY_EMPTY_SAY_SENTENCE_OTHERS = fixed(
+    "results.ratings.judging.why_empty_say_sentence_others",
+    "why is empty: say it in a sentence, others read it",
+)
+_WERE_NOT_RUN_ONE_AFTER = Pattern(
+    "results.ratings.judging.were_not_run_one_after",
+    "{first} and {second} were not run one after the other at the same initial condition",
+)
+_YOU_HAVE_SEEN_RESULTS_RATER = Pattern(
+    "results.ratings.judging.you_have_seen_results_rater",
+    "you have seen results of {plan}: a rater of preferences must not know them",
+)
+_HAS_NO_TRIAL = Pattern("results.ratings.judging.has_no_trial", "{plan} has no trial {code!r:.20}")
+_OTHERWISE_WHAT_SAID_STANDS = Pattern(
+    "results.ratings.judging.otherwise_what_said_stands",
+    "{twice}, and otherwise: what was said stands",
+)
+
+_STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)
+
+
+T = TypeVar("T")
+_NAMED = 200  # pairs per database query
+
+
+class NextItem(NamedTuple, Generic[T]):
+    """Next item for one rater, None if there is none; `left` is the number of items for this rater.
+
+    `passed` are codes of earlier trials that were skipped, because this machine has no images of them.
+    """
+
+    found: T | None
+    left: int
+    passed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two trials that were run consecutively from the same initial condition, in that order."""
+
+    plan: Plan
+    first: Handout
+    second: Handout
+
+
+def rating_sample(plan: Plan) -> list[int]:
+    """Return the schedule positions of the trials to rate again, in their order; drawn by the plan's key."""
+    n = plan.slots.count()
+    drawn = SeededDraws(bytes(plan.key or b""), "second rater").shuffled(range(n))
+    return drawn[: math.ceil(plan.second_rater_share * n)]
+
+
+def next_to_rate(user: User) -> NextItem[Handout]:
+    """Return the next trial with images that this user may rate again."""
+    mine: list[Handout] = []
+    for plan in Plan.objects.filter(state__in=_STATES, second_rater_share__gt=0).order_by("pk"):
+        if has_looked_at_the_same(plan, user):
+            continue
+        open_ones = {handout.slot.index: handout for handout in _unrated(plan, user)}
+        mine += [open_ones[index] for index in rating_sample(plan) if index in open_ones]
+    return _offered(mine, len(mine), lambda handout: (handout,))
+
+
+def _rated_first(what: str, trial: Trial, user: User) -> None:
+    """Check, before the wording of a score is corrected, that the user is not a potential second rater of the trial.
+
+    Correcting first would disqualify them as a rater, and mostly for failures; and a rater must not know the score's
+    wording.
+    """
+    if what != "reworded":
+        return
+    if any(_still_rates(user, plan, trial) for plan in Plan.objects.filter(handouts__trial=trial)):
+        raise NotAllowed(_TRIAL_RATED_BY_SECOND_PERSON(trial=trial.pk))
+
+
+register_check(_rated_first)
+
+
+@still_judges
+def _may_be_asked(user: User, episode: Episode) -> bool:
+    """Return True if this user may be asked to rate the trial of an episode a second time."""
+    trial = getattr(episode, "trial", None)
+    if trial is None or role_of(user) is Role.VIEWER:
+        return False
+    return any(_still_rates(user, plan, trial) for plan in Plan.objects.filter(handouts__trial=trial))
+
+
+def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
+    if plan.state not in _STATES or not plan.second_rater_share:
+        return False
+    handout = _unrated(plan, user).filter(trial=trial).first()
+    if handout is None or not handout.trial.episode.cameras or has_looked_at_the_same(plan, user):
+        return False  # this user will not be asked
+    return handout.slot.index in rating_sample(plan)
+
+
+def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> NextItem[T]:
+    """Return the first item with all images, else the first whose images may still arrive; earlier ones are `passed`.
+
+    `waiting` is read no further than necessary.
+    """
+    for there, each in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
+        passed: list[str] = []
+        for one in each:
+            lacking = [handout.code for handout in of(one) if not there(handout.trial.episode)]
+            if not lacking:
+                return NextItem(one, count, tuple(dict.fromkeys(passed)))
+            passed += lacking
+    return NextItem(None, count, tuple(dict.fromkeys(passed)))
+
+
+def _unrated(plan: Plan, user: User) -> QuerySet[Handout]:
+    rated = Rating.objects.filter(trial=OuterRef("trial"))
+    scored_by_me = Score.objects.filter(trial=OuterRef("trial"), rater=user)
+    rows = plan.handouts.filter(trial__status=TrialStatus.SCORED, trial__episode__isnull=False)
+    rows = rows.exclude(trial__episode__status=EpisodeStatus.MISSING)  # it would stay in the queue for ever
+    rows = rows.exclude(trial__operator=user).exclude(Exists(rated)).exclude(Exists(scored_by_me))
+    return rows.select_related("slot", "plan", "trial__scene", "trial__episode")
+
+
+@transaction.atomic
+def save_rating(
+    *,
+    user: User,
+    plan: Plan,
+    code: str,
+    milestones: Mapping[object, object],
+    success: bool | None = None,
+    failure: str = "",
+    failure_phase: str = "",
+    note: str = "",
+) -> Rating:
+    """Record a second rating of the trial with that code: in the journal, then in the database.
+
+    Raises:
+        Conflict: If the trial is not to be rated again, has no video, or the user has rated it differently before.
+        NotAllowed: If the user ran or scored the trial, or has seen results of the plan.
+    """
+    require_role(user, Role.OPERATOR)
+    handout = _handout(plan, code)
+    trial = handout.trial
+    if handout.slot.index not in rating_sample(plan) or trial.status != TrialStatus.SCORED:
+        raise Conflict(_TRIAL_NOT_ONE_THOSE_RATED(code=code, plan=plan))
+    if trial.operator_id == user.pk or trial.scores.filter(rater=user).exists():
+        raise NotAllowed(_YOU_RAN_SCORED_TRIAL_SOMEONE(code=code))
+    run_checks("judged", trial, user)
+    twice = f"you have rated trial {code} already"
+    fails = bool(failing(trial))
+    found = score_outcome(list(trial.scene.milestones.order_by("order")), milestones, success, fails=fails)
+    said = {
+        "success": found.success,
+        "score": found.score,
+        "milestones": [[row[0].text, row[1]] for row in found.reached],
+        **failures.clean_failure(failure_phase=failure_phase, failure=failure),
+        "note": clean_text("note", note, LONGEST_NOTE),
+    }
+    before = Rating.objects.filter(trial=trial, rater=user).first()
+    if before is not None:
+        return _is_repeat(before, said, twice)
+    if has_looked_at_the_same(plan, user):
+        raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_SECOND(plan=plan))
+    failures.check_failure(trial.scene, said, success=found.success)
+    require_video(handout)
+    rating = Rating(trial=trial, rater=user, blind=plan.sealed, **said)
+    RATINGS.append(journal_uuid(trial), RatingLine.written(rating))
+    return _once(rating, twice)
+
+
+def next_to_compare(user: User, plans: Iterable[Plan] | None = None) -> NextItem[Pair]:
+    """Return the next pair with images that this user has not compared."""
+    fresh: list[tuple[Plan, list[tuple[int, int]]]] = []
+    for plan in plans if plans is not None else Plan.objects.filter(state__in=_STATES).order_by("pk"):
+        if not has_looked_at_the_same(plan, user):
+            judged = set(Preference.objects.filter(plan=plan, rater=user).values_list("first", "second"))
+            fresh.append((plan, [pair for pair in _pairs(plan) if pair not in judged]))
+    named = (
+        pair
+        for plan, pairs in fresh
+        for begin in range(0, len(pairs), _NAMED)
+        for pair in _named(plan, pairs[begin : begin + _NAMED])
+    )
+    return _offered(named, sum(len(pairs) for _, pairs in fresh), lambda pair: (pair.first, pair.second))
+
+
+def _pairs(plan: Plan) -> list[tuple[int, int]]:
+    """Return the pairs of consecutive trials in one block that both count and are recorded on this disk."""
+    rows = plan.handouts.filter(trial__status=TrialStatus.SCORED, trial__episode__isnull=False)
+    blocks: dict[int, list[tuple[int, str]]] = defaultdict(list)
+    of_each = rows.order_by("number").values_list("slot__block", "trial", "trial__episode__status")
+    for block, trial, status in of_each:
+        blocks[block].append((trial, status))
+    gone = EpisodeStatus.MISSING
+    neighbours = (pair for block in blocks.values() for pair in pairwise(block))
+    return [(one, other) for (one, at), (other, there) in neighbours if gone not in (at, there)]
+
+
+def _named(plan: Plan, pairs: Sequence[tuple[int, int]]) -> list[Pair]:
+    trials = {trial for pair in pairs for trial in pair}
+    of_plan = plan.handouts.filter(trial__in=trials)
+    rows = {
+        row.trial_id: row
+        for row in of_plan.select_related("trial__episode", "trial__scene", "trial__position")
+    }
+    return [Pair(plan, rows[first], rows[second]) for first, second in pairs]
+
+
+@transaction.atomic
+def save_preference(*, user: User, plan: Plan, first: str, second: str, outcome: str, why: str) -> Preference:
+    """Record which of two trials was better, in the journal, then in the database; `first` was run first.
+
+    Raises:
+        Conflict: If they were not run consecutively, lack a video, or the user has compared them differently
+            before.
+        NotAllowed: If the user has seen results of the plan.
+    """
+    require_role(user, Role.OPERATOR)
+    if outcome not in Preference.Outcome.values:
+        raise EvaError(_OUTCOME_ALLOWED(outcome=outcome, values=", ".join(Preference.Outcome.values)))
+    reason = clean_text("why", why, LONGEST_NOTE)
+    if not reason:
+        raise EvaError(_WHY_EMPTY_SAY_SENTENCE_OTHERS)
+    one, other = _handout(plan, first), _handout(plan, second)
+    if (one.trial_id, other.trial_id) not in _pairs(plan):
+        raise Conflict(_WERE_NOT_RUN_ONE_AFTER(first=first, second=second))
+    twice = f"you have compared {first} and {second} already"
+    said = {"outcome": outcome, "why": reason}
+    before = Preference.objects.filter(first=one.trial, second=other.trial, rater=user).first()
+    if before is not None:
+        return _is_repeat(before, said, twice)
+    if has_looked_at_the_same(plan, user):
+        raise NotAllowed(_YOU_HAVE_SEEN_RESULTS_RATER(plan=plan))
+    require_video(one, other)
+    row = Preference(plan=plan, first=one.trial, second=other.trial, rater=user, blind=plan.sealed, **said)
+    RATINGS.append(journal_uuid(other.trial), PreferenceLine.written(row))
+    return _once(row, twice)
+
+
+def _handout(plan: Plan, code: str) -> Handout:
+    """Return the handout of a code with its trial's row locked for the transaction, so that only one process
+    writes its journal.
+    """
+    rows = plan.handouts.select_related("slot", "trial__scene", "trial__episode")
+    found = rows.filter(code=code).first()
+    if found is None:
+        raise NotFound(_HAS_NO_TRIAL(plan=plan, code=code))
+    found.trial.status = Trial.objects.select_for_update().get(pk=found.trial_id).status
+    return found
+
+
+def _is_repeat(before: T, said: Mapping[str, Any], twice: str) -> T:
+    """Return the earlier answer if the same is sent again, as after a lost reply.
+
+    Raises:
+        Conflict: If the new answer differs.
+    """
+    if any(getattr(before, name) != value for name, value in said.items()):
+        raise Conflict(_OTHERWISE_WHAT_SAID_STANDS(twice=twice))
+    return before
+
+
+def _once(row: Any, twice: str) -> Any:
+    try:
+        with transaction.atomic():
+            row.save()
+    except IntegrityError:
+        raise Conflict(twice) from None
+    return row

@@ -1,0 +1,63 @@
+"""Shows what happens at a station: figures as they change, events by their numbers, so that none is missed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from typing import Any
+
+from runtime.clients.client import StationClient
+from runtime.clients.terminal.status_text import status_line
+from runtime.ipc.session_state import complete_state_meaning
+
+_SHOW_S = 0.5
+_PATIENCE_S = 2.0
+
+
+def watch(client: StationClient, as_json: bool) -> int:
+    """Print until interrupted; the stream only wakes, events are fetched by number so that none is missed."""
+    status = client.status()
+    boot, seen, shown = status["boot"], status["newest_event"], 0.0
+    subscriber = client.subscribe("state")
+    while True:
+        heard = subscriber.receive(_PATIENCE_S)
+        if "state" in heard:
+            status = complete_state_meaning(heard["state"])
+        else:
+            status = client.status()  # raises a sentence where the station is gone
+            subscriber.close()
+            subscriber = client.subscribe("state")  # a restarted one has other sockets
+        if status["boot"] != boot:
+            boot, seen = status["boot"], 0
+        if status["newest_event"] > seen:
+            for event in client.events_since(seen):
+                tell(event, as_json)
+                seen = event["number"]
+        if time.monotonic() - shown > _SHOW_S:
+            shown = time.monotonic()
+            print(
+                json.dumps(status, default=str) if as_json else status_line(status, client.holder), flush=True
+            )
+
+
+def tell(event: dict[str, Any], as_json: bool = False) -> None:
+    """One event as a line."""
+    print(json.dumps(event, default=str) if as_json else f"  {event['kind']}: {event['text']}", flush=True)
+
+
+def list_events(client: StationClient, given: argparse.Namespace) -> int:
+    """Print what has happened since the station was started, with how long ago each was."""
+    now = client.status()["clock"]
+    events = [
+        event
+        for event in client.events_since(given.since)
+        if given.kind is None or event["kind"] in given.kind
+    ]
+    for event in events if given.last is None else events[-given.last or len(events) :]:
+        if given.json:
+            tell(event, as_json=True)
+        else:
+            ago = f"{now - event['time']:8.1f} s ago"
+            print(f"{event['number']:6} {ago}  {event['kind']}: {event['text']}")
+    return 0

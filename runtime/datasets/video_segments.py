@@ -1,0 +1,155 @@
+"""Takes the video of one episode out of a file, as the same coded pictures where that is possible."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from runtime.core.errors import RecordingError
+from runtime.core.picture_bounds import TooLargeError, open_video
+from runtime.datasets.entries import Span
+from runtime.datasets.remux import copied_stream
+from runtime.datasets.video_frames import VideoFrames, VideoSegment
+
+if TYPE_CHECKING:
+    import av
+
+TOLERANCE = 1e-4  # of LeRobot, between a row and its picture [s]
+ENCODING = {"crf": "18", "preset": "veryfast", "g": "2", "bf": "0"}  # x264, where pictures are coded again
+
+
+class NotCopyableError(RecordingError):
+    """The coded pictures of the episode cannot be had without those of others."""
+
+
+def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
+    """Put the `frames` coded pictures of `span` into `target`, frame k at k / fps, index at the front.
+
+    A file that is all of that already is copied as it is. Raises NotCopyableError where the first is no key frame or
+    other pictures lie between them in coded order, RecordingError where pictures are missing.
+    """
+    stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
+    with VideoFrames(span.path, stretch) as scan:
+        times, ticks = scan.times, scan.stamps
+    if len(times) < frames:
+        raise RecordingError(f"{span.path} has {len(times)} frames for {frames} rows")
+    off = np.abs(np.array(times[:frames]) - times[0] - np.arange(frames) / fps).max(initial=0.0)
+    if len(times) != frames and off > 0.5 / fps:  # as many pictures as rows are those of the rows
+        raise RecordingError(
+            f"{span.path}: its pictures are up to {off:.2f} s off the rows, which come at {fps:g} Hz: "
+            "make its video anew at that rate"
+        )
+    if not span.start and _is_ready(span.path, frames, fps):
+        shutil.copyfile(span.path, target)
+        return
+    _copy(span.path, target, ticks[:frames], fps)
+
+
+def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
+    """As `cut`, but with the pictures decoded and coded again as H.264: they lose a little."""
+    import av
+
+    stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
+    rate = Fraction(fps).limit_denominator(10_000)
+    try:
+        with (
+            VideoFrames(span.path, stretch) as pictures,
+            av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
+        ):
+            if pictures.is_deep:
+                raise RecordingError(
+                    f"{span.path} has depth of more than 8 bits, of which coding it again would leave 8: "
+                    "cut it with the program that made it"
+                )
+            stream = container.add_stream("libx264", rate=rate, options=dict(ENCODING))
+            stream.height, stream.width = pictures.size
+            stream.pix_fmt = "yuv420p"
+            for number in range(frames):
+                frame = av.VideoFrame.from_ndarray(pictures[number], format="rgb24")
+                frame.pts, frame.time_base = number, 1 / rate
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+    except (av.FFmpegError, OSError, IndexError, ValueError) as error:
+        raise RecordingError(f"{span.path} cannot be coded again: {error}") from error
+
+
+def other_streams(path: Path) -> set[str]:
+    """Kinds of what a video file holds beside its pictures."""
+    with open_video(path) as container:
+        return {stream.type for stream in container.streams} - {"video"}
+
+
+def _is_ready(path: Path, frames: int, fps: float) -> bool:
+    """True if the whole file is what is wanted: these frames at these times, its index at the front."""
+    with VideoFrames(path) as whole:
+        times = whole.times
+    if len(times) != frames or np.abs(np.array(times) - np.arange(frames) / fps).max() > TOLERANCE:
+        return False
+    with open(path, "rb") as file:
+        return _index_first(file)
+
+
+def _index_first(file: Any) -> bool:
+    """True if the box `moov` comes before `mdat`."""
+    while len(head := file.read(8)) == 8:
+        size, kind = int.from_bytes(head[:4], "big"), head[4:]
+        if kind in (b"moov", b"mdat"):
+            return bool(kind == b"moov")
+        if size == 1:
+            size = int.from_bytes(file.read(8), "big") - 8
+        if size < 8:
+            return False
+        file.seek(size - 8, 1)
+    return False
+
+
+def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
+    import av
+
+    rate = Fraction(fps).limit_denominator(10_000)
+    rank = {tick: number for number, tick in enumerate(ticks)}
+    try:
+        with (
+            open_video(source) as recorded,
+            av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
+        ):
+            packets = list(_coded(source, recorded, rank))
+            # Pictures are decoded as much earlier as the most belated of them in coded order wants.
+            ahead = max(number - rank[packet.pts] for number, packet in enumerate(packets))
+            copy = copied_stream(container, recorded.streams.video[0])
+            copy.time_base = 1 / rate
+            for number, packet in enumerate(packets):
+                packet.pts, packet.dts = rank[packet.pts], number - ahead
+                packet.duration, packet.time_base = 1, 1 / rate
+                packet.stream = copy
+                container.mux(packet)
+    except (av.FFmpegError, OSError, IndexError, TooLargeError) as error:
+        raise RecordingError(f"{source} cannot be copied: {error}") from error
+
+
+def _coded(source: Path, recorded: av.container.InputContainer, rank: dict[int, int]) -> Iterator[Any]:
+    """The packets of the pictures in `rank` (their number by time stamp), in coded order."""
+    first = min(rank, key=rank.__getitem__)
+    stream = recorded.streams.video[0]
+    recorded.seek(first, stream=stream)
+    missing = set(rank)
+    for packet in recorded.demux(stream):
+        if packet.pts is None or packet.is_discard:
+            continue
+        begun = len(missing) < len(rank)
+        if not begun and packet.pts not in missing:
+            continue
+        if not begun and not (packet.pts == first and packet.is_keyframe):
+            raise NotCopyableError(f"{source}: the episode does not begin with a key frame")
+        if packet.pts not in missing:
+            raise NotCopyableError(f"{source}: pictures of others lie between those of the episode")
+        missing.remove(packet.pts)
+        yield packet
+        if not missing:
+            return
+    raise RecordingError(f"{source} ends {len(missing)} frames early")

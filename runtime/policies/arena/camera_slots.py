@@ -1,0 +1,75 @@
+"""Assignment of cameras to the slots of a RoboArena request: declared, never derived from an order.
+
+Servers and most clients number the exterior cameras from 0, the original client from 1. A server that receives the
+other numbering uses a picture for the wrong view, or drops it, without an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+from runtime.core.errors import ConfigurationError, ContradictionError
+from runtime.policies.arena.requirements import ServerRequirements
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Numbering = Literal["0-based", "1-based"]
+Slot = Literal["first", "second", "wrist", "first_stereo", "second_stereo", "wrist_stereo"]
+_FIRST: dict[Numbering, int] = {"0-based": 0, "1-based": 1}
+
+
+class Cameras:
+    """Slots of a robot's cameras by observation key.
+
+    Raises ConfigurationError for unknown cameras or repeated slots.
+    """
+
+    def __init__(self, cameras: Mapping[str, Slot], numbering: Numbering, robot: Robot) -> None:
+        known = [camera.key for camera in robot.cameras]
+        unknown = [key for key in cameras if key not in known]
+        if unknown:
+            raise ConfigurationError(
+                f"policy.cameras names {', '.join(unknown)}; cameras of {robot.name}: {', '.join(known)}"
+            )
+        self._by_slot = {slot: key for key, slot in cameras.items()}
+        if len(self._by_slot) != len(cameras):
+            raise ConfigurationError(
+                f"policy.cameras puts two cameras into one slot: {dict(cameras)}; allowed: each slot once"
+            )
+        self._numbering: Numbering = numbering
+
+    def assign(self, wants: ServerRequirements) -> dict[str, str]:
+        """Return request key = observation key for the server's views, in its order; other cameras are not sent.
+
+        Raises ContradictionError if it needs a view for which no camera is declared.
+        """
+        found: dict[str, str] = {}
+        for slot, key in _keys(wants, self._numbering):
+            if slot not in self._by_slot:
+                declared = ", ".join(f"{k} = {s}" for s, k in self._by_slot.items()) or "none"
+                raise ContradictionError(
+                    f"the server wants {key} (n_external_cameras = {wants.externals}, needs_wrist_camera = "
+                    f"{wants.wrist}, needs_stereo_camera = {wants.stereo}), policy.cameras has no {slot!r}, only "
+                    f"{declared}; say which camera it is"
+                )
+            found[key] = self._by_slot[slot]
+        return found
+
+
+def _keys(wants: ServerRequirements, numbering: Numbering) -> list[tuple[Slot, str]]:
+    """Return slots and request keys in the order of the protocol's messages."""
+    slots: tuple[Slot, Slot] = ("first", "second")
+    stereo: tuple[Slot, Slot] = ("first_stereo", "second_stereo")
+    keys: list[tuple[Slot, str]] = []
+    for place in range(wants.externals):
+        name = f"observation/exterior_image_{_FIRST[numbering] + place}"
+        keys.append((slots[place], f"{name}_left"))
+        if wants.stereo:
+            keys.append((stereo[place], f"{name}_right"))
+    if wants.wrist:
+        keys.append(("wrist", "observation/wrist_image_left"))
+        if wants.stereo:
+            keys.append(("wrist_stereo", "observation/wrist_image_right"))
+    return keys

@@ -1,0 +1,90 @@
+"""Marks of damaged recordings, DATA/quarantine/<uuid>.json, and the condition for their removal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from runtime.core.errors import RecordingError
+from runtime.recording.files import read_json
+from runtime.recording.integrity import Damage, IntegrityCheck
+from runtime.recording.outcome_seal import OUTCOME
+
+FOLDER = "quarantine"
+
+
+@dataclass(frozen=True, slots=True)
+class DamageMark:
+    """Damage found in a recording.
+
+    `damage` has the form of `IntegrityCheck.to_dict`. `seal` is that of the outcome when the damage was found; "" if
+    it had none, None if it is unknown.
+    """
+
+    damage: list[dict[str, Any]]
+    seal: str | None
+
+    def is_resolved_by(self, verdict: IntegrityCheck) -> bool:
+        """Return True if the same recording is intact again, and not one that was sealed anew since."""
+        if verdict.state == "sound":
+            return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
+        files = {one["file"] for one in self.damage}
+        unsealed_then = bool(files) if self.seal == "" else self.seal is None and files == {OUTCOME}
+        return verdict.state == "unsealed" and not verdict.why and unsealed_then
+
+
+def mark_file(data: Path, uuid: str) -> Path:
+    """Return the path of a recording's mark."""
+    return data / FOLDER / f"{uuid}.json"
+
+
+def data_of(folder: Path) -> Path | None:
+    """Return the data folder of DATA/episodes/<uuid>; None for an episode elsewhere."""
+    episodes = folder.absolute().parent
+    return episodes.parent if episodes.name == "episodes" else None
+
+
+def read_mark(data: Path, uuid: str) -> DamageMark | None:
+    """Return the mark of a recording or None. A mark that is itself unreadable is returned without damage."""
+    path = mark_file(data, uuid)
+    if not path.exists():
+        return None
+    try:
+        told = read_json(path)
+    except RecordingError:
+        told = {}
+    damage, seal = told.get("damage"), told.get("seal")
+    if not (isinstance(damage, list) and all(map(_is_damage_table, damage))):
+        return DamageMark([], "")
+    return DamageMark(damage, seal if isinstance(seal, str) else None)
+
+
+def known_damage(verdict: IntegrityCheck) -> tuple[Damage, ...]:
+    """Return damage found by an earlier check that `verdict` does not resolve."""
+    data = data_of(verdict.path)
+    mark = read_mark(data, verdict.path.name) if data else None
+    if mark is None or mark.is_resolved_by(verdict):
+        return ()
+    spoiled = Damage(f"{FOLDER}/{verdict.path.name}.json", "is no mark any more, and was one")
+    return tuple(_damage(one) for one in mark.damage) or (spoiled,)
+
+
+def _damage(told: Mapping[str, Any]) -> Damage:
+    spans = {name: tuple((first, last) for first, last in told[name]) for name in ("rows", "times")}
+    return Damage(told["file"], told["what"], **spans)
+
+
+def _is_damage_table(one: object) -> bool:
+    """Return True if it has the form of a damage in `IntegrityCheck.to_dict`."""
+    if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
+        return False
+    words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
+    return words and _are_spans(one["rows"], int) and _are_spans(one["times"], float)
+
+
+def _are_spans(value: object, kind: type) -> bool:
+    """Return True if it is a list of [first, last] pairs."""
+    spans = value if isinstance(value, list) else [None]
+    return all(isinstance(span, list) and [type(end) for end in span] == [kind, kind] for span in spans)
