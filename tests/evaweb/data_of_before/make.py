@@ -20,9 +20,9 @@ from evaweb.collect.record import SESSIONS
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.plans.allocation import allocate_trial
-from evaweb.plans.toml_exchange import export_toml
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan
+from evaweb.plans.toml_exchange import export_toml
 from evaweb.results.ratings import rating_queue
 from evaweb.reviews import services as reviews
 from evaweb.trials import services, voids

@@ -14,8 +14,8 @@ from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
 from evaweb.jobs import doorbell
-from evaweb.plans.toml_exchange import import_file
 from evaweb.plans.models import Plan
+from evaweb.plans.toml_exchange import import_file
 from evaweb.results.models import Preference, Rating
 from evaweb.reviews.models import Review, Segment, Standing
 from evaweb.trials.models import (
