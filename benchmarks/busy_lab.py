@@ -61,10 +61,10 @@ def _up(lab: Any, given: argparse.Namespace) -> None:
     from evaweb.lab.benches import Bench
     from evaweb.lab.processes import ProgramSpec
     from evaweb.roles import Role
-    from runtime.sim.standin import announce_ready
+    from runtime.simulation.program import announce_ready
 
     node = lab.processes.start(programs.tabletop(ROBOT, programs.bench(1, 640, 480)))
-    serving = ("-m", "runtime.sim.serve", "openpi", *_POLICY)
+    serving = ("-m", "runtime.standins.serve", "openpi", *_POLICY)
     policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
     assignments = [
         f'transport.sub_endpoint="{node["obs_endpoint"]}"',

@@ -18,16 +18,16 @@ from runtime.core.clock import VirtualClock
 from runtime.core.types import ActionChunk, Conditioning, Float64, Observation, UInt8
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.lockstep.lockstep import Lockstep
-from runtime.sim.bench import BenchState, camera_arm
-from runtime.sim.chase import ChaseScript, PlaceMap
-from runtime.sim.continuing import CommittedPrefix, continue_prefix
-from runtime.sim.conveyor import CONVEYOR, Conveyor
-from runtime.sim.lockstep import in_process_peers
-from runtime.sim.node import parser
-from runtime.sim.plant import Plant
-from runtime.sim.render import Renderer
-from runtime.sim.surroundings import Environment
-from runtime.sim.tabletop import ResetRequest
+from runtime.simulation.bench.bench import BenchState, camera_arm
+from runtime.simulation.bench.conveyor import CONVEYOR, Conveyor
+from runtime.simulation.bench.plant import Plant
+from runtime.simulation.bench.tabletop import ResetRequest
+from runtime.simulation.environments import Environment
+from runtime.simulation.node import parser
+from runtime.simulation.render import Renderer
+from runtime.simulation.scripts.chase import ChaseScript, PlaceMap
+from runtime.standins.continuing import CommittedPrefix, continue_prefix
+from runtime.standins.lockstep import in_process_peers
 from runtime.station.checks import check_deployment
 
 HORIZON = 50  # rows of a chunk

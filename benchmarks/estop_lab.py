@@ -63,14 +63,24 @@ def _limit_files() -> None:
 def _up(lab: Any, ready_file: Path) -> None:
     from evaweb.lab.benches import Bench
     from evaweb.lab.processes import ProgramSpec
-    from runtime.sim.standin import announce_ready
+    from runtime.simulation.program import announce_ready
 
     small = ("--robot", _ROBOT, "--width", "64", "--height", "48")
     free = ("--obs-endpoint", "tcp://127.0.0.1:0", "--action-endpoint", "tcp://127.0.0.1:0")
     node = lab.processes.start(
-        ProgramSpec("bench", ("-m", "runtime.sim.node", *small, *free), announces=True)
+        ProgramSpec("bench", ("-m", "runtime.simulation.node", *small, *free), announces=True)
     )
-    serving = ("-m", "runtime.sim.serve", "openpi", "--robot", _ROBOT, "--port", "0", "--latency-ms", "80")
+    serving = (
+        "-m",
+        "runtime.standins.serve",
+        "openpi",
+        "--robot",
+        _ROBOT,
+        "--port",
+        "0",
+        "--latency-ms",
+        "80",
+    )
     policy = lab.processes.start(ProgramSpec("policy", serving, announces=True))
     # Programs are named after deployment files: each station needs its own.
     pressed = _bench("demo.toml", PRESSED, node["obs_endpoint"], node["action_endpoint"], policy["url"])

@@ -45,7 +45,7 @@ def _announce(ready_file: Path, url: str, stops: str, pids: dict[str, int]) -> N
     from evaweb.lab.demo_rows import demo_login, station_registered
     from evaweb.roles import Role
     from evaweb.stations.enrolment import code_make
-    from runtime.sim.standin import announce_ready
+    from runtime.simulation.program import announce_ready
 
     logins = [demo_login(username=str(role), role=role) for role in (Role.OPERATOR, Role.ADMIN)]
     admin, enrol = User.objects.get(username=Role.ADMIN), {}

@@ -1,11 +1,11 @@
 """Moving target: a block rides on the simulated conveyor, and each strategy should keep the fingertips next to it.
 
 All components are those of the product, in lockstep and deterministic: node with gate, plant and messages
-(runtime/sim), the complete station (media, coordinator, control, safety), and the strategies. Only time is virtual,
-and there are no sockets. Design decisions:
+(runtime/simulation), the complete station (media, coordinator, control, safety), and the strategies. Only time is
+virtual, and there are no sockets. Design decisions:
 
-* The policy (runtime/sim/chase.py) gets an image per request, extrapolates the block's motion, and answers with 50
-  rows at 30 Hz. It knows the lag of robots and the ends of the belt, but not when the belt will turn.
+* The policy (runtime/simulation/scripts/chase.py) gets an image per request, extrapolates the block's motion, and
+  answers with 50 rows at 30 Hz. It knows the lag of robots and the ends of the belt, but not when the belt will turn.
 * The belt changes its speed every 2.6 s on average, at 60 to 100 mm/s: far below the arm's limits, so that only timing
   matters. On target: fingertips at most half of a block's edge, 20 mm, from their place next to it. Success: on target
   for two thirds of the 20 s of the course. This threshold was set when the shares were known, between those of `async`
@@ -38,7 +38,7 @@ from benchmarks.report import Figure, Report
 from runtime.core.types import Float64
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
-from runtime.sim.conveyor import COURSE_S, Conveyor
+from runtime.simulation.bench.conveyor import COURSE_S, Conveyor
 
 DELAYS = (0, 1, 3, 8, 15)  # control ticks of 1/30 s
 STRATEGIES: Mapping[str, Mapping[str, Any]] = {

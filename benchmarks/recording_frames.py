@@ -9,7 +9,7 @@ from numpy.lib.format import open_memmap
 
 from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, WIDTH
 from robots import load_robot
-from runtime.sim.pictures import Scene
+from runtime.simulation.bench.numbered_frames import Scene
 
 COUNT = 90
 

@@ -21,7 +21,7 @@ from benchmarks.wires_receiver import FPS
 from benchmarks.wires_recording import record
 from runtime.core.errors import ConfigurationError, SetupError
 from runtime.core.plugins import variants
-from runtime.sim.ros_domain import free_domain
+from runtime.simulation.ros.ros_domain import free_domain
 
 ROBOT, ROS2_ROBOT = "agilex_piper", "r1_lite"
 PATIENCE_S = 60.0

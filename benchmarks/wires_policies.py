@@ -49,7 +49,7 @@ _PEER = "openpi-client"
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Protocol by its name in `runtime.sim.serve`: our settings, and options of the server."""
+    """Protocol by its name in `runtime.standins.serve`: our settings, and options of the server."""
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -234,7 +234,7 @@ def _weighed(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> 
 @contextlib.contextmanager
 def _server(protocol: Protocol) -> Iterator[str]:
     """Yield the address of a stand-in server in a separate process."""
-    command = [sys.executable, "-m", "runtime.sim.serve", protocol.name, "--robot", ROBOT, "--port", "0"]
+    command = [sys.executable, "-m", "runtime.standins.serve", protocol.name, "--robot", ROBOT, "--port", "0"]
     command += ["--horizon", str(HORIZON), "--rate", str(RATE), "--lifeline", *protocol.options]
     child = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert child.stdin is not None

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from robots import Robot
 from runtime.datasets.mapping import video_key
-from runtime.sim.pictures import Scene
+from runtime.simulation.bench.numbered_frames import Scene
 
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"

@@ -1,8 +1,8 @@
 """Sender at the other end of a transport, and the start times of its messages.
 
-`python -m benchmarks.wires_sender TIMES PAGE MODULE ARGUMENT...` runs the simulated robot `runtime.sim.MODULE`, or
-with MODULE "cameras" MJPEG cameras: COUNT RATE WIDTH HEIGHT. At its end it writes the times [s] to the file TIMES as
-JSON: by message from 0 on, or by camera. If PAGE is the descriptor of the shared state that receives a simulated
+`python -m benchmarks.wires_sender TIMES PAGE MODULE ARGUMENT...` runs the simulated robot `runtime.simulation.MODULE`,
+or with MODULE "cameras" MJPEG cameras: COUNT RATE WIDTH HEIGHT. At its end it writes the times [s] to the file TIMES
+as JSON: by message from 0 on, or by camera. If PAGE is the descriptor of the shared state that receives a simulated
 robot's images, it is never more than a few images ahead, so that none is lost.
 """
 
@@ -22,8 +22,8 @@ from benchmarks.wires_receiver import layout
 from robots.broken_pipe import exit_on_broken_pipe
 from runtime.core.clock import Clock
 from runtime.ipc.shared_state import SharedState
-from runtime.sim import node, standin
-from runtime.sim.mjpeg_server import MjpegServer
+from runtime.simulation import node, program
+from runtime.standins.mjpeg_server import MjpegServer
 
 _AHEAD = 4  # images; the queues of every transport are at least as long
 _LOOK_S = 0.0005
@@ -84,7 +84,7 @@ def main(file: str, shared: str, module: str, *arguments: str) -> int:
     """Run the sender; return the exit code of the simulated robot."""
     if module == "cameras":
         return _cameras(Path(file), arguments)
-    simulated = importlib.import_module(f"runtime.sim.{module}")
+    simulated = importlib.import_module(f"runtime.simulation.{module}")
     plain = simulated.run
 
     def run(ticking: node.Ticking, clock: Clock, rate: float, told: Event) -> None:
@@ -106,8 +106,8 @@ def _pace(shared: str, arguments: Sequence[str], clock: Clock) -> Pace:
 def _cameras(file: Path, arguments: Sequence[str]) -> int:
     count, rate, width, height = int(arguments[0]), float(arguments[1]), int(arguments[2]), int(arguments[3])
     servers = [TimestampingCameraServer(width, height, rate) for _ in range(count)]
-    told = standin.stop_event(lifeline=True)
-    standin.announce_ready({"urls": [server.start() for server in servers]}, None)
+    told = program.stop_event(lifeline=True)
+    program.announce_ready({"urls": [server.start() for server in servers]}, None)
     told.wait()
     for server in servers:
         server.close()

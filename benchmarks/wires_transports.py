@@ -31,7 +31,7 @@ from benchmarks.wires_receiver import FPS, Receiving, layout
 from runtime.core.clock import MonotonicClock
 from runtime.core.types import UInt8
 from runtime.ipc.shared_state import SharedState
-from runtime.sim.pictures import frame_number
+from runtime.simulation.bench.numbered_frames import frame_number
 
 IDLE_FRAMES = 18_900  # of each camera: half a minute of warm-up, and ten minutes
 _WARM_FRAMES = 900  # after which memory should be constant

@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.attacks import bus, crowds, databases, frames, presses, requests
 from benchmarks.attacks.target import Target
 from robots.broken_pipe import exit_on_broken_pipe
-from runtime.sim.standin import stop_event
+from runtime.simulation.program import stop_event
 
 ATTACKS = {
     "status_flood": bus.status_flood,

@@ -16,10 +16,10 @@ from runtime.core.errors import PolicyError
 from runtime.core.plugins import variants
 from runtime.core.types import Observation
 from runtime.policies.base import Policy
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
-from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
-from runtime.sim.websocket_server import Frames, WebsocketServer
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
+from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
+from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.websocket_server import Frames, WebsocketServer
 
 _QUESTIONS = 12
 _SIZE = (24, 32)  # of images

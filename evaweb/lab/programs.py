@@ -74,7 +74,7 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
         ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
-        return ("-m", "runtime.sim.node", "--robot", robot, "--bench", "tabletop", *options, *ends)
+        return ("-m", "runtime.simulation.node", "--robot", robot, "--bench", "tabletop", *options, *ends)
 
     free = "tcp://127.0.0.1:0"
     return ProgramSpec(
@@ -89,7 +89,7 @@ def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
     """Return the simulated leader, which demonstrates the bench's task, on a free port that it keeps."""
 
     def arguments(endpoint: str) -> tuple[str, ...]:
-        watching = ("-m", "runtime.sim.leader", "--robot", robot, "--obs-endpoint", observations)
+        watching = ("-m", "runtime.simulation.leader", "--robot", robot, "--obs-endpoint", observations)
         return (*watching, "--seed", str(seed), "--endpoint", endpoint)
 
     return ProgramSpec(
@@ -101,7 +101,7 @@ def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
 
 
 def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tuple[str, ...]:
-    """Return the arguments of runtime.sim.serve for a scripted policy that uses the images."""
+    """Return the arguments of runtime.standins.serve for a scripted policy that uses the images."""
     what = ("openpi", "--robot", robot, "--behaviour", "pick_place")
     return (*what, "--name", name, "--port", str(port), *options)
 
@@ -110,7 +110,7 @@ def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> Prog
     """Return a scripted policy on that port, or on a free port that it keeps."""
 
     def arguments(port: object) -> tuple[str, ...]:
-        return ("-m", "runtime.sim.serve", *_serving(name, robot, options, port))
+        return ("-m", "runtime.standins.serve", *_serving(name, robot, options, port))
 
     return ProgramSpec(
         f"policy-{name}", arguments(port), announces=True, again=lambda found: arguments(port_of(found))
@@ -135,7 +135,7 @@ def lockstep(
         for name, (skill, port) in policies.items()
         for part in ("--serve", shlex.join(_serving(name, robot, skill, port)))
     ]
-    arguments = ("-m", "runtime.sim.lockstep", deployment, *sets, *served, *options)
+    arguments = ("-m", "runtime.standins.lockstep", deployment, *sets, *served, *options)
     return ProgramSpec(f"station-{_stem(deployment)}", arguments, announces=True, patience_s=15.0)
 
 

@@ -20,7 +20,7 @@ Float64 = NDArray[np.float64]
 Rectangle = tuple[float, float, float, float]  # x from, to, y from, y to [m]
 
 AREA: Rectangle = (-0.22, 0.22, 0.18, 0.40)  # area for objects
-# The simulated bench of runtime.sim.bench (a test compares the sizes): lengths [m], colours from 0 to 1.
+# The simulated bench of runtime.simulation.bench.bench (a test compares the sizes): lengths [m], colours from 0 to 1.
 BENCH = {
     "block_edge": 0.04,
     "plate_radius": 0.075,

@@ -44,7 +44,7 @@ _SCENE_DOES_NOT_EXIST_ANY = Pattern(
     "scene {name!r:.80} does not exist any more: nothing was saved",
 )
 
-APART_M = 0.15  # least distance between the centres of block and plate; runtime.sim.layout refuses less
+APART_M = 0.15  # least distance between the centres of block and plate; runtime.simulation.bench.layout refuses less
 
 
 _IDS = {

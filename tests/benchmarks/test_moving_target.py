@@ -9,7 +9,7 @@ from benchmarks.moving_target import STRATEGIES, ChaseResult, run_chase
 
 @pytest.fixture(autouse=True)
 def short_course(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("runtime.sim.conveyor.COURSE_S", 6.0)
+    monkeypatch.setattr("runtime.simulation.bench.conveyor.COURSE_S", 6.0)
 
 
 def chased(strategy: str, delay: int, seed: int = 1) -> ChaseResult:

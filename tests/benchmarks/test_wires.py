@@ -21,8 +21,8 @@ from benchmarks.wires_sender import Pace
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import SetupError
 from runtime.core.plugins import variants
-from runtime.sim import camera_server
-from runtime.sim.pictures import Scene, frame_number
+from runtime.simulation.bench.numbered_frames import Scene, frame_number
+from runtime.standins import camera_server
 from tests.processes import PATIENCE_S
 
 PIPER = robots.load_robot("agilex_piper")

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from runtime.sim.ros_domain import free_domain
+from runtime.simulation.ros.ros_domain import free_domain
 from tests.processes import joined
 from tests.runtime.ros_master import RosMaster, master
 

@@ -14,12 +14,12 @@ from robots import Robot
 from runtime.core.clock import MonotonicClock
 from runtime.core.plugins import variants
 from runtime.policies.base import Policy
-from runtime.sim.faults import NONE, Fault
-from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
-from runtime.sim.serve import StandInServer
-from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.faults import NONE, Fault
+from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
+from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
+from runtime.standins.serve import StandInServer
+from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
 from tests.runtime.policies.peers import FRANKA, PIPER, seen
 
 SIZE = (48, 64)  # of the pictures of `seen`
@@ -85,7 +85,7 @@ def _gr00t(version: Any) -> Served:
 
 
 def _lerobot(fault: Fault) -> StandInServer:
-    from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
+    from runtime.standins.lerobot_server import LerobotBehaviour, LerobotServer
 
     return LerobotServer(PIPER, LerobotBehaviour(fault=fault, patience=0.1))
 

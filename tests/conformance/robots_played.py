@@ -18,7 +18,7 @@ import zmq
 import robots
 from runtime.core.clock import MonotonicClock
 from runtime.core.types import Observation
-from runtime.sim import arrays
+from runtime.standins import arrays
 from runtime.transports import ros1, ros2
 from runtime.transports import zmq as node
 from runtime.transports.base import Source

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from runtime.cameras.base import CameraCondition
-from runtime.sim.camera_server import FAULTS
-from runtime.sim.mjpeg_server import MjpegServer
+from runtime.standins.camera_server import FAULTS
+from runtime.standins.mjpeg_server import MjpegServer
 from tests.runtime.cameras.movies import until
 from tests.runtime.cameras.watched import KINDS, both, live, looking, lost, watched
 

@@ -16,8 +16,8 @@ import zmq
 import robots
 from runtime.core.clock import MonotonicClock
 from runtime.core.types import RobotCommand
-from runtime.sim import arrays
-from runtime.sim.node import Node, parser, run
+from runtime.simulation.node import Node, parser, run
+from runtime.standins import arrays
 from runtime.transports import zmq as link
 from runtime.transports.node_source import NodeSource
 from tests.processes import eventually, joined

@@ -18,8 +18,8 @@ from runtime.core.errors import CodecError
 from runtime.policies.async_inference import messages, pickles
 from runtime.policies.async_inference.tensors import Tensors
 from runtime.policies.groot import arrays as groot
-from runtime.sim import arrays
-from runtime.sim.gate import AcceptedCommand, CommandGate
+from runtime.simulation.command_gate import AcceptedCommand, CommandGate
+from runtime.standins import arrays
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeFrame, NodeMessages
 from tests.conformance.test_recorded_bytes import MNP, NPY, OPENPI, PICKLED_ACTIONS, vector
 from tests.examples import some

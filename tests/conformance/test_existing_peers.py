@@ -16,7 +16,7 @@ import zmq
 import robots
 from runtime.core.clock import MonotonicClock, VirtualClock
 from runtime.core.types import RobotCommand
-from runtime.sim.node import Node, parser
+from runtime.simulation.node import Node, parser
 from runtime.transports import zmq as link
 from runtime.transports.node_messages import MESSAGE_LIMIT, NodeMessages
 from runtime.transports.node_sink import NodeSink

@@ -22,8 +22,8 @@ from runtime.core.errors import (
     PolicyTimeout,
 )
 from runtime.core.types import Conditioning
-from runtime.sim import faults
-from runtime.sim.faults import Fault
+from runtime.standins import faults
+from runtime.standins.faults import Fault
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served, protocol
 from tests.processes import PATIENCE_S, eventually, joined
 from tests.runtime.policies.peers import seen, serving

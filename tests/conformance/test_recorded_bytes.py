@@ -21,8 +21,8 @@ from runtime.policies.async_inference import messages, pickles
 from runtime.policies.groot import arrays as groot
 from runtime.policies.rtc.async_rtc import AsyncRtc
 from runtime.policies.rtc.prev_action import PrevAction
-from runtime.sim import arrays as stand_in
-from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
+from runtime.standins import arrays as stand_in
+from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.conformance.policies_served import PROTOCOLS, WEBSOCKETS, Served
 from tests.runtime.policies.peers import answering, seen, serving
 

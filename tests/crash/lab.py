@@ -67,7 +67,7 @@ class Lab:
     def node(self, *arguments):
         ends = self.own.get("node", {"obs_endpoint": FREE, "action_endpoint": FREE})
         self.addresses["node"] = self.start(
-            *("node", "runtime.sim.node", "--robot", ROBOT, "--width", "64", "--height", "48"),
+            *("node", "runtime.simulation.node", "--robot", ROBOT, "--width", "64", "--height", "48"),
             *("--obs-endpoint", ends["obs_endpoint"], "--action-endpoint", ends["action_endpoint"]),
             *arguments,
         )
@@ -75,7 +75,7 @@ class Lab:
 
     def server(self, *arguments):
         self.addresses["server"] = self.start(
-            *("server", "runtime.sim.serve", "openpi", "--robot", ROBOT, "--port", "0"),
+            *("server", "runtime.standins.serve", "openpi", "--robot", ROBOT, "--port", "0"),
             *("--latency-ms", "20", *arguments),
         )
         return self

@@ -19,7 +19,7 @@ def bench(tmp_path_factory, shared):
     lab = Lab(tmp_path_factory.mktemp("bench"), shared.addresses).node("--bench", "tabletop")
     own = lab.addresses["server"]["url"]
     other = lab.start(
-        *("other", "runtime.sim.serve", "openpi", "--robot", "agilex_piper", "--port", "0"),
+        *("other", "runtime.standins.serve", "openpi", "--robot", "agilex_piper", "--port", "0"),
         *("--latency-ms", "40"),
     )["url"]
     lab.up("transport.simulated=true", "transport.detect_frozen=false")

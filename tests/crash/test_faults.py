@@ -46,7 +46,7 @@ def served(station):
 
     def by(*arguments):
         address = station.start(
-            *("failing", "runtime.sim.serve", "openpi", "--robot", ROBOT, "--port", "0"),
+            *("failing", "runtime.standins.serve", "openpi", "--robot", ROBOT, "--port", "0"),
             *("--latency-ms", "20", *arguments),
         )
         return {"policy": {"url": address["url"], "connect_deadline": 1.0, "inference_deadline": 1.0}}

@@ -32,7 +32,7 @@ def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     sets = [part for one in PATIENCE for part in ("--set", one)]
     done = subprocess.run(
-        [sys.executable, "-m", "runtime.sim.demo", "--once", "--json", str(folder / "out.json"), *sets],
+        [sys.executable, "-m", "runtime.standins.demo", "--once", "--json", str(folder / "out.json"), *sets],
         cwd=ROOT,
         env={**os.environ, "EVA_DATA_DIR": str(folder / "data")},
         capture_output=True,

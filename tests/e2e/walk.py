@@ -194,7 +194,8 @@ class Walk:
         deployment = self.folder / f"{name}.toml"
         deployment.write_text(f'extends = "{ROOT}/deployments/tabletop.toml"\nstation = "{name}"\n')
         station = documented(
-            ".venv/bin/python -m runtime.sim.lockstep", **{"deployments/MINE.toml": f"{deployment} {_SMALL}"}
+            ".venv/bin/python -m runtime.standins.lockstep",
+            **{"deployments/MINE.toml": f"{deployment} {_SMALL}"},
         )
         link = documented(".venv/bin/python -m runtime.link", NAME=name)
         for process, command in ((name, station), (f"{name}.link", link)):

@@ -1,6 +1,6 @@
 """Launcher of a program that ends with its parent process, however that ends.
 
-Run by its path: `bound.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it starts the program at
+Run by its path: `die_with_parent.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it starts the program at
 once.
 """
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from runtime.core.environment import ssh_environment
 from runtime.policies.tunnel.listening import is_listening
 
-_BOUND = Path(__file__).with_name("bound.py")
+_BOUND = Path(__file__).with_name("die_with_parent.py")
 _PATIENCE_S = 2.0  # time for its end after SIGTERM [s]
 _LINES, _WIDTH = 20, 300  # stored lines of its output, and their longest width
 _WORD = b"eva-tunnel"  # text that the far end echoes

@@ -14,8 +14,8 @@ from evaweb.plans.models import Reference
 from evaweb.setup.editing import OVERHEAD, SIZES
 from evaweb.stations.models import Station
 from evaweb.trials.models import FailureTerm, Scene
-from runtime.sim import layout
-from runtime.sim.bench import Bench, overhead_camera
+from runtime.simulation.bench import layout
+from runtime.simulation.bench.bench import Bench, overhead_camera
 from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db

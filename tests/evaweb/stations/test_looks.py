@@ -10,7 +10,7 @@ from evaweb.errors import NotFound
 from evaweb.stations import robot_geometry as looks_module
 from evaweb.stations.robot_geometry import DrawnRobot, describe_robot, drawn_robot, groups_of
 from runtime.kinematics.base import KinematicsError
-from runtime.sim.bench import tip_in_world
+from runtime.simulation.bench.bench import tip_in_world
 from tests.processes import PATIENCE_S
 
 

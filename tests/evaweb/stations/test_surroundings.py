@@ -9,7 +9,7 @@ import robots
 from evaweb.stations.robot_geometry import drawn_robot
 from evaweb.stations.surroundings import AREA, BENCH, bounds, scene_surroundings
 from robots.visuals import Visual
-from runtime.sim.bench import Bench
+from runtime.simulation.bench.bench import Bench
 
 
 def test_the_bench_that_is_drawn_is_the_one_that_is_simulated():

@@ -10,7 +10,7 @@ from runtime.cameras import rtsp, v4l2
 from runtime.cameras.base import CameraCondition
 from runtime.cameras.live_camera import LiveCamera
 from runtime.core.clock import MonotonicClock
-from runtime.sim.rtsp_server import RtspServer
+from runtime.standins.rtsp_server import RtspServer
 from tests.runtime.cameras.movies import until
 from tests.runtime.cameras.watched import CLOCK, both, live, looking, watched
 

@@ -13,11 +13,11 @@ import pytest
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep.lockstep import Lockstep
 from runtime.recording.reader import Episode, open_episode
-from runtime.sim import demo
-from runtime.sim.rtsp_server import RtspServer
+from runtime.standins import demo
+from runtime.standins.rtsp_server import RtspServer
 from tests.runtime.cameras.movies import movie, number_of
 from tests.runtime.lockstep_station import column
-from tests.runtime.sim.tabletop_station import served
+from tests.runtime.simulation.tabletop_station import served
 
 CAMERA = "cam_high"
 RECORDED = ["recording.enabled=true", "recording.min_free_bytes=0"]

@@ -10,7 +10,7 @@ import pytest
 
 from runtime.cameras.base import Address, CameraError
 from runtime.cameras.video_stream import Backlog, VideoStream
-from runtime.sim.mjpeg_server import MjpegServer
+from runtime.standins.mjpeg_server import MjpegServer
 from tests.processes import PATIENCE_S
 from tests.runtime.cameras.movies import movie, number_of
 
@@ -58,7 +58,7 @@ def test_pictures_that_are_larger_than_any_cameras_are_refused_with_their_size(
     monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     monkeypatch.setattr(
-        "runtime.sim.mjpeg_server.picture", lambda *given: np.zeros((size, size, 3), np.uint8)
+        "runtime.standins.mjpeg_server.picture", lambda *given: np.zeros((size, size, 3), np.uint8)
     )
     server = MjpegServer()
     url = server.start()

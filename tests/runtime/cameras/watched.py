@@ -13,9 +13,9 @@ from runtime.cameras import mjpeg, rtsp
 from runtime.cameras.base import CameraCondition
 from runtime.cameras.live_camera import LiveCamera
 from runtime.core.clock import MonotonicClock
-from runtime.sim.camera_server import CameraServer
-from runtime.sim.mjpeg_server import MjpegServer
-from runtime.sim.rtsp_server import RtspServer
+from runtime.standins.camera_server import CameraServer
+from runtime.standins.mjpeg_server import MjpegServer
+from runtime.standins.rtsp_server import RtspServer
 
 CLOCK = MonotonicClock()
 KINDS = {"rtsp": (RtspServer, rtsp), "mjpeg": (MjpegServer, mjpeg)}

@@ -36,7 +36,7 @@ def test_a_program_that_was_started_with_secrets_goes_on_without_as_the_same_pro
     assert said.endswith(" this\n")
 
 
-@pytest.mark.parametrize("module", ["runtime", "runtime.preflight", "runtime.sim.lockstep"])
+@pytest.mark.parametrize("module", ["runtime", "runtime.preflight", "runtime.standins.lockstep"])
 def test_every_way_to_start_a_station_sheds_them_first(module, monkeypatch):
     class Gone(Exception):
         pass

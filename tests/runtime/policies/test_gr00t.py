@@ -26,8 +26,8 @@ from runtime.core.types import Observation
 from runtime.policies import gr00t
 from runtime.policies.gr00t import Config, Gr00tPolicy
 from runtime.policies.groot import arrays
-from runtime.sim.faults import NONE, Fault
-from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
+from runtime.standins.faults import NONE, Fault
+from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.processes import PATIENCE_S, eventually
 
 ROBOT = robots.load_robot("agilex_piper")

@@ -15,7 +15,7 @@ from runtime.core.errors import PolicyError, PolicyLostError
 from runtime.policies import openpi
 from runtime.policies.health import require_healthy
 from runtime.policies.openpi import OpenpiPolicy
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from tests.processes import joined
 from tests.runtime.policies.peers import FRANKA, seen
 from tests.runtime.policies.tls import Certificate, encrypted, self_signed

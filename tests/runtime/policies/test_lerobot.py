@@ -17,10 +17,10 @@ from runtime.core.errors import ConfigurationError, PolicyError, PolicyLostError
 from runtime.core.types import Observation
 from runtime.policies import lerobot
 from runtime.policies.lerobot import Config, LerobotPolicy
-from runtime.sim.faults import NONE, Fault
+from runtime.standins.faults import NONE, Fault
 
 pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")
-from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
+from runtime.standins.lerobot_server import LerobotBehaviour, LerobotServer
 
 ROBOT = robots.load_robot("agilex_piper")
 NOWHERE = "grpc://127.0.0.1:1"

@@ -34,10 +34,10 @@ from runtime.core.types import Conditioning, Observation
 from runtime.policies import openpi
 from runtime.policies.openpi import Config, OpenpiPolicy
 from runtime.policies.websocket_link import WebsocketLink, error_headline
-from runtime.sim.faults import NONE, TOO_LARGE, Fault
-from runtime.sim.in_poses import PoseScript
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.script import WavingScript
+from runtime.simulation.scripts.pose_script import PoseScript
+from runtime.simulation.scripts.script import WavingScript
+from runtime.standins.faults import NONE, TOO_LARGE, Fault
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from tests.processes import PATIENCE_S, joined
 
 ROBOT = robots.load_robot("agilex_piper")

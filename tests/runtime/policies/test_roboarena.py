@@ -26,8 +26,8 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Conditioning, Observation
 from runtime.policies import roboarena
 from runtime.policies.roboarena import Config, RoboarenaPolicy
-from runtime.sim.faults import Fault
-from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
+from runtime.standins.faults import Fault
+from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 from tests.runtime.policies.peers import FRANKA, PIPER, answering, seen, serving
 
 VECTORS = Path(__file__).parents[1] / "vectors"

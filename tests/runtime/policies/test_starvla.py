@@ -17,8 +17,8 @@ from runtime.core.pose_format import PoseFormat
 from runtime.core.types import Conditioning, Observation
 from runtime.policies import starvla
 from runtime.policies.starvla import Config, StarvlaPolicy
-from runtime.sim.faults import NONE, Fault
-from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.faults import NONE, Fault
+from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
 from tests.processes import PATIENCE_S, joined
 from tests.runtime.policies.peers import FRANKA, PIPER, Handler, seen, serving
 

@@ -11,7 +11,7 @@ from robots import Robot
 from runtime.config import loader
 from runtime.preflight.report import Report
 from runtime.preflight.runner import PreflightRunner
-from runtime.sim.faults import NONE, Fault
+from runtime.standins.faults import NONE, Fault
 from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 from tests.runtime.policies.peers import FRANKA, PIPER
@@ -35,13 +35,13 @@ class Wire:
 
 
 def _openpi(fault: Fault) -> Any:
-    from runtime.sim.openpi_server import Behaviour, OpenpiServer
+    from runtime.standins.openpi_server import Behaviour, OpenpiServer
 
     return OpenpiServer(FRANKA, Behaviour(fault=fault))
 
 
 def _arena(variant: Any) -> Callable[[Fault], Any]:
-    from runtime.sim.roboarena_server import RoboarenaBehaviour, RoboarenaServer
+    from runtime.standins.roboarena_server import RoboarenaBehaviour, RoboarenaServer
 
     return lambda fault: RoboarenaServer(
         FRANKA, RoboarenaBehaviour(fault=fault, variant=variant, resolution=SIZE)
@@ -49,19 +49,19 @@ def _arena(variant: Any) -> Callable[[Fault], Any]:
 
 
 def _starvla(old: bool) -> Callable[[Fault], Any]:
-    from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
+    from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
 
     return lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, size=SIZE, old=old))
 
 
 def _gr00t(version: Any) -> Callable[[Fault], Any]:
-    from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
+    from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 
     return lambda fault: Gr00tServer(PIPER, Gr00tBehaviour(version, fault=fault))
 
 
 def _lerobot(fault: Fault) -> Any:
-    from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
+    from runtime.standins.lerobot_server import LerobotBehaviour, LerobotServer
 
     return LerobotServer(PIPER, LerobotBehaviour(fault=fault, patience=0.1))
 

@@ -13,7 +13,7 @@ from websockets.sync.server import serve
 from runtime.core.errors import PolicyError, PolicyLostError, RuntimeFault, SetupError
 from runtime.preflight.runner import PreflightRunner
 from runtime.preflight.verdict import PreflightStage, PreflightVerdict, stage_of, verdict_of
-from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
+from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
 from tests.runtime.policies.peers import PIPER
 from tests.runtime.preflight.bench import HURRIED, WIRES, flown, planned, served
 

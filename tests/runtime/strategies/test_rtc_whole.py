@@ -14,8 +14,8 @@ import pytest
 
 from runtime.core.types import Float32, Float64, UInt8
 from runtime.ipc.session_state import SessionState
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.script import Answer, Script
+from runtime.simulation.scripts.script import Answer, Script
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from tests.runtime.lockstep_station import MOVED, STANDS, Station, column, stubbed
 
 HORIZON, DELAY = 16, 4

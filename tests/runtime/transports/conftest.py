@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from runtime.sim.ros_domain import free_domain
+from runtime.simulation.ros.ros_domain import free_domain
 from tests.runtime.ros_master import RosMaster, master
 
 

@@ -135,11 +135,11 @@ def moved(episode: Episode) -> None:
 def waving(start: Start, robot: str) -> dict[str, Any]:
     """A leader that waves as the node beside it does, which nobody commands."""
     node = start(
-        *("runtime.sim.node", "--robot", robot, "--obs-endpoint", "tcp://127.0.0.1:0"),
+        *("runtime.simulation.node", "--robot", robot, "--obs-endpoint", "tcp://127.0.0.1:0"),
         *("--action-endpoint", "tcp://127.0.0.1:0", *SMALL),
     )
     leader = start(
-        *("runtime.sim.leader", "--robot", robot, "--behaviour", "gesture", "--lifeline"),
+        *("runtime.simulation.leader", "--robot", robot, "--behaviour", "gesture", "--lifeline"),
         *("--obs-endpoint", node["obs_endpoint"], "--endpoint", "tcp://127.0.0.1:0"),
     )
     ends = {"sub_endpoint": node["obs_endpoint"], "pub_endpoint": node["action_endpoint"]}
@@ -217,7 +217,7 @@ def test_over_ros_2_a_leader_is_relayed(
     tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch, domain: int
 ) -> None:
     pytest.importorskip("cyclonedds", reason="the package cyclonedds (extra ros2) is not installed")
-    start("runtime.sim.ros2_node", "--robot", "r1_lite", "--domain", str(domain), *SMALL)
+    start("runtime.simulation.ros2_node", "--robot", "r1_lite", "--domain", str(domain), *SMALL)
     link = ros2.Link(domain=domain)
     with Waving("r1_lite", lambda: ros2.middleware(link, "leader"), cdr) as leader:
         collection = led("ros2", leader, domain=domain)
@@ -230,7 +230,7 @@ def test_over_ros_2_a_leader_is_relayed(
 def test_over_ros_1_a_leader_is_relayed(
     tmp_path: Path, start: Start, monkeypatch: pytest.MonkeyPatch, ros_master: RosMaster
 ) -> None:
-    start("runtime.sim.ros1_node", "--robot", "agilex_piper", "--master", ros_master.uri, *SMALL)
+    start("runtime.simulation.ros1_node", "--robot", "agilex_piper", "--master", ros_master.uri, *SMALL)
     link = ros1.Link(master=ros_master.uri)
     with Waving("agilex_piper", lambda: ros1.middleware(link, "leader"), ros1_serialization) as leader:
         collection = led("ros1", leader, master=ros_master.uri)

@@ -40,7 +40,7 @@ def node(ros_master: RosMaster) -> Iterator[Node]:
     def begin(*arguments: str, robot: str = "agilex_piper") -> subprocess.Popen[bytes]:
         line = ["--robot", robot, "--master", ros_master.uri, "--width", "64", "--height", "48", "--lifeline"]
         process = subprocess.Popen(
-            [sys.executable, "-m", "runtime.sim.ros1_node", *line, *arguments],
+            [sys.executable, "-m", "runtime.simulation.ros1_node", *line, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )

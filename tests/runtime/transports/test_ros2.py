@@ -51,7 +51,7 @@ def node(domain: int) -> Iterator[Node]:
             "--lifeline",
         ]
         process = subprocess.Popen(
-            [sys.executable, "-m", "runtime.sim.ros2_node", *line, *arguments],
+            [sys.executable, "-m", "runtime.simulation.ros2_node", *line, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )

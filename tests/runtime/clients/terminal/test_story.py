@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from runtime import ctl as ctl_module
-from runtime.sim import drives
+from runtime.simulation import drives
 from tests.crash.lab import ROOT, Lab
 from tests.processes import eventually
 

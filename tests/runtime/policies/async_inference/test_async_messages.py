@@ -76,7 +76,7 @@ def test_random_bytes_are_data_or_an_error(broken: bytes) -> None:
 @given(st.binary(max_size=400))
 def test_protobufs_own_classes_write_and_read_the_same(data: bytes) -> None:
     pytest.importorskip("google.protobuf", reason="the extra lerobot-grpc is not installed")
-    from runtime.sim.lerobot_wire import MESSAGES
+    from runtime.standins.lerobot_wire import MESSAGES
 
     assert messages.decode_actions(MESSAGES["Actions"](data=data).SerializeToString()) == data
     parts = [MESSAGES["Observation"].FromString(part) for part in messages.encode_observations(data, 100)]

@@ -24,14 +24,18 @@ def actions(rows: Any, first: int = 5, rate: float = 30.0) -> list[TimedAction]:
 
 
 def sent(made: AsyncRequest) -> Any:
-    wire = pytest.importorskip("runtime.sim.lerobot_wire", reason="the extra lerobot-grpc is not installed")
+    wire = pytest.importorskip(
+        "runtime.standins.lerobot_wire", reason="the extra lerobot-grpc is not installed"
+    )
     pictures = {camera.key: np.full((4, 6, 3), 7, np.uint8) for camera in ROBOT.cameras}
     qpos = np.arange(14, dtype=np.float32) / 4
     return wire.unpickle(made.build(Observation(1, 0.0, {}, qpos, pictures, prompt="pick"), 5))
 
 
 def told(made: AsyncRequest) -> Any:
-    wire = pytest.importorskip("runtime.sim.lerobot_wire", reason="the extra lerobot-grpc is not installed")
+    wire = pytest.importorskip(
+        "runtime.standins.lerobot_wire", reason="the extra lerobot-grpc is not installed"
+    )
     return wire.unpickle(made.setup_message())
 
 

@@ -20,8 +20,8 @@ from runtime.ipc.messages import ChunkMerged
 from runtime.policies import openpi
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.sim.faults import NONE, Fault
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
+from runtime.standins.faults import NONE, Fault
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
 from tests.processes import PATIENCE_S
 
 ROBOT = robots.load_robot("agilex_piper")

@@ -30,15 +30,15 @@ from runtime.policies.tunnel.policy import TunnelledPolicy
 from runtime.policies.tunnel.settings import TunnelSettings
 from runtime.policies.tunnel.ssh_process import free_port
 from runtime.processes.coordinator.builders import make_policy
-from runtime.sim.faults import Fault
-from runtime.sim.gr00t_server import Gr00tBehaviour, Gr00tServer
-from runtime.sim.openpi_server import Behaviour, OpenpiServer
-from runtime.sim.starvla_server import StarvlaBehaviour, StarvlaServer
+from runtime.standins.faults import Fault
+from runtime.standins.gr00t_server import Gr00tBehaviour, Gr00tServer
+from runtime.standins.openpi_server import Behaviour, OpenpiServer
+from runtime.standins.starvla_server import StarvlaBehaviour, StarvlaServer
 from runtime.station.checks import check_deployment
 from tests.processes import PATIENCE_S, alive, eventually, joined
 from tests.runtime.policies.peers import PIPER, seen
 from tests.runtime.policies.tls import encrypted, self_signed
-from tests.runtime.sim.tabletop_station import pick_and_place, served
+from tests.runtime.simulation.tabletop_station import pick_and_place, served
 from tests.ssh import SshServer, key, required
 
 Begin = Callable[..., SshServer]
@@ -154,7 +154,7 @@ def gr00t(url: str) -> dict[str, Any]:
 
 def lerobot_server() -> Any:
     pytest.importorskip("grpc", reason="the extra lerobot-grpc is not installed")
-    from runtime.sim.lerobot_server import LerobotBehaviour, LerobotServer
+    from runtime.standins.lerobot_server import LerobotBehaviour, LerobotServer
 
     return LerobotServer(PIPER, LerobotBehaviour())
 

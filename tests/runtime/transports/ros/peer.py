@@ -20,7 +20,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from runtime.sim import ros2_types as types
+from runtime.simulation.ros import ros2_types as types
 from runtime.transports.ros.dds_middleware import LOOPBACK, configuration
 from tests.processes import eventually
 

@@ -1,5 +1,0 @@
-"""Pictures of the simulated bench and the robot over it, as its cameras would see them."""
-
-from runtime.sim.render.renderer import Renderer
-
-__all__ = ["Renderer"]

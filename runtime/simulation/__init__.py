@@ -1,0 +1,1 @@
+"""Simulated robots: execution nodes of every transport, the bench that they move, and what draws it."""

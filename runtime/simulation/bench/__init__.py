@@ -1,0 +1,1 @@
+"""The simulated bench: what lies on the table, how it moves, and how fingers move it."""

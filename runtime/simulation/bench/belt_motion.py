@@ -1,0 +1,95 @@
+"""Course of a belt: strokes to and fro of random lengths and speeds, drawn by a seed, not foreseeable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.core.types import Float64
+from runtime.simulation.bench.bench import Belt, BenchError
+
+SPEED = (0.06, 0.10)  # m/s, of a stroke
+SHORTEST = 0.10  # m, of a stroke
+ACCELERATION = 0.6  # m/s^2, with which the belt changes its speed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeltMotion:
+    """Pieces of constant acceleration, one after the other: `knots` [n, 4] of time [s], x [m], speed, acceleration.
+
+    The belt stands before the first and after the last.
+    """
+
+    knots: Float64
+
+    @property
+    def duration(self) -> float:
+        """Seconds until it stands for good."""
+        return float(self.knots[-1, 0])
+
+    @property
+    def changes(self) -> tuple[float, ...]:
+        """When it begins to change its speed [s]."""
+        return tuple(self.knots[self.knots[:, 3] != 0.0, 0].tolist())
+
+    def x(self, seconds: float) -> float:
+        """Position of a block on the belt [m], `seconds` after its start."""
+        seconds = min(max(seconds, 0.0), self.duration)
+        start, x, speed, acceleration = self.knots[
+            int(np.searchsorted(self.knots[:, 0], seconds, "right")) - 1
+        ]
+        passed = seconds - start
+        return float(x + speed * passed + acceleration * passed * passed / 2)
+
+
+def draw_belt_motion(seed: int, belt: Belt, seconds: float) -> BeltMotion:
+    """The course of a seed, always the same one for the same arguments; BenchError for a belt that is too short.
+
+    After so many seconds it comes to a stand.
+    """
+    low, high = belt.x
+    room = SPEED[1] ** 2 / ACCELERATION  # twice what it needs to stop
+    if high - low < 2 * (SHORTEST + room):
+        raise BenchError(
+            f"a belt of {high - low:.3f} m was given; allowed: {2 * (SHORTEST + room):.3f} m or more"
+        )
+    chance = np.random.default_rng(seed)
+    x = float(chance.uniform(low + room, high - room))
+    run = _BeltMotionBuilder([], 0.0, x, 0.0)
+    while run.time < seconds:
+        ends = chance.uniform(low + room, high - room, 64)
+        end = float(ends[np.abs(ends - run.x) >= SHORTEST][0])
+        speed = math.copysign(float(chance.uniform(*SPEED)), end - run.x)
+        run.change(speed)
+        run.cruise(min(abs(end - run.x) / abs(speed), seconds - run.time))
+    run.change(0.0)
+    run.knots.append((run.time, run.x, 0.0, 0.0))
+    return BeltMotion(np.array(run.knots))
+
+
+@dataclass(slots=True)
+class _BeltMotionBuilder:
+    """A course that is being drawn, up to `time`, where the block is at `x` and has `speed`."""
+
+    knots: list[tuple[float, float, float, float]]
+    time: float
+    x: float
+    speed: float
+
+    def change(self, speed: float) -> None:
+        """Go over to another speed."""
+        seconds = abs(speed - self.speed) / ACCELERATION
+        self._piece(seconds, math.copysign(ACCELERATION, speed - self.speed))
+        self.speed = speed
+
+    def cruise(self, seconds: float) -> None:
+        """Go on as fast as now."""
+        self._piece(seconds, 0.0)
+
+    def _piece(self, seconds: float, acceleration: float) -> None:
+        if seconds > 0:
+            self.knots.append((self.time, self.x, self.speed, acceleration))
+            self.x += self.speed * seconds + acceleration * seconds * seconds / 2
+            self.time += seconds

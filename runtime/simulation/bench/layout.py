@@ -1,0 +1,114 @@
+"""Places of blocks and plate on the simulated bench: drawn by a seed, near wished places if there are any."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from runtime.simulation.bench.bench import Bench, BenchError, BenchLayout
+
+NOISE_M = 0.005  # by which things lie beside where they were asked for, at most, in x and in y
+NOISE_RAD = math.radians(4.0)
+APART_M = 0.15  # block and plate, centre to centre, at least
+_CROWD_M = 0.09  # two blocks, centre to centre, at least
+_TRIES = 1000
+_SIDES = ((-0.25, 0.0), (0.25, 0.0))  # where arms stand, and how far they reach [m] to grasp from above
+_REACH = 0.42
+
+
+def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> BenchLayout:
+    """The layout of a seed: always the same one for the same arguments.
+
+    `positions` may say where the task's block ("block": [x, y, yaw in degrees]) and the plate ("plate":
+    [x, y]) are wanted, they then lie within NOISE_M and NOISE_RAD of it; what it leaves out lies anywhere,
+    so that one side of the bench reaches both. BenchError where `positions` is not of this form, lies outside
+    the area or has block and plate closer than APART_M, or where `blocks` do not fit.
+    """
+    block, plate = _wanted(positions or {})
+    if blocks < 1 or seed < 0:
+        raise BenchError(f"{blocks} blocks by seed {seed} were asked for; allowed: one or more, from 0 on")
+    chance = np.random.default_rng(seed)
+    placed_block, placed_plate = _pair(chance, block, plate)
+    placed = [placed_block]
+    for _ in range(blocks - 1):
+        placed.append(_distractor(chance, placed, placed_plate))
+    return BenchLayout(tuple(placed), placed_plate)
+
+
+def _wanted(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
+    """Block (x, y, yaw in rad) and plate (x, y) as asked for."""
+    unknown = sorted(str(name) for name in positions if name not in ("block", "plate"))
+    if unknown:
+        raise BenchError(f"positions name {', '.join(unknown)}; allowed: block, plate")
+    block = _place("block", positions.get("block"), 3)
+    plate = _place("plate", positions.get("plate"), 2)
+    if block is not None:
+        block[2] = math.radians(block[2])
+    if block is not None and plate is not None and math.dist(block[:2], plate) < APART_M:
+        raise BenchError(
+            f"block and plate are {math.dist(block[:2], plate):.3f} m apart; allowed: {APART_M} m or more"
+        )
+    return block, plate
+
+
+def _place(name: str, given: Any, count: int) -> list[float] | None:
+    if given is None:
+        return None
+    numbers = list(given) if isinstance(given, list | tuple) else []
+    right = len(numbers) == count and all(
+        isinstance(number, int | float) and not isinstance(number, bool) and math.isfinite(number)
+        for number in numbers
+    )
+    if not right:
+        raise BenchError(f"positions.{name} = {given!r}; allowed: {count} finite numbers")
+    x_from, x_to, y_from, y_to = Bench().area
+    x, y = numbers[:2]
+    if not (x_from <= x <= x_to and y_from <= y <= y_to):
+        raise BenchError(
+            f"positions.{name} = {given!r}; allowed: x {x_from} to {x_to} m, y {y_from} to {y_to} m"
+        )
+    return [float(number) for number in numbers]
+
+
+def _pair(
+    chance: np.random.Generator, block: list[float] | None, plate: list[float] | None
+) -> tuple[tuple[float, float, float], tuple[float, float]]:
+    """Block and plate, tried until they are far enough apart and reached from one side."""
+    for _ in range(_TRIES):
+        block_x, block_y, yaw = _random_place(chance) if block is None else _random_near(chance, block)
+        plate_x, plate_y, _ = _random_place(chance) if plate is None else _random_near(chance, [*plate, 0.0])
+        asked = block is not None and plate is not None
+        apart = math.dist((block_x, block_y), (plate_x, plate_y)) >= APART_M
+        if asked or (apart and _one_side((block_x, block_y), (plate_x, plate_y))):
+            return (block_x, block_y, yaw), (plate_x, plate_y)
+    raise BenchError(f"no place was found beside block {block}, plate {plate}; allowed: other positions")
+
+
+def _one_side(*places: tuple[float, float]) -> bool:
+    return any(all(math.dist(side, place) <= _REACH for place in places) for side in _SIDES)
+
+
+def _random_place(chance: np.random.Generator) -> tuple[float, float, float]:
+    x_from, x_to, y_from, y_to = Bench().area
+    x, y = chance.uniform((x_from, y_from), (x_to, y_to))
+    return float(x), float(y), float(chance.uniform(-math.pi / 4, math.pi / 4))
+
+
+def _random_near(chance: np.random.Generator, place: list[float]) -> tuple[float, float, float]:
+    noise = chance.uniform(-1.0, 1.0, 3) * (NOISE_M, NOISE_M, NOISE_RAD)
+    x, y, yaw = np.add(place, noise)
+    return float(x), float(y), float(yaw)
+
+
+def _distractor(
+    chance: np.random.Generator, placed: list[tuple[float, float, float]], plate: tuple[float, float]
+) -> tuple[float, float, float]:
+    for _ in range(_TRIES):
+        x, y, yaw = _random_place(chance)
+        clear = all(math.dist((x, y), other[:2]) >= _CROWD_M for other in placed)
+        if clear and math.dist((x, y), plate) >= APART_M:
+            return x, y, yaw
+    raise BenchError(f"no place was found for block {len(placed) + 1}; allowed: fewer blocks")

@@ -1,0 +1,167 @@
+"""Messages that a careful execution node accepts: one master, fresh finite targets within limits, a deadline.
+
+Words that switch the drives of a simulated robot (runtime.simulation.drives) are taken from any client. A node with
+a bench also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+
+import numpy as np
+
+from runtime.core import msgpack_arrays
+from runtime.core.clock import ClockMap
+from runtime.core.errors import CodecError
+from runtime.core.types import Float64
+from runtime.simulation import drives
+from runtime.simulation.bench.tabletop import ResetRequest
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Control = Literal["collect_start", "collect_stop", "hil_start", "hil_stop"]
+ANONYMOUS = "anonymous"  # older clients do not say who they are
+MASTER_SILENCE = 1.0  # s after which another client may take over
+_TOLERANCE = 1e-5  # limits travel as float32
+_RESET = "scene_reset"
+_LONGEST_ID = 128
+_MESSAGE_LIMIT = 1024 * 1024  # bytes; a command has a few hundred
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptedCommand:
+    """A message that counts: a target [D] to go to, a control word, a wish to lay the bench anew, a switch."""
+
+    target: Float64 | None = None
+    control: Control | None = None
+    reset: ResetRequest | None = None
+    switch: drives.DriveSwitch | None = None
+
+
+class CommandGate:
+    """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason.
+
+    A target that was sent more than `deadline` seconds ago is refused as well, by the master's own clock, where that
+    goes on. `ack` is the `seq` of the master's newest message that took effect, None where it does not number.
+    `bench` says whether there is one that could be laid anew.
+    """
+
+    def __init__(self, robot: Robot, deadline: float, bench: bool = False) -> None:
+        self._robot = robot
+        self._deadline = deadline
+        self._bench = bench
+        self._heard = float("-inf")  # the master's last message, accepted or not
+        self._accepted = float("-inf")
+        self._stamp = float("-inf")  # of the master's newest command, on its clock
+        self._clock = ClockMap()
+        self.master: str | None = None
+        self.ack: int | None = None
+        self.refused: Counter[str] = Counter()
+
+    def accept(self, payload: bytes, arrival: float) -> AcceptedCommand | None:
+        """The message if it may take effect, else None and one more in `refused`."""
+        message = self._message(payload)
+        if message is None:
+            return None
+        word = message.get("target", "real")
+        if word in drives.WORDS:
+            return self._switch(word, message)
+        if not self._rules(message, arrival):
+            return None
+        accepted = self._accept(word, message, arrival)
+        if accepted is not None:
+            number = message.get("seq")
+            self.ack = number if type(number) is int else None
+        return accepted
+
+    def _accept(self, word: str, message: dict[Any, Any], arrival: float) -> AcceptedCommand | None:
+        if word == "real":
+            return self._target(message, arrival)
+        if word in get_args(Control):
+            return AcceptedCommand(control=cast(Control, word))
+        if word == _RESET:
+            return self._reset(message)
+        if word != "sim":
+            self.refused["unknown_target"] += 1
+        return None
+
+    def is_silent(self, now: float) -> bool:
+        """True if no target was accepted within the deadline: the robot has to hold."""
+        return now - self._accepted > self._deadline
+
+    def _message(self, payload: bytes) -> dict[Any, Any] | None:
+        try:
+            message = msgpack_arrays.unpack(payload, _MESSAGE_LIMIT)
+        except CodecError:
+            message = None
+        if not isinstance(message, dict) or not isinstance(message.get("target", "real"), str):
+            self.refused["malformed"] += 1
+            return None
+        return message
+
+    def _rules(self, message: dict[Any, Any], arrival: float) -> bool:
+        """The first to speak rules until it is silent for a second."""
+        name = message.get("master")
+        name = name if isinstance(name, str) else ANONYMOUS
+        if self.master != name and self.master is not None and arrival - self._heard <= MASTER_SILENCE:
+            self.refused["other_master"] += 1
+            return False
+        if self.master != name:
+            self.master, self.ack = name, None
+            self._stamp, self._clock = float("-inf"), ClockMap()
+        self._heard = arrival
+        return True
+
+    def _switch(self, word: str, message: dict[Any, Any]) -> AcceptedCommand | None:
+        """Whoever stands at the robot switches its drives; that does not make them its master."""
+        switch = drives.parse_word(word, message)
+        if switch is None:
+            self.refused["malformed"] += 1
+            return None
+        return AcceptedCommand(switch=switch)
+
+    def _reset(self, message: dict[Any, Any]) -> AcceptedCommand | None:
+        name, seed, positions = (message.get(key) for key in ("id", "seed", "positions"))
+        if not self._bench:
+            self.refused["no_bench"] += 1
+            return None
+        named = isinstance(name, str) and 0 < len(name) <= _LONGEST_ID
+        seeded = isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0
+        if not (named and seeded and (positions is None or isinstance(positions, dict))):
+            self.refused["malformed"] += 1
+            return None
+        return AcceptedCommand(reset=ResetRequest(str(name), int(seed or 0), positions))
+
+    def _target(self, message: dict[Any, Any], arrival: float) -> AcceptedCommand | None:
+        action = message.get("action")
+        reason = "stale" if self._late(message.get("t"), arrival) else self._wrong(action)
+        if reason:
+            self.refused[reason] += 1
+            return None
+        self._accepted = arrival
+        return AcceptedCommand(
+            target=np.clip(np.asarray(action, np.float64), self._robot.lower, self._robot.upper)
+        )
+
+    def _late(self, stamp: object, arrival: float) -> bool:
+        """True if the target was sent too long ago; never where the sender's clock says nothing."""
+        if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
+            return False
+        before, self._stamp = self._stamp, cast(float, stamp)
+        if before == self._stamp:
+            return False  # a clock that stands still
+        return arrival - self._clock.map(self._stamp, arrival) > self._deadline
+
+    def _wrong(self, action: object) -> str:
+        if not isinstance(action, np.ndarray) or action.dtype.kind != "f":
+            return "malformed"
+        if action.shape != (self._robot.dim,):
+            return "dimension"
+        if not np.isfinite(action).all():
+            return "not_finite"
+        low, high = self._robot.lower - _TOLERANCE, self._robot.upper + _TOLERANCE
+        return "" if ((action >= low) & (action <= high)).all() else "limits"

@@ -1,0 +1,188 @@
+"""A simulated leader: `python -m runtime.simulation.leader --robot NAME`; a person's arm that shows the robot the task.
+
+It listens to a simulated execution node and publishes, over ZMQ, where the tabletop's own script would have the
+robot a moment later: as somebody does who looks at the bench and moves a leader arm. What it says is what
+`runtime.teleoperators.zmq` reads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import zmq
+
+from robots.broken_pipe import exit_on_broken_pipe
+from runtime.core import msgpack_arrays
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault
+from runtime.core.types import Float64
+from runtime.simulation import program
+from runtime.simulation.node import positive, run, start_pose
+from runtime.simulation.scripts.pick_place import PickPlace, Skill
+from runtime.simulation.scripts.script import Script, WavingScript
+from runtime.simulation.sockets import address, bound
+from runtime.teleoperators.base import Leader
+from runtime.transports import zmq as node
+from runtime.transports.node_source import NodeSource
+
+if TYPE_CHECKING:
+    from robots import Robot
+    from runtime.core.types import Observation
+
+_ASKS_S = 0.2  # the script is asked anew; between that it goes on along its rows
+_HORIZON_S = 1.0
+_AHEAD_S = 0.1  # a hand is ahead of the robot that follows it
+
+
+class SimulatedLeader:
+    """Stands at `start` [D] until the node is seen, then does what the script does from where the robot is."""
+
+    def __init__(self, robot: Robot, script: Script, task: str, rate: float, start: Float64) -> None:
+        self._robot, self._task, self._rate = robot, task, rate
+        self._answer = script.begin()
+        self._joints = start.copy()
+        self._rows: Float64 | None = None
+        self._asked = float("-inf")
+
+    def update(self, observation: Observation, now: float) -> None:
+        """The bench and the robot now; the script is asked five times a second."""
+        if now - self._asked < _ASKS_S:
+            return
+        q = np.asarray(observation.qpos, np.float64)
+        self._rows = np.asarray(self._answer(q, observation.pictures, self._task), np.float64)
+        self._asked = now
+
+    def joints_at(self, now: float) -> Float64:
+        """The leader's joints [D]."""
+        if self._rows is not None:
+            row = int((now - self._asked + _AHEAD_S) * self._rate)
+            self._joints = self._rows[min(row, len(self._rows) - 1)]
+        return self._joints
+
+    def message(self, now: float) -> bytes:
+        """The leader's message, packed."""
+        parts = self._robot.split(self.joints_at(now)).items()
+        return msgpack_arrays.pack(
+            {"t": now, "state": {name: part.astype(np.float32) for name, part in parts}}
+        )
+
+
+class AttachedLeader(Leader):
+    """A simulated leader within the station's own process, for lockstep: at each observation it says where it is."""
+
+    def __init__(self, robot: Robot, clock: Clock, simulated: SimulatedLeader) -> None:
+        super().__init__(robot, clock)
+        self._simulated = simulated
+
+    @property
+    def name(self) -> str:
+        return "the simulated leader"
+
+    def connect(self) -> None:
+        """There is nothing to open."""
+
+    def see(self, observation: Observation) -> None:
+        """The bench and the robot now."""
+        now = self._clock.now()
+        self._simulated.update(observation, now)
+        self._take(self._simulated.joints_at(now), now)
+
+    def close(self) -> None:
+        """There is nothing to release."""
+
+
+def demonstrator(
+    robot: Robot, task: str, seed: int, behaviour: str = "pick_place", start: str = "home"
+) -> SimulatedLeader:
+    """Who shows the robot the task, by the script of that behaviour; before it sees the bench at the pose `start`."""
+    rate = robot.control_rate
+    horizon = round(_HORIZON_S * rate)
+    script: Script = WavingScript(robot, horizon, rate, seed)
+    if behaviour == "pick_place":
+        script = PickPlace(robot, horizon, rate, Skill(seed=seed))
+    return SimulatedLeader(robot, script, task, rate, start_pose(robot, start))
+
+
+class LeaderPublisher:
+    """A leader on its socket; `tick` hears the node and says where the leader is."""
+
+    def __init__(self, leader: SimulatedLeader, source: NodeSource, endpoint: str, clock: Clock) -> None:
+        self._leader, self._source, self._clock = leader, source, clock
+        self._socket = bound(zmq.PUB, endpoint, False)
+
+    @property
+    def address(self) -> str:
+        """Bound address of its publisher."""
+        return address(self._socket)
+
+    def tick(self, seconds: float) -> None:
+        """One message."""
+        now = self._clock.now()
+        seen = self._source.receive(0.0)
+        if seen is not None:
+            self._leader.update(seen, now)
+        with contextlib.suppress(zmq.Again):  # the next one is newer
+            self._socket.send(self._leader.message(now), zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Release the socket and the node."""
+        self._socket.close(linger=0)
+        self._source.close()
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    line = argparse.ArgumentParser(
+        prog="python -m runtime.simulation.leader", description="A simulated leader arm."
+    )
+    line.add_argument("--robot", required=True, help="name of a folder in robots/, or a path")
+    line.add_argument(
+        "--groups", type=program.names, metavar="NAME,...", help="of the robot, as the deployment has them"
+    )
+    line.add_argument(
+        "--obs-endpoint", default="tcp://127.0.0.1:5555", help="where the simulated node publishes"
+    )
+    line.add_argument(
+        "--endpoint", default="tcp://127.0.0.1:5560", help="where it publishes; port 0 takes a free one"
+    )
+    line.add_argument("--rate", type=positive, default=60.0, help="messages per second")
+    line.add_argument("--behaviour", choices=["pick_place", "gesture"], default="pick_place")
+    line.add_argument("--task", default="put the block on the plate", help="what the script is asked for")
+    line.add_argument("--seed", type=int, default=0, help="of the script")
+    line.add_argument(
+        "--start-pose", metavar="NAME", default="home", help="where it is before the node is seen"
+    )
+    program.add_arguments(line)
+    return line
+
+
+@exit_on_broken_pipe
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a leader until SIGTERM, SIGINT or the end of the lifeline."""
+    import robots
+
+    options = parser().parse_args(arguments)
+    told = program.stop_event(options.lifeline)
+    clock = MonotonicClock()
+    try:
+        robot = robots.load_robot(options.robot, options.groups)
+        source = node.source(node.Config(sub_endpoint=options.obs_endpoint, simulated=True), robot, clock)
+        leader = demonstrator(robot, options.task, options.seed, options.behaviour, options.start_pose)
+        publishing = LeaderPublisher(leader, source, options.endpoint, clock)
+        with contextlib.closing(publishing):
+            source.connect()
+            program.announce_ready({"endpoint": publishing.address}, options.ready_file)
+            run(publishing, clock, options.rate, told)
+    except (RuntimeFault, robots.RobotError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""Every camera's picture of one moment: the robot at its joints, the bench as it lies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robots import scene_of
+from runtime.core.types import Float64, UInt8
+from runtime.simulation.bench import bench as benches
+from runtime.simulation.bench.bench import Bench, BenchState, PinholeCamera
+from runtime.simulation.render.painter import Painter
+from runtime.simulation.render.plate import Plate
+from runtime.simulation.render.shadows import Shadows, darken
+from runtime.simulation.render.solids import Solid, Solids
+from runtime.simulation.render.table import Table
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+
+class Renderer:
+    """Draws all cameras of a robot over a bench at [height, width]; `seed` makes the grain of the table.
+
+    The same arguments give the same pictures to the last bit. Nothing is kept from one moment to the next
+    but what is always the same.
+    """
+
+    def __init__(self, robot: Robot, bench: Bench, width: int, height: int, seed: int = 0) -> None:
+        self._robot = robot
+        self._bench = bench
+        self._size = width, height
+        self._scene = scene_of(robot)
+        self._table = Table(bench, seed)
+        self._plate = Plate(bench)
+        self._shadows = Shadows(bench)
+        self._solids: dict[int, Solids] = {}  # by the number of blocks
+        q = robot.poses["home"]
+        carriers = {camera.key: benches.camera_arm(robot, camera) for camera in robot.cameras}
+        still = {key for key, arm in carriers.items() if arm is None}
+        self._still = {
+            key: self._table.draw(camera) for key, camera in self._cameras(q).items() if key in still
+        }
+
+    def draw(self, q: Float64, state: BenchState) -> dict[str, UInt8]:
+        """A BGR uint8 [H, W, 3] per camera key for joints [D]; fresh memory each time."""
+        solids = self._solids_of(len(state.blocks))
+        frames = np.array([*self._scene.poses(q), *(block.pose for block in state.blocks)])
+        whole = solids.placed(frames)
+        placed = solids.above_table(whole)
+        light = self._shadows.cast(solids, placed, state.plate)
+        painter = Painter(solids, placed)
+        pictures = {}
+        for key, camera in self._cameras(q).items():
+            still = self._still.get(key)
+            picture = self._table.draw(camera) if still is None else still.copy()
+            self._plate.draw(picture, camera, state.plate)
+            darken(picture, camera, light)
+            under = camera.pose[2, 3] < 0  # where no arm should be, but a simulated one can
+            (Painter(solids, whole) if under else painter).paint(picture, camera)
+            pictures[key] = picture
+        return pictures
+
+    def _cameras(self, q: Float64) -> dict[str, PinholeCamera]:
+        return benches.cameras(self._robot, q, *self._size)
+
+    def _solids_of(self, blocks: int) -> Solids:
+        """The robot's shapes and so many blocks, whose frames follow those of the robot's parts."""
+        if blocks not in self._solids:
+            shapes = [
+                Solid(visual.part, visual.kind, visual.size, visual.origin, visual.colour[:3])
+                for visual in (shown.simple() for shown in self._scene.visuals)
+            ]
+            self._solids[blocks] = Solids([*shapes, *(self._block(index) for index in range(blocks))])
+        return self._solids[blocks]
+
+    def _block(self, index: int) -> Solid:
+        colours = self._bench.block_colours
+        red, green, blue = (part / 255 for part in colours[index % len(colours)])
+        edge = self._bench.block_edge
+        frame = len(self._scene.parts) + index
+        return Solid(frame, "box", (edge, edge, edge), np.eye(4), (red, green, blue), painted=True)

@@ -1,0 +1,89 @@
+"""The shadows on the table, of everything that stands on it or hangs over it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from runtime.core.types import Float64, UInt8
+from runtime.simulation.bench.bench import Bench, PinholeCamera
+from runtime.simulation.render.painter import LIGHT
+from runtime.simulation.render.solids import Placed, Solids
+from runtime.simulation.render.table import (
+    X,
+    Y,
+    covers,
+    outline_of,
+    texels_to_pixels,
+)
+
+_TEXEL = 0.004  # m
+_SOFT_FROM = 0.09  # m above the table from which a shadow is softer
+
+
+class Shadows:
+    """Light on the table, uint8 (255 = all), in a map of its own seen from above."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        size = ((Y[1] - Y[0]) / _TEXEL, (X[1] - X[0]) / _TEXEL)
+        self._shape = (round(size[0]), round(size[1]))
+        self._under_plate: tuple[tuple[float, float], UInt8] | None = None
+
+    def cast(self, solids: Solids, placed: Placed, plate: tuple[float, float]) -> UInt8:
+        """The map for solids and a plate: sharp and dark where they touch the table, soft where they are high."""
+        vertices = placed.vertices
+        floor = np.where(
+            np.hypot(*(placed.centres[:, :2] - np.array(plate)).T) < self._bench.plate_radius * 0.9,
+            np.float32(self._bench.plate_height * 0.4),
+            np.float32(0),
+        )
+        counts = solids.stops - solids.starts
+        height = np.maximum(vertices[:, 2:] - np.repeat(floor, counts)[:, None], 0)
+        points = vertices[:, :2] - height * (LIGHT[:2] / LIGHT[2])
+        corners = ((points - (X[0], Y[0])) / _TEXEL * 16).astype(np.int32)
+        middle = placed.centres[:, 2]
+        soft, sharp = np.full((2, *self._shape), 255, np.uint8)
+        for solid in filter(placed.seen.__getitem__, np.argsort(-middle).tolist()):
+            hull = cv2.convexHull(corners[solids.starts[solid] : solids.stops[solid]])
+            high = middle[solid] > _SOFT_FROM
+            light = 150 + 60 * min(1.0, float(middle[solid]) / 0.4) if high else 118
+            cv2.fillConvexPoly(soft if high else sharp, hull, light, cv2.LINE_8, 4)
+        blurred = cv2.min(
+            cv2.blur(cv2.blur(soft, (13, 13)), (9, 9)), cv2.blur(cv2.blur(sharp, (5, 5)), (3, 3))
+        )
+        return np.asarray(cv2.min(blurred, self._plate_map(plate)), np.uint8)
+
+    def _plate_map(self, plate: tuple[float, float]) -> UInt8:
+        """The plate's own shadow, around it but not upon it."""
+        if self._under_plate is None or self._under_plate[0] != plate:
+            shade = np.full(self._shape, 255, np.uint8)
+            height, radius = self._bench.plate_height, self._bench.plate_radius
+            fallen = np.array(plate) - height * LIGHT[:2] / LIGHT[2]
+            self._disc(shade, fallen, radius * 1.02, 120)
+            shade = np.asarray(cv2.blur(cv2.blur(shade, (5, 5)), (5, 5)), np.uint8)
+            self._disc(shade, np.array(plate), radius * 0.99, 255)
+            self._under_plate = plate, shade
+        return self._under_plate[1]
+
+    @staticmethod
+    def _disc(shade: UInt8, centre: Float64, radius: float, light: int) -> None:
+        column, row = ((centre - (X[0], Y[0])) / _TEXEL * 16).round().astype(int).tolist()
+        cv2.circle(shade, (column, row), round(radius / _TEXEL * 16), light, cv2.FILLED, cv2.LINE_AA, 4)
+
+
+def darken(picture: UInt8, camera: PinholeCamera, light: UInt8) -> None:
+    """Darken the picture of a table by a map of the light on it."""
+    half = (camera.width // 2, camera.height // 2)
+    matrix = np.diag([0.5, 0.5, 1.0]) @ texels_to_pixels(camera, _TEXEL)
+    small = cv2.warpPerspective(
+        light, matrix, half, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=255
+    )
+    outline = outline_of(camera)
+    if not covers(outline, camera):  # a homography also shows what lies behind the camera, above the horizon
+        mask = np.full(small.shape, 255, np.uint8)
+        if len(outline) > 2:
+            cv2.fillConvexPoly(mask, (outline * 8).round().astype(np.int32), 0, cv2.LINE_8, 4)
+        small = cv2.max(small, mask)
+    full = cv2.resize(small, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    cv2.multiply(picture, cv2.cvtColor(full, cv2.COLOR_GRAY2BGR), dst=picture, scale=1 / 255)

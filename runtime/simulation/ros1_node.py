@@ -1,0 +1,157 @@
+"""A simulated robot behind its own ROS 1 topics: `python -m runtime.simulation.ros1_node --robot NAME`.
+
+A stand-in for the drivers of a robot, on rospy and its own messages; a master has to run. It says where its joints
+and what its cameras see, and goes where it is told, as long as it is told. Topics are those of the robot's
+description, or for a robot that has none /GROUP/joint_states, /GROUP/command and /CAMERA/image_raw/compressed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+import tempfile
+import xmlrpc.client
+from collections import deque
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from robots.broken_pipe import exit_on_broken_pipe
+from runtime.core.clock import Clock, MonotonicClock
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.core.types import UInt8
+from runtime.simulation import program
+from runtime.simulation.node import run
+from runtime.simulation.ros import ros1_modules, ros_robot
+from runtime.simulation.ros.ros_robot import ReceivedCommand, RosRobot
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_COMMANDS_KEPT = 32
+_QUEUE = 10
+_LOGGING = "version: 1\ndisable_existing_loggers: false\n"
+
+
+class Ros1Node(RosRobot):
+    """One robot; `open`, then `tick` at the rate, then `close`. A process can open but one."""
+
+    VERSION = 1
+
+    def __init__(self, robot: Robot, options: argparse.Namespace, clock: Clock) -> None:
+        super().__init__(robot, options, clock)
+        self._publishers: dict[str, Any] = {}
+        self._inbox: deque[ReceivedCommand] = deque(maxlen=_COMMANDS_KEPT)
+
+    def open(self) -> dict[str, object]:
+        """Register with the master, and return it with the topics of the pictures."""
+        master = self._options.master
+        try:  # rospy would wait for it for ever
+            xmlrpc.client.ServerProxy(master).getPid("/sim")
+        except OSError as error:
+            raise SetupError(f"no ROS master is at {master}: {error}; start roscore") from error
+        os.environ.pop("ROS_HOSTNAME", None)
+        os.environ.update(ROS_MASTER_URI=master, ROS_IP="127.0.0.1")
+        import rospy
+        from sensor_msgs.msg import JointState
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "logging.yaml"
+            path.write_text(_LOGGING)
+            os.environ.update(ROS_PYTHON_LOG_CONFIG_FILE=str(path), ROS_LOG_DIR=folder)
+            rospy.init_node(self._options.name, argv=[], disable_signals=True, disable_rosout=True)
+        for outlet in self.outlets():
+            rospy.Subscriber(outlet.topic, JointState, self._taker(outlet), queue_size=_QUEUE)
+        return {"master": master, "node": rospy.get_name(), "cameras": self._pictures}
+
+    def close(self) -> None:
+        """Take leave of the master; safe to call twice."""
+        import rospy
+
+        rospy.signal_shutdown("the end")
+        self._publishers = {}
+
+    def _taker(self, outlet: ros_robot.JointTopic) -> Any:
+        return lambda message: self._inbox.append(
+            ReceivedCommand(outlet, tuple(message.name), list(message.position))
+        )
+
+    def _received_commands(self) -> Iterator[ReceivedCommand]:
+        while self._inbox:
+            yield self._inbox.popleft()
+
+    def _say_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
+        from sensor_msgs.msg import JointState
+
+        self._say(topic, JointState(_header(stamp), names, position, [], []))
+
+    def _say_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
+        from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+
+        x, y, z, qw, qx, qy, qz = pose
+        placed = Pose(Point(x, y, z), Quaternion(qx, qy, qz, qw))
+        self._say(topic, PoseStamped(_header(stamp, frame), placed))
+
+    def _say_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
+        from sensor_msgs.msg import Image
+
+        height, width = pixels.shape[:2]
+        self._say(topic, Image(_header(stamp), height, width, encoding, 0, 3 * width, pixels.tobytes()))
+
+    def _say_compressed(self, topic: str, stamp: int, data: bytes) -> None:
+        from sensor_msgs.msg import CompressedImage
+
+        self._say(topic, CompressedImage(_header(stamp), "bgr8; jpeg compressed bgr8", data))
+
+    def _say(self, topic: str, message: Any) -> None:
+        import rospy
+
+        if topic not in self._publishers:
+            self._publishers[topic] = rospy.Publisher(topic, type(message), queue_size=_QUEUE)
+        self._publishers[topic].publish(message)
+
+
+def _header(stamp: int, frame: str = "") -> Any:
+    import rospy
+    from std_msgs.msg import Header
+
+    return Header(0, rospy.Time(*divmod(stamp, 10**9)), frame)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    line = argparse.ArgumentParser(
+        prog="python -m runtime.simulation.ros1_node", description="A simulated robot behind ROS 1 topics."
+    )
+    line.add_argument("--master", default="http://127.0.0.1:11311", help="ROS_MASTER_URI")
+    line.add_argument("--python", default="/usr/bin/python3", help="the one whose rospy is taken")
+    line.add_argument("--name", default="sim_robot", help="of the node")
+    ros_robot.add_arguments(line)
+    return line
+
+
+@exit_on_broken_pipe
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
+    import robots
+
+    options = parser().parse_args(arguments)
+    told = program.stop_event(options.lifeline)
+    clock = MonotonicClock()
+    try:
+        node = Ros1Node(robots.load_robot(options.robot, options.groups), options, clock)
+        with ros1_modules.lent(options.python), contextlib.closing(node):
+            program.announce_ready(node.open(), options.ready_file)
+            run(node, clock, options.rate, told)
+            print(json.dumps({"truth": node.truth(), "refused": node.refused}), flush=True)
+    except (RuntimeFault, robots.RobotError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Scripted policies of the simulated bench, and what they plan with."""

@@ -1,0 +1,180 @@
+"""Sight of a scripted policy: the task's block and the plate, found by colour in the overhead picture.
+
+Nothing else tells it where things are. What an arm covers in part has neither the size nor the shape that it
+should have at its place, and then counts as not seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.core.types import Float64, UInt8
+from runtime.simulation.bench import bench
+from runtime.simulation.bench.bench import Bench, BenchError, PinholeCamera
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+_NATIVE_WIDTH, _NATIVE_HEIGHT = 640, 480  # the overhead camera's picture before it was fitted
+_BLACK = 8  # the brightest that a letterbox may be
+_FINER = 4  # times, for the outline of something that is ten pixels wide
+_HUE = 9  # to each side, of 180
+_SATURATION = 0.45  # of the thing's own
+_DARKEST = 40  # of 255; in shadow a colour is still a colour
+_BLOCK_SIZE = (0.7, 1.4)  # area seen over area expected
+_PLATE_SIZE = (0.85, 1.2)
+_ROUND = 1.15  # longest over shortest width of a disc
+_RING = 0.6  # of what a ring surrounds, the most that has its colour
+_CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
+
+Matrix = NDArray[Any]  # what OpenCV's own annotations call a picture or a mask
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """Block (x, y, yaw) and plate (x, y) in the world [m, rad], each None where it is not seen whole.
+
+    The yaw is that of a square: within 45 degrees of zero. `dark`: there was nothing but black.
+    """
+
+    block: tuple[float, float, float] | None = None
+    plate: tuple[float, float] | None = None
+    dark: bool = False
+
+
+class OverheadDetector:
+    """The overhead camera of a robot's bench: `key` names its picture among those of a request."""
+
+    def __init__(self, robot: Robot, table: Bench | None = None) -> None:
+        keys = [camera.key for camera in robot.cameras if bench.camera_arm(robot, camera) is None]
+        if not keys:
+            raise BenchError(f"{robot.name} has no camera above the bench; all of its cameras are on arms")
+        self.key = keys[0]
+        self._bench = table or Bench()
+        self._camera = bench.overhead_camera(_NATIVE_WIDTH, _NATIVE_HEIGHT)
+
+    def detect(self, picture: UInt8) -> Detection:
+        """Block and plate in an RGB picture [H, W, 3] or [3, H, W] of any size, letterboxed or not."""
+        shown = _without_bars(_channels_last(picture))
+        if int(shown.max(initial=0)) < _DARKEST:
+            return Detection(dark=True)
+        hsv = cv2.cvtColor(np.ascontiguousarray(shown), cv2.COLOR_RGB2HSV)
+        return Detection(self._block(shown, hsv), self._plate(hsv))
+
+    def _block(self, shown: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
+        """The silhouette's middle lies half-way up the block; its narrowest rectangle gives the yaw."""
+        colour = self._bench.block_colours[0]
+        found = _largest(_mask(hsv, colour))
+        if found is None:
+            return None
+        left, top, width, height = cv2.boundingRect(found)
+        rows = slice(max(0, top - 2), top + height + 2)
+        columns = slice(max(0, left - 2), left + width + 2)
+        crop = cv2.resize(shown[rows, columns], None, fx=_FINER, fy=_FINER, interpolation=cv2.INTER_LINEAR)
+        outline = _largest(_mask(cv2.cvtColor(crop, cv2.COLOR_RGB2HSV), colour))
+        if outline is None:
+            return None
+        fine = outline[:, 0].astype(np.float64)
+        pixels = self._native((fine + 0.5) / _FINER - 0.5 + (columns.start, rows.start), shown)
+        hull = cv2.convexHull(pixels.astype(np.float32))
+        (u, v), sides, angle = cv2.minAreaRect(hull)
+        edge = self._bench.block_edge
+        x, y = self._camera.pixel_to_table(u, v, edge / 2)
+        yaw = self._yaw((u, v), math.radians(angle), max(sides))
+        block = (x, y, yaw)
+        return block if _within(cv2.contourArea(hull), self._block_area(block), _BLOCK_SIZE) else None
+
+    def _yaw(self, middle: tuple[float, float], angle: float, length: float) -> float:
+        """The world's direction of a line in the picture, modulo a quarter turn."""
+        u, v = middle
+        ahead = u + length * math.cos(angle), v + length * math.sin(angle)
+        height = self._bench.block_edge / 2
+        from_x, from_y = self._camera.pixel_to_table(u, v, height)
+        to_x, to_y = self._camera.pixel_to_table(*ahead, height)
+        return math.remainder(math.atan2(to_y - from_y, to_x - from_x), math.pi / 2)
+
+    def _block_area(self, block: tuple[float, float, float]) -> float:
+        x, y, yaw = block
+        turn = np.array([[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+        return _area(self._camera, self._bench.block_edge * _CORNERS @ turn + (x, y, 0.0))
+
+    def _plate(self, hsv: Matrix) -> tuple[float, float] | None:
+        """The middle of the rim's outer edge; a solid disc of its colour is part of a robot."""
+        mask = _mask(hsv, self._bench.plate_rim_colour)
+        rim = _largest(mask)
+        if rim is None or len(rim) < 5:
+            return None
+        pixels = self._native(rim[:, 0].astype(np.float64), hsv)
+        hull = cv2.convexHull(pixels.astype(np.float32))
+        (u, v), (width, height), _ = cv2.minAreaRect(hull)
+        x, y = self._camera.pixel_to_table(u, v, self._bench.plate_height)
+        turns = np.linspace(0.0, 2 * math.pi, 48, endpoint=False)
+        radius = self._bench.plate_radius
+        circle = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
+        expected = _area(self._camera, np.insert(circle, 2, self._bench.plate_height, axis=1))
+        is_round = max(width, height) <= _ROUND * min(width, height) and _is_ring(mask, rim)
+        return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _PLATE_SIZE) else None
+
+    def _native(self, pixels: Float64, shown: Matrix) -> Float64:
+        """Pixels [n, 2] of the picture shown as pixels of the camera."""
+        height, width = shown.shape[:2]
+        return np.asarray((pixels + 0.5) * (_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height) - 0.5)
+
+
+def _channels_last(picture: UInt8) -> UInt8:
+    if picture.ndim != 3 or 3 not in (picture.shape[0], picture.shape[2]):
+        raise BenchError(f"a picture of shape {picture.shape} was given; allowed: [H, W, 3] or [3, H, W]")
+    return picture if picture.shape[2] == 3 else np.asarray(cv2.merge(list(picture)), np.uint8)
+
+
+def _without_bars(picture: UInt8) -> UInt8:
+    """The picture without its letterbox; one whose margins are not black was stretched, and is taken whole."""
+    height, width = picture.shape[:2]
+    ratio = max(_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height)
+    inner_width, inner_height = max(1, int(_NATIVE_WIDTH / ratio)), max(1, int(_NATIVE_HEIGHT / ratio))
+    top, left = (height - inner_height) // 2, (width - inner_width) // 2
+    inner = picture[top : top + inner_height, left : left + inner_width]
+    rows = picture[top : top + inner_height]
+    bars = picture[:top], picture[top + inner_height :], rows[:, :left], rows[:, left + inner_width :]
+    return inner if all(bar.max(initial=0) <= _BLACK for bar in bars) else picture
+
+
+def _mask(hsv: Matrix, colour: bench.Colour) -> Matrix:
+    """Mask of a picture, 255 where it has the colour, in whatever light."""
+    pixel = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_RGB2HSV)[0, 0]
+    hue, saturation, _ = (int(part) for part in pixel)
+    lowest = max(0, hue - _HUE), int(_SATURATION * saturation), _DARKEST
+    mask: Matrix = cv2.inRange(hsv, lowest, (hue + _HUE, 255, 255))
+    if hue < _HUE:  # red lies at both ends of the circle
+        mask |= cv2.inRange(hsv, (180 + hue - _HUE, *lowest[1:]), (179, 255, 255))
+    return mask
+
+
+def _largest(mask: Matrix) -> Matrix | None:
+    """The outline [n, 1, 2] of the largest patch."""
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return max(outlines, key=cv2.contourArea, default=None)
+
+
+def _is_ring(mask: Matrix, outline: Matrix) -> bool:
+    """True if most of what the outline [n, 1, 2] surrounds, or would if closed, is not in the mask."""
+    left, top, width, height = cv2.boundingRect(outline)
+    inside = np.zeros((height, width), np.uint8)
+    cv2.fillConvexPoly(inside, cv2.convexHull(outline - (left, top)), 1)
+    coloured = mask[top : top + height, left : left + width] * inside
+    return bool(np.count_nonzero(coloured) <= _RING * np.count_nonzero(inside))
+
+
+def _area(camera: PinholeCamera, points: Float64) -> float:
+    """Area of the convex hull of world points [n, 3] in the camera's picture [pixels]."""
+    return float(cv2.contourArea(cv2.convexHull(camera.project(points).astype(np.float32))))
+
+
+def _within(seen: float, expected: float, share: tuple[float, float]) -> bool:
+    return share[0] * expected <= seen <= share[1] * expected

@@ -1,0 +1,281 @@
+"""Joints of an arm for its fingertips over a block or a plate, pointing down.
+
+Four points of every vertical way are solved by inverse kinematics, from a posture of the arm with its fingers down
+that is found once: turned about an upright first joint, or led from place to place where there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robots.rotations import quaternion_of_matrix
+from runtime.core.errors import SetupError
+from runtime.core.types import Float64
+from runtime.kinematics.compiled import CompiledKinematics
+from runtime.simulation.bench.arm_frames import arm_frames
+from runtime.simulation.bench.bench import Bench
+from runtime.simulation.scripts.downward_tip import DownwardTip, Place
+
+if TYPE_CHECKING:
+    from robots import Gripper, Group, Robot
+
+CLEAR = 0.12  # m: fingertips so high pass over everything, also with a block between them
+TILTS = ((0.0, 0.26), (0.26, 0.26), (0.4, 0.4))  # rad outwards from straight down: below, above
+_GRASP = 0.45  # of the block's edge: the height of the fingertips that grasp it
+_DROP = 0.003  # m between block and plate when the jaws open
+_MARGIN = 0.05  # of the jaws' whole way, at both ends
+_AHEAD = (
+    0.3  # m from an arm's shoulder to the place over which searches begin, away from the table's near side
+)
+_ASIDE = 0.05  # m beyond the area, where they may begin too
+_TRIES = 60  # postures that a search begins from
+_ENOUGH = 0.8  # of the places that an arm is asked for, with which a search is content
+_STATIONS = 4
+_ACROSS = math.pi / 2
+
+Tilts = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nominal:
+    """A posture of an arm's `joints` [n] with its fingertips `down`; the jaws open `across` its bearing there."""
+
+    joints: Float64
+    down: DownwardTip
+    across: float
+
+
+class Postures:
+    """Those of one robot at one bench; SetupError where no arm of it can pick things up.
+
+    `arms` are those that can.
+    """
+
+    def __init__(self, robot: Robot, table: Bench) -> None:
+        self._robot = robot
+        self._table = table
+        self._kinematics = CompiledKinematics(robot)
+        self._rest = robot.poses.get("ready", robot.poses["home"])
+        self._limbs = arm_frames(robot)
+        self._shoulders = {name: limb.shoulder(self._rest)[:2, 3] for name, limb in self._limbs.items()}
+        self._nominal: dict[str, Nominal] = {}
+        faults = [fault for arm in robot.arms if (fault := self._learn(arm))]
+        if not self._nominal:
+            raise SetupError(f"{robot.name} cannot pick things up: {'; '.join(faults) or 'it has no arm'}")
+
+    @property
+    def arms(self) -> tuple[Group, ...]:
+        return tuple(arm for arm in self._robot.arms if arm.name in self._nominal)
+
+    def distance(self, arm: Group, place: Sequence[float]) -> float:
+        """From an arm's shoulder to a place, over the table [m]."""
+        return math.dist(self._shoulders[arm.name], place[:2])
+
+    def hover(self, arm: Group, q: Float64, place: Place, height: float) -> Float64 | None:
+        """Joints [D] with an arm's fingertips over a place at a height, its jaws open; None where it cannot reach."""
+        tilt = TILTS[0][1]
+        way = self._down(arm, q, place, 0.0, (height, CLEAR), (tilt, tilt))
+        return None if way is None else np.asarray(way[-1])
+
+    def stations(
+        self,
+        arm: Group,
+        q: Float64,
+        block: tuple[float, float, float],
+        plate: Place,
+        short: float,
+        tilts: Tilts,
+    ) -> tuple[Float64 | None, Float64 | None]:
+        """Joints [stations, D] from above to below the block, and the same over the plate.
+
+        The jaws take those sides of the block that they are turned to most, else the other two.
+        """
+        base = self._shoulders[arm.name]
+        reach = math.dist(base, block[:2])
+        x, y = base + (np.array(block[:2]) - base) * (1 - short / reach)
+        bearing = self._bearing(arm, (x, y))
+        twist = math.remainder(block[2] - bearing, math.pi / 2)  # of the jaws, from across the arm
+        low = _GRASP * self._table.block_edge
+        put = self._table.plate_height + low + _DROP
+        first: tuple[Float64 | None, Float64 | None] = None, None
+        for turned in (twist, twist - math.copysign(math.pi / 2, twist)):
+            down = self._down(arm, q, (x, y), turned, (low, CLEAR), tilts)
+            over = None if down is None else self._down(arm, q, plate, turned, (put, CLEAR), tilts)
+            if over is not None:
+                return down, over
+            first = first if first[0] is not None else (down, over)
+        return first
+
+    def risen(self, arm: Group, q: Float64) -> Float64:
+        """Joints [D] with the fingertips straight up from where they are; q where they are high or cannot."""
+        tip = self.tip(arm, q)
+        if tip[2, 3] >= CLEAR:
+            return q
+        place = float(tip[0, 3]), float(tip[1, 3])
+        yaw, bearing = math.atan2(tip[1, 1], tip[0, 1]), self._bearing(arm, place)
+        for _, tilt in TILTS:
+            found = self._solved(arm, [DownwardTip(place, CLEAR, yaw, bearing, tilt)], q)
+            if found is not None:
+                return np.asarray(found[0])
+        return q
+
+    def aside(self, arm: Group, q: Float64) -> Float64:
+        """Joints [D] with an arm at rest, its jaws as they are."""
+        rest = q.copy()
+        rest[arm.joint_dims] = self._rest[arm.joint_dims]
+        return rest
+
+    def rested(self, arm: Group, q: Float64) -> Float64:
+        """Joints [D] with an arm at rest, its jaws open."""
+        return opened(arm, self.aside(arm, q))
+
+    def tip(self, arm: Group, q: Float64) -> Float64:
+        """An arm's fingertips in the world, [4, 4], at joints q [D]."""
+        return self._limbs[arm.name].tip(q)
+
+    def _down(
+        self, arm: Group, q: Float64, place: Place, twist: float, heights: tuple[float, float], tilts: Tilts
+    ) -> Float64 | None:
+        """Joints [stations, D] of an arm with open jaws, the others as in q [D]; None where it cannot reach."""
+        bearing = self._bearing(arm, place)
+        yaw = bearing + self._nominal[arm.name].across + twist
+        way = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
+        stations = [DownwardTip(place, height, yaw, bearing, tilt) for height, tilt in way.tolist()]
+        return self._descent(arm, q, self._nominal[arm.name], stations)
+
+    def _descent(
+        self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[DownwardTip]
+    ) -> Float64 | None:
+        """Joints [stations, D]: from the nominal posture turned about an upright shoulder, else led there."""
+        start = opened(arm, q)
+        start[arm.joint_dims] = nominal.joints
+        if upright := self._limbs[arm.name].upright:
+            turned = start.copy()
+            turned[arm.joint_dims[0]] += upright * (stations[0].bearing - nominal.down.bearing)
+            found = self._solved(arm, stations, np.clip(turned, self._robot.lower, self._robot.upper))
+            if found is not None:
+                return found
+        return self._solved(arm, stations, start, list(nominal.down.interpolate(stations[0])))
+
+    def _solved(
+        self, arm: Group, stations: Sequence[DownwardTip], seed: Float64, before: Sequence[DownwardTip] = ()
+    ) -> Float64 | None:
+        """Joints [T, D] for the stations, by way of what comes `before`; None where one of them is not reached."""
+        index = self._robot.arms.index(arm)
+        frame = self._limbs[arm.name].frame(seed)
+        tip = np.eye(4) if arm.tip is None else arm.tip
+        eef = (
+            np.linalg.inv(frame)
+            @ np.stack([down.tip() for down in (*before, *stations)])
+            @ np.linalg.inv(tip)
+        )
+        targets = np.repeat(self._kinematics.forward(seed)[None], len(eef), axis=0)
+        targets[:, index, :3] = eef[:, :3, 3]
+        targets[:, index, 3:] = quaternion_of_matrix(eef[:, :3, :3])
+        result = self._kinematics.solve(targets, seed)
+        return result.q[len(before) :] if result.reached[len(before) :, index].all() else None
+
+    def _learn(self, arm: Group) -> str:
+        """Find an arm's nominal posture; returns why it has none, "" where it has."""
+        if arm.tip is None or arm.gripper is None or arm.gripper.apart is None:
+            return f"{arm.name} needs fingertips and a gripper that says how far it opens (apart)"
+        wanted = self._wanted(arm)
+        best, reached = None, 0
+        for nominal in self._found(arm):
+            count = sum(self._reaches(arm, nominal, place) for place in wanted)
+            if best is None or count > reached:
+                best, reached = nominal, count
+            if reached >= _ENOUGH * len(wanted):
+                break
+        if best is None:
+            return f"{arm.name} cannot hold its fingertips down {CLEAR} m above the table"
+        self._nominal[arm.name] = best
+        return ""
+
+    def _found(self, arm: Group) -> Iterator[Nominal]:
+        """Postures with the fingertips down: from the rest posture, then from more and more random ones."""
+        chance = np.random.default_rng(0)
+        seed = self._rest
+        low, high = np.maximum(self._robot.lower, -math.pi), np.minimum(self._robot.upper, math.pi)
+        for number in range(_TRIES):
+            for place in self._ahead(arm):
+                bearing = self._bearing(arm, place)
+                for across in (_ACROSS, -_ACROSS):
+                    down = DownwardTip(place, CLEAR, bearing + across, bearing, TILTS[0][1])
+                    found = self._solved(arm, [down], seed)
+                    if found is not None:
+                        yield Nominal(found[0, arm.joint_dims], down, across)
+            share = min(1.0, 2 * (number + 1) / _TRIES)
+            seed = np.clip(
+                (1 - share) * self._rest + share * chance.uniform(low, high),
+                self._robot.lower,
+                self._robot.upper,
+            )
+
+    def _reaches(self, arm: Group, nominal: Nominal, place: Place) -> bool:
+        """True if the fingertips go straight down on a place of the table."""
+        bearing = self._bearing(arm, place)
+        low = _GRASP * self._table.block_edge
+        above = DownwardTip(place, CLEAR, bearing + nominal.across, bearing, TILTS[0][1])
+        below = replace(above, height=low, tilt=TILTS[0][0])
+        return self._descent(arm, self._rest, nominal, [above, below]) is not None
+
+    def _wanted(self, arm: Group) -> list[Place]:
+        """Places of the area that are this arm's: nearer to it than to any other."""
+        x_from, x_to, y_from, y_to = self._table.area
+        places = [
+            (float(x), float(y)) for x in np.linspace(x_from, x_to, 5) for y in np.linspace(y_from, y_to, 3)
+        ]
+        return [
+            place
+            for place in places
+            if self.distance(arm, place)
+            <= min(self.distance(other, place) for other in self._robot.arms) + 1e-6
+        ]
+
+    def _ahead(self, arm: Group) -> list[Place]:
+        """First places of searches: straight ahead of the shoulder, and in the middle of the area."""
+        x_from, x_to, y_from, y_to = self._table.area
+        x, y = self._shoulders[arm.name]
+        ahead = (
+            float(np.clip(x, x_from - _ASIDE, x_to + _ASIDE)),
+            float(np.clip(y + _AHEAD, y_from, y_to)),
+        )
+        return [ahead, ((x_from + x_to) / 2, (y_from + y_to) / 2)]
+
+    def _bearing(self, arm: Group, place: Place) -> float:
+        x, y = self._shoulders[arm.name]
+        return math.atan2(place[1] - y, place[0] - x)
+
+
+def jaws(arm: Group) -> Gripper:
+    """The gripper of an arm."""
+    assert arm.gripper is not None  # an arm without one picks nothing up
+    return arm.gripper
+
+
+def opened(arm: Group, q: Float64) -> Float64:
+    """Joints [..., D] with an arm's jaws open: nearly as far as they go, because safety slows them at their limits."""
+    return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).open, jaws(arm).close)
+
+
+def closed(arm: Group, q: Float64) -> Float64:
+    """Joints [..., D] with an arm's jaws closed, likewise."""
+    return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).close, jaws(arm).open)
+
+
+def gripper_dim(arm: Group) -> int:
+    """The place of an arm's gripper in the robot's vector."""
+    assert arm.gripper_dim is not None
+    return arm.gripper_dim
+
+
+def _with_jaws(arm: Group, q: Float64, here: float, there: float) -> Float64:
+    changed = q.copy()
+    changed[..., gripper_dim(arm)] = here + _MARGIN * (there - here)
+    return changed

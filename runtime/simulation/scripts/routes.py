@@ -1,0 +1,224 @@
+"""Pick and place of a block by an arm: legs of joint targets, timed, with gates for the jaws between.
+
+Between few postures the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so
+that an attempt is planned once and cheaply.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from runtime.core.types import Float64
+from runtime.simulation.bench.bench import Bench
+from runtime.simulation.bench.hands import Opening
+from runtime.simulation.scripts.clearance import clearance_for
+from runtime.simulation.scripts.downward_tip import Place
+from runtime.simulation.scripts.postures import (
+    CLEAR,
+    TILTS,
+    Postures,
+    closed,
+    gripper_dim,
+    jaws,
+    opened,
+)
+
+if TYPE_CHECKING:
+    from robots import Group, Robot
+
+_SPEED = 0.75  # rad/s of the fastest joint, at its fastest
+_TIP_SPEED = 0.11  # m/s on vertical ways, at its fastest
+_SHORTEST = 0.5  # s
+_JAW_SPEED = 0.16  # m/s
+_PAUSE = 0.3  # s that a route stands still at first: its rows arrive late
+_DWELL = 0.2  # s by which a gate outlasts the way of its jaws
+_PEAK = 1.875  # highest over mean speed of a minimum-jerk motion
+_AT_REST = 0.02  # rad
+
+Gate = Literal["", "close", "open"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leg:
+    """Rows float64 [n, D], one per control period; a gate's leg ends when the jaws are seen to have obeyed.
+
+    `others` are the arms that move instead of the route's own: those that make way.
+    """
+
+    name: str
+    rows: Float64
+    gate: Gate = ""
+    others: tuple[Group, ...] = ()
+
+    @property
+    def end(self) -> Float64:
+        """Its last row [D]."""
+        return np.asarray(self.rows[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFailure:
+    """Deliberate failure: the jaws close `short` of the block [m], or let it go on the way."""
+
+    short: float = 0.0
+    lets_go: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """Motion of one arm, leg after leg; the rest of the robot stays, or makes way first.
+
+    `rows` [N, D] are those of all legs, `starts` the places of each leg's first one among them.
+    """
+
+    arm: Group
+    legs: tuple[Leg, ...]
+
+    @cached_property
+    def rows(self) -> Float64:
+        return np.concatenate([leg.rows for leg in self.legs])
+
+    @cached_property
+    def starts(self) -> tuple[int, ...]:
+        return tuple(itertools.accumulate((len(leg.rows) for leg in self.legs[:-1]), initial=0))
+
+
+class RoutePlanner:
+    """Plans for one robot at one bench, `rate` rows per second."""
+
+    def __init__(self, robot: Robot, rate: float, table: Bench) -> None:
+        self._robot = robot
+        self._rate = rate
+        self._postures = Postures(robot, table)
+        self._room = clearance_for(robot)
+        self._speed = np.minimum(0.5 * robot.velocity, _SPEED)
+        for arm in self._postures.arms:
+            self._speed[gripper_dim(arm)] = min(0.5 * robot.velocity[gripper_dim(arm)], _jaw_speed(arm))
+
+    def pick_and_place(
+        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
+    ) -> Route | None:
+        """The route from joints q [D], by the arm nearest the block that reaches all of it; None if none does.
+
+        Where that would come too near to another arm or the body, it is another arm's, or others make way; where
+        nothing helps, the one with most room.
+        """
+        found, most = None, -math.inf
+        for route in self._routes(q, block, plate, slip):
+            spare = self._room.margin_along(route.rows)
+            if spare >= 0:
+                return route
+            if spare > most:
+                found, most = route, spare
+        return found
+
+    def _routes(
+        self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
+    ) -> Iterator[Route]:
+        """By each arm that can, the nearest first: while the others stay, then with those at rest that are not."""
+        nearest = sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block))
+        for makes_way in (False, True):
+            for arm in nearest:
+                before = self._clear_other_arms(arm, q) if makes_way else []
+                if makes_way and not before:
+                    continue
+                start = before[-1].end if before else q
+                for tilts in TILTS:
+                    down, over = self._postures.stations(arm, start, block, plate, slip.short, tilts)
+                    if down is not None and over is not None:
+                        yield self._begun(arm, [*before, *self._legs(arm, start, down, over, slip)])
+
+    def _clear_other_arms(self, arm: Group, q: Float64) -> list[Leg]:
+        """The legs by which all other arms that are not at rest go there, up from the table first; [] where none is."""
+        others = tuple(
+            other
+            for other in self._robot.arms
+            if other is not arm and np.abs(self._postures.aside(other, q) - q).max() > _AT_REST
+        )
+        if not others:
+            return []
+        high = q
+        for other in others:
+            high = self._postures.risen(other, high) if self._low(other, high) else high
+        rest = high
+        for other in others:
+            rest = self._postures.aside(other, rest)
+        ways = [("rise", q, high)] * (high is not q) + [("make way", high, rest)]
+        return [replace(self._leg(*way), others=others) for way in ways]
+
+    def _low(self, arm: Group, q: Float64) -> bool:
+        """True if the fingertips are so near to the table that they have to rise before they go elsewhere."""
+        return bool(self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR)
+
+    def retreat(self, q: Float64, arm: Group) -> Route:
+        """Open the jaws, rise, and go where the arm is out of the camera's way."""
+        high = opened(arm, self._postures.risen(arm, q))
+        return self._begun(
+            arm, [self._leg("back off", q, high), self._leg("retreat", high, self._postures.rested(arm, q))]
+        )
+
+    def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: PlannedFailure) -> list[Leg]:
+        """From the stations above to below the block, `down`, and the plate, `over`, [stations, D], jaws open."""
+        held, lowered = (closed(arm, way) for way in (down, over))
+        legs = []
+        if self._low(arm, q):
+            legs.append(self._leg("rise", q, self._postures.risen(arm, q)))
+            q = legs[-1].end
+        legs += [self._leg("reach", q, down[0]), self._vertical_leg("descend", down)]
+        legs += [self._jaw_leg("close", down[-1], held[-1]), self._vertical_leg("lift", held[::-1])]
+        carry = self._leg("carry", held[0], lowered[0])
+        if slip.lets_go:
+            half = carry.rows[: len(carry.rows) // 2]
+            last = opened(arm, half[-1])
+            legs += [Leg("carry", half), self._jaw_leg("open", half[-1], last)]
+        else:
+            last = over[0]
+            legs += [carry, self._vertical_leg("lower", lowered)]
+            legs += [self._jaw_leg("open", lowered[-1], over[-1]), self._vertical_leg("leave", over[::-1])]
+        legs.append(self._leg("retreat", last, self._postures.rested(arm, q)))
+        return legs
+
+    def _begun(self, arm: Group, legs: Sequence[Leg]) -> Route:
+        first = legs[0]
+        still = np.repeat(first.rows[:1], round(_PAUSE * self._rate), axis=0)
+        return Route(arm, (replace(first, rows=np.concatenate([still, first.rows])), *legs[1:]))
+
+    def _leg(self, name: str, start: Float64, end: Float64) -> Leg:
+        return Leg(name, self._timed(np.stack([start, end]), 0.0))
+
+    def _vertical_leg(self, name: str, stations: Float64) -> Leg:
+        return Leg(name, self._timed(stations, _PEAK * CLEAR / _TIP_SPEED))
+
+    def _jaw_leg(self, gate: Literal["close", "open"], start: Float64, end: Float64) -> Leg:
+        rows = self._timed(np.stack([start, end]), 0.0)
+        return Leg(
+            gate, np.concatenate([rows, np.repeat(rows[-1:], round(_DWELL * self._rate), axis=0)]), gate
+        )
+
+    def _timed(self, stations: Float64, shortest: float) -> Float64:
+        """Rows [n, D] through stations [k, D], at rest at both ends: a polynomial, run with minimum jerk."""
+        marks = np.linspace(0.0, 1.0, len(stations))
+        powers = np.linalg.solve(np.vander(marks, increasing=True), stations)
+        way = np.abs(np.diff(stations, axis=0)).sum(axis=0)
+        seconds = max(_SHORTEST, shortest, _PEAK * float((way / self._speed).max()))
+        u = np.linspace(0.0, 1.0, 1 + math.ceil(seconds * self._rate))
+        s = u**3 * (10 - 15 * u + 6 * u * u)
+        rows = np.vander(s, len(stations), increasing=True) @ powers
+        switched = list(
+            self._robot.binary_dims
+        )  # on a way through numbers between they would begin anew at each look
+        rows[:, switched] = stations[-1, switched]
+        return np.asarray(np.clip(rows, self._robot.lower, self._robot.upper))
+
+
+def _jaw_speed(arm: Group) -> float:
+    """In the gripper's own unit per second."""
+    opening = Opening(jaws(arm))
+    return abs(opening.number(_JAW_SPEED) - opening.number(0.0))

@@ -1,0 +1,40 @@
+"""Script of a stand-in policy server; it begins anew with every connection."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from runtime.core.types import Float32, Float64, UInt8
+from runtime.simulation.scripts.gestures import Gesture
+
+if TYPE_CHECKING:
+    from robots import Robot
+
+Answer = Callable[[Float64, Mapping[str, UInt8], str], Float32]
+"""From joints float64 [D], pictures by request key and instruction to rows float32 [H, D]."""
+
+
+class Script(ABC):
+    """One behaviour; `metadata` is what the server says of it on connect."""
+
+    metadata: Mapping[str, object]
+
+    @abstractmethod
+    def begin(self) -> Answer:
+        """Answers to the requests of one connection, in their order."""
+
+
+class WavingScript(Script):
+    """A gesture around home: depends on nothing but the joints."""
+
+    def __init__(
+        self, robot: Robot, horizon: int, rate: float, seed: int = 0, name: str | None = None
+    ) -> None:
+        self._gesture = Gesture(robot, seed)
+        self._horizon, self._rate = horizon, rate
+        self.metadata = {"name": name or "stand-in", "action_horizon": horizon}
+
+    def begin(self) -> Answer:
+        return lambda q, pictures, prompt: self._gesture.chunk(q, self._horizon, self._rate)

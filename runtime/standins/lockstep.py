@@ -1,0 +1,154 @@
+"""A station at its simulated bench on a virtual clock: `python -m runtime.standins.lockstep DEPLOYMENT`.
+
+Node, bench, policy servers and station are one process and have one time; people, pages and programs find the station
+as they find any other. With the same seeds the same commands in the same order give the same course, to the tick, on
+any machine however busy it is. A run ends by itself once the bench's own truth has said success for a second; with
+--paced, the station is no faster than life and nothing ends a run but what ends a real one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import robots
+from robots.broken_pipe import exit_on_broken_pipe
+from runtime.config import loader
+from runtime.core import environment
+from runtime.core import logs as log
+from runtime.core.clock import Clock, VirtualClock
+from runtime.core.errors import RuntimeFault, SetupError
+from runtime.processes.coordinator.builders import make_policy
+from runtime.processes.lockstep.lockstep import Peers
+from runtime.processes.lockstep.server import ServedLockstep
+from runtime.processes.reception.process import make_source
+from runtime.simulation import environments, program
+from runtime.simulation.environments import Environment
+from runtime.simulation.in_process_node import InProcessNode
+from runtime.simulation.leader import AttachedLeader, demonstrator
+from runtime.simulation.node import Node
+from runtime.simulation.node import parser as node_parser
+from runtime.standins import serve
+from runtime.station.checks import check_deployment
+from runtime.station.spec import StationSpec
+
+REST_S = 1.0  # of success, after which nothing more is to be seen
+# Deadlines are in real seconds; a server of this process is not lost because the machine is busy.
+_PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
+
+
+class SuccessDetector:
+    """Says when a run is over: the bench's truth has said success for a while."""
+
+    def __init__(self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock) -> None:
+        self._truth, self._clock = truth, clock
+        self._since: float | None = None
+
+    def __call__(self, running: bool) -> str:
+        truth = self._truth() if running else None
+        if not (truth and truth["success"]):
+            self._since = None
+            return ""
+        self._since = self._clock.now() if self._since is None else self._since
+        rested = self._clock.now() - self._since >= REST_S - 1e-6
+        return f"the simulated bench has said success for {REST_S:g} s" if rested else ""
+
+
+def in_process_peers(
+    made: StationSpec, clock: Clock, around: Environment, options: argparse.Namespace
+) -> Peers:
+    """A simulated node in this process in the place of the transport, and a simulated leader in that of the leader.
+
+    SetupError where the deployment declares no simulated node.
+    """
+    transport = made.deployment.transport
+    if not made.capabilities.resets_bench or transport.kind != "zmq":
+        raise SetupError(
+            f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
+        )
+    leader = AttachedLeader(made.robot, clock, demonstrator(made.robot, made.deployment.task, options.seed))
+    link = InProcessNode(Node(made.robot, options, clock, around), made.robot, clock, leader.see)
+    return Peers(
+        source=lambda spec, clock: make_source(spec, clock, lambda *of: link),
+        sink=lambda spec, clock: link,
+        policy=partial(make_policy, leader=lambda spec, clock: leader),
+    )
+
+
+def station(
+    path: Path, assignments: Sequence[str], clock: VirtualClock, *bench_options: str, paced: bool = False
+) -> ServedLockstep:
+    """The station of a deployment at its bench, which has the options of a simulated node; RuntimeFault where it
+    cannot be. A paced one is no faster than life, and the bench's truth ends none of its runs.
+    """
+    made = check_deployment(loader.load(path, assignments))
+    given = ("--robot", made.robot.name, "--bench", "tabletop", *bench_options)
+    options = node_parser().parse_args(given)
+    around = environments.make_environment(made.robot, options)
+    peers = in_process_peers(made, clock, around, options)
+    over = (lambda running: "") if paced else SuccessDetector(around.truth, clock)
+    return ServedLockstep(made, clock, over, peers=peers, paced=paced)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    line = argparse.ArgumentParser(
+        prog="python -m runtime.standins.lockstep", description="A station at a simulated bench, in lockstep."
+    )
+    line.add_argument("deployment", type=Path, help="one whose transport is zmq and simulated")
+    line.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="assignments")
+    line.add_argument("--seed", type=int, default=0, help="the first layout of the bench")
+    line.add_argument(
+        "--serve",
+        action="append",
+        default=[],
+        metavar="LINE",
+        help="a policy server of this process, as a command line of runtime.standins.serve; the first is the "
+        "deployment's",
+    )
+    line.add_argument(
+        "--paced", action="store_true", help="no faster than life, and a run ends as at a real bench"
+    )
+    line.add_argument("--width", type=int, default=640, help="of each picture")
+    line.add_argument("--height", type=int, default=480)
+    program.add_arguments(line)
+    return line
+
+
+@exit_on_broken_pipe
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve until SIGTERM, SIGINT or the end of the lifeline."""
+    options = parser().parse_args(arguments)
+    log.configure_logging("lockstep")
+    told = program.stop_event(options.lifeline)
+    clock = VirtualClock()
+    try:
+        with ExitStack() as stack:
+            urls: dict[str, str] = {}
+            for line in options.serve:
+                given = serve.parser().parse_args(shlex.split(line))
+                server = stack.enter_context(closing(serve.made(given, clock)))
+                urls[str(given.name or len(urls))] = str(server.start()["url"])
+            own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
+            bench = ("--seed", options.seed, "--width", options.width, "--height", options.height)
+            served = station(
+                options.deployment, [*own, *options.assignments], clock, *map(str, bench), paced=options.paced
+            )
+            stack.enter_context(closing(served))
+            program.announce_ready({"policies": urls}, options.ready_file)
+            served.serve(told.is_set)
+    except (RuntimeFault, robots.RobotError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    environment.restart_without_web_secrets()
+    sys.exit(main())

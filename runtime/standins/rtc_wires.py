@@ -1,0 +1,206 @@
+"""The ways in which the stand-in policy server is told what the robot is committed to."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from runtime.standins.arrays import packed
+from runtime.standins.continuing import STAND_IN, CommittedPrefix, ModelSpace
+from runtime.standins.faults import Fault
+
+Name = Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"]
+_SHIFT, _FROZEN = 25, 10  # rows that openpi-rtc takes off, and that it keeps to
+_ENVELOPE, _VERSION = "openpi-async-rtc", 2
+_FIELDS = (
+    "prev_chunk_left_over",
+    "inference_delay",
+    "execution_horizon",
+    "prefix_attention_schedule",
+    "max_guidance_weight",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ParsedRequest:
+    """A request, read: the observation, what it is to continue, its number where it has one."""
+
+    observation: dict[str, Any]
+    prefix: CommittedPrefix | None = None
+    number: int | None = None
+
+
+class Wire(ABC):
+    """Reads requests and frames answers; `fault` may have it say or answer something else."""
+
+    def __init__(self, space: ModelSpace, horizon: int, fault: Fault) -> None:
+        self._space = space
+        self._horizon = horizon
+        self._fault = fault
+
+    @abstractmethod
+    def metadata(self) -> dict[str, object]:
+        """The server's metadata of the wire, sent on connect."""
+
+    @abstractmethod
+    def read(self, message: Any) -> ParsedRequest:
+        """The request; an exception where it is none."""
+
+    @abstractmethod
+    def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
+        """The frame that answers it."""
+
+    @abstractmethod
+    def failure(self, traceback: str, message: Any) -> str | bytes:
+        """The frame that says what went wrong with it."""
+
+    @property
+    def _continues(self) -> bool:
+        return self._fault.name != "no_rtc"
+
+
+class NoRtcWire(Wire):
+    """Wire of most servers: keys that they do not know are dropped, without a word."""
+
+    def metadata(self) -> dict[str, object]:
+        return {}
+
+    def read(self, message: Any) -> ParsedRequest:
+        return ParsedRequest(message)
+
+    def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
+        return packed(result)
+
+    def failure(self, traceback: str, message: Any) -> str | bytes:
+        return traceback
+
+
+class PrevActionWire(NoRtcWire):
+    """Keys of the observation; it names no delay, so as many rows are kept as were consumed since the last request."""
+
+    def metadata(self) -> dict[str, object]:
+        dialect = "prev_action" if self._continues else "none"
+        return {"rtc": {"dialect": dialect, "stand_in": STAND_IN}}
+
+    def read(self, message: Any) -> ParsedRequest:
+        if not self._continues or "prev_action" not in message:
+            return ParsedRequest(message)
+        rows = self._space.joints(message["prev_action"])
+        consumed = message["rtc_params"]["s"]
+        if not isinstance(consumed, int) or not 0 <= consumed < len(rows):
+            raise ValueError(f"rtc_params.s is {consumed!r}, expected 0 to {len(rows) - 1}")
+        left = rows[: len(rows) - consumed]
+        return ParsedRequest(message, CommittedPrefix(left, consumed, len(left)))
+
+
+class OpenpiRtcWire(NoRtcWire):
+    """openpi-rtc: takes a fixed number of rows off the chunk before, whatever the robot has executed."""
+
+    @property
+    def _shift(self) -> int:
+        return min(_SHIFT, self._horizon // 2)
+
+    def metadata(self) -> dict[str, object]:
+        dialect = "openpi_rtc" if self._continues else "none"
+        return {"rtc": {"dialect": dialect, "stand_in": STAND_IN, "shift": self._shift}}
+
+    def read(self, message: Any) -> ParsedRequest:
+        observation = message.get("obs", message)
+        if not self._continues or not message.get("is_rtc") or "prev_action" not in message:
+            return ParsedRequest(observation)
+        left = self._space.joints(message["prev_action"])[self._shift :]
+        return ParsedRequest(observation, CommittedPrefix(left, min(_FROZEN, len(left)), len(left)))
+
+
+class Kai0Flat(NoRtcWire):
+    """kai0: row n of the chunk before is row n of the new one."""
+
+    def metadata(self) -> dict[str, object]:
+        return {"rtc": {"dialect": "kai0" if self._continues else "none", "stand_in": STAND_IN}}
+
+    def read(self, message: Any) -> ParsedRequest:
+        delay, end = message["inference_delay"], message["execute_horizon"]
+        if not isinstance(delay, int) or not isinstance(end, int) or delay < 0 or end < 1:
+            raise ValueError(f"inference_delay {delay!r}, execute_horizon {end!r}: expected 0 and 1 or more")
+        if not self._continues or "prev_action_chunk" not in message:
+            return ParsedRequest(message)
+        rows = np.asarray(message["prev_action_chunk"], np.float64)
+        if rows.ndim != 2 or rows.shape[1] < self._space.dim:
+            raise ValueError(
+                f"prev_action_chunk has shape {rows.shape}, expected [T, {self._space.dim}] or wider"
+            )
+        end = max(delay, min(end, len(rows)))
+        return ParsedRequest(message, CommittedPrefix(rows[:, : self._space.dim], delay, end))
+
+
+class Envelope(Wire):
+    """openpi-async-rtc, version 2."""
+
+    def metadata(self) -> dict[str, object]:
+        return {
+            "rtc": {"dialect": "async_rtc", "stand_in": STAND_IN},
+            "async_rtc": {
+                **self._head(),
+                "model_action_horizon": self._horizon,
+                "model_action_dim": self._space.width,
+                "rtc_supported": self._continues,
+                "image_transport_codecs": ["raw"],
+            },
+        }
+
+    def read(self, message: Any) -> ParsedRequest:
+        found = (message.get("protocol"), message.get("protocol_version"))
+        if found != (_ENVELOPE, _VERSION):
+            raise ValueError(f"protocol {found[0]!r} version {found[1]!r}; expected {_ENVELOPE!r} version 2")
+        number, codec = message.get("request_id"), message["image_transport"]["codec"]
+        if not isinstance(number, int) or number < 0:
+            raise ValueError(f"request_id is {number!r}, expected 0 or more")
+        if codec != "raw":
+            raise ValueError(f"image_transport.codec is {codec!r}, expected 'raw'")
+        rtc = message.get("rtc")
+        prefix = None if rtc is None or not self._continues else self._prefix(rtc)
+        return ParsedRequest(message["observation"], prefix, number)
+
+    def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
+        number = asked.number
+        if self._fault.name == "request_id" and number is not None:
+            number += 1
+        timing = {"image_decode_ms": 0.0, "codec": "raw"}
+        whole = {**self._head(), "request_id": number, "result": {**result, "image_transport": timing}}
+        return packed(whole)
+
+    def failure(self, traceback: str, message: Any) -> str | bytes:
+        number = message.get("request_id") if isinstance(message, dict) else None
+        known = number if isinstance(number, int) else None
+        return packed({**self._head(), "request_id": known, "error": traceback})
+
+    def _head(self) -> dict[str, object]:
+        version = _VERSION
+        if self._fault.name == "envelope_version":
+            version = int(self._fault.number(_VERSION + 1))
+        return {"protocol": _ENVELOPE, "protocol_version": version}
+
+    def _prefix(self, rtc: Any) -> CommittedPrefix:
+        missing = [name for name in _FIELDS if name not in rtc]
+        if missing:
+            raise KeyError(f"rtc has no {', '.join(missing)}")
+        rows = self._space.joints(np.asarray(rtc["prev_chunk_left_over"]))
+        delay, end = rtc["inference_delay"], rtc["execution_horizon"]
+        if not 0 <= delay <= end <= self._horizon:
+            raise ValueError(
+                f"inference_delay {delay} and execution_horizon {end}: expected 0 <= delay <= execution_horizon "
+                f"<= {self._horizon}"
+            )
+        return CommittedPrefix(rows, delay, end)
+
+
+WIRES: dict[Name, type[Wire]] = {
+    "none": NoRtcWire,
+    "prev_action": PrevActionWire,
+    "openpi_rtc": OpenpiRtcWire,
+    "kai0": Kai0Flat,
+    "async_rtc": Envelope,
+}
