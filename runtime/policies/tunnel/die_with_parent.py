@@ -1,7 +1,7 @@
 """Launcher of a program that ends with its parent process, however that ends.
 
-Run by its path: `die_with_parent.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it starts the program at
-once.
+Run by its path: `die_with_parent.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it starts the
+program at once.
 """
 
 import ctypes
