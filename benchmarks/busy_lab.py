@@ -57,10 +57,10 @@ def main() -> int:
 
 
 def _up(lab: Any, given: argparse.Namespace) -> None:
+    from evaweb.accounts.roles import Role
     from evaweb.lab import demo_rows, programs
     from evaweb.lab.benches import Bench
     from evaweb.lab.processes import ProgramSpec
-    from evaweb.roles import Role
     from runtime.simulation.program import announce_ready
 
     node = lab.processes.start(programs.tabletop(ROBOT, programs.bench(1, 640, 480)))

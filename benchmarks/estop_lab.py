@@ -98,9 +98,9 @@ def _people() -> dict[str, Any]:
     """Create accounts of each role and GUESSED_ACCOUNT with new passwords, and a token of the operator."""
     from django.contrib.auth.models import User
 
+    from evaweb.accounts.roles import Role
     from evaweb.api.tokens import create_token
     from evaweb.lab.demo_rows import demo_login
-    from evaweb.roles import Role
 
     people = {str(role): role for role in Role} | {GUESSED_ACCOUNT: Role.VIEWER}
     logins = [demo_login(username=name, role=role) for name, role in people.items()]

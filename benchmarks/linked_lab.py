@@ -42,8 +42,8 @@ def main() -> int:
 def _announce(ready_file: Path, url: str, stops: str, pids: dict[str, int]) -> None:
     from django.contrib.auth.models import User
 
+    from evaweb.accounts.roles import Role
     from evaweb.lab.demo_rows import demo_login, station_registered
-    from evaweb.roles import Role
     from evaweb.stations.enrolment import code_make
     from runtime.simulation.program import announce_ready
 

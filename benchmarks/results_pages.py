@@ -250,7 +250,7 @@ def _operator(
     """
     from django.db import OperationalError, connection
 
-    from evaweb.errors import Conflict
+    from evaweb.core.errors import Conflict
 
     trial = None
     try:

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection, connect
 
-from evaweb.binary_frames import decode
+from evaweb.core.binary_frames import decode
 from robots.broken_pipe import exit_on_broken_pipe
 
 

@@ -18,8 +18,8 @@ from django.conf import settings
 from evaweb.api.stop_gateway import StopGateway
 from evaweb.console.origins import SameOrigin
 from evaweb.console.routing import websocket_urlpatterns
-from evaweb.slots import RequestLimiter
-from evaweb.static_files import StaticFiles
+from evaweb.serving.request_limiter import RequestLimiter
+from evaweb.serving.static_files import StaticFiles
 
 application = ProtocolTypeRouter(
     {

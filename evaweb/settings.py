@@ -11,8 +11,9 @@ from pathlib import Path
 import dj_database_url
 from django.core.exceptions import ImproperlyConfigured
 
-from evaweb import environment, headers
-from evaweb.static_files import digest_of
+from evaweb.core import environment
+from evaweb.serving import headers
+from evaweb.serving.static_files import digest_of
 
 BASE_DIR = environment.checkout(Path(__file__).parents[1])
 DATA_DIR = environment.data_dir(BASE_DIR / "data")
@@ -50,18 +51,18 @@ INSTALLED_APPS = [
 ]
 
 MIDDLEWARE = [
-    "evaweb.headers.HeadersMiddleware",
+    "evaweb.serving.headers.HeadersMiddleware",
     "django.middleware.security.SecurityMiddleware",
     "csp.middleware.CSPMiddleware",
-    "evaweb.cookies.AnySessionMiddleware",
+    "evaweb.accounts.cookies.AnySessionMiddleware",
     "django.middleware.common.CommonMiddleware",
     "django.middleware.csrf.CsrfViewMiddleware",
     "django.contrib.auth.middleware.AuthenticationMiddleware",
-    "evaweb.refusals.LoginMiddleware",
+    "evaweb.serving.error_pages.LoginMiddleware",
     "django.contrib.messages.middleware.MessageMiddleware",
     "django.middleware.clickjacking.XFrameOptionsMiddleware",
     "django_htmx.middleware.HtmxMiddleware",
-    "evaweb.refusals.RefusalMiddleware",
+    "evaweb.serving.error_pages.RefusalMiddleware",
     "axes.middleware.AxesMiddleware",
 ]
 
@@ -83,9 +84,9 @@ TEMPLATES = [
                 "django.contrib.messages.context_processors.messages",
             ],
             "builtins": [
-                "evaweb.blinding_tags",  # templates get checkpoint names only through these tags
-                "evaweb.language_tags",
-                "evaweb.time_tags",
+                "evaweb.blinding.template_tags",  # templates get checkpoint names only through these tags
+                "evaweb.core.language_tags",
+                "evaweb.core.time_tags",
             ],
         },
     }
@@ -102,7 +103,7 @@ _SQLITE = {
 
 
 _POSTGRESQL = {
-    "connect_timeout": 10,  # shorter in the web: evaweb.lock_wait
+    "connect_timeout": 10,  # shorter in the web: evaweb.core.lock_wait
     "tcp_user_timeout": 10_000,  # [ms], detects a server that has vanished
     "keepalives_idle": 5,
     "keepalives_interval": 2,
@@ -153,7 +154,7 @@ def _viewer() -> Path | None:
     return Path(str(scripts[0].locate())).parent if scripts else None
 
 
-LANGUAGES_DIR = BASE_DIR / "static" / "languages"  # translations, see evaweb.languages
+LANGUAGES_DIR = BASE_DIR / "static" / "languages"  # translations, see evaweb.core.languages
 STATICFILES_DIRS: list[Path | tuple[str, Path]] = [BASE_DIR / "static"]
 # `make setup` installs both; a system check of evaweb.console reports a missing one.
 for _name, _folder in (("meshcat", _viewer()), ("uplot", BASE_DIR / "node_modules" / "uplot" / "dist")):
@@ -185,11 +186,11 @@ SECURE_REFERRER_POLICY = "same-origin"
 X_FRAME_OPTIONS = "DENY"
 AUTHENTICATION_BACKENDS = [
     "axes.backends.AxesStandaloneBackend",
-    "evaweb.lockout.ManyNames",
+    "evaweb.serving.lockout_page.ManyNames",
     "django.contrib.auth.backends.ModelBackend",
-    "evaweb.administration.RoleBackend",
+    "evaweb.accounts.admin_site.RoleBackend",
 ]
-PASSWORD_HASHERS = ["evaweb.hashing.QueuedHasher"]  # same hashes as PBKDF2PasswordHasher
+PASSWORD_HASHERS = ["evaweb.accounts.password_hashing.QueuedHasher"]  # same hashes as PBKDF2PasswordHasher
 AUTH_PASSWORD_VALIDATORS = [
     {"NAME": "django.contrib.auth.password_validation.UserAttributeSimilarityValidator"},
     {"NAME": "django.contrib.auth.password_validation.MinimumLengthValidator"},
@@ -201,10 +202,10 @@ AXES_FAILURE_LIMIT = 5
 AXES_COOLOFF_TIME = timedelta(minutes=15)
 AXES_RESET_ON_SUCCESS = True
 AXES_RESET_COOL_OFF_ON_FAILURE_DURING_LOCKOUT = False
-AXES_CLIENT_IP_CALLABLE = "evaweb.callers.lockable_of"
-AXES_LOCKOUT_CALLABLE = "evaweb.lockout.lockout_response"
+AXES_CLIENT_IP_CALLABLE = "evaweb.accounts.client_addresses.lockable_of"
+AXES_LOCKOUT_CALLABLE = "evaweb.serving.lockout_page.lockout_response"
 AXES_SENSITIVE_PARAMETERS = ["username", "ip_address", "csrfmiddlewaretoken"]
-AXES_DISABLE_ACCESS_LOG = True  # evaweb.audit logs logins and logouts
+AXES_DISABLE_ACCESS_LOG = True  # evaweb.accounts.login_audit logs logins and logouts
 AXES_ENABLE_ADMIN = False  # evaweb.api.admin has its own page
 AXES_VERBOSE = False
 
@@ -221,7 +222,7 @@ LOGGING = {
     "handlers": {"console": {"class": "logging.StreamHandler", "formatter": "line"}},
     "filters": {"in_one_line": {"()": "django.utils.log.CallbackFilter", "callback": _in_one_line}},
     "loggers": {
-        "axes": {"level": "ERROR"},  # evaweb.audit logs the logins
+        "axes": {"level": "ERROR"},  # evaweb.accounts.login_audit logs the logins
         "django.security.DisallowedHost": {
             "filters": ["in_one_line"]
         },  # any client can cause it, so log one line without traceback

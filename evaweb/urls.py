@@ -8,9 +8,9 @@ from django.contrib.auth.decorators import login_not_required
 from django.http import HttpRequest, HttpResponse
 from django.urls import include, path
 
+from evaweb.accounts.password_change import OwnPasswordView
 from evaweb.api.urls import urls as rest
 from evaweb.lab import first_account
-from evaweb.passwords import OwnPasswordView
 
 
 @login_not_required
@@ -19,7 +19,7 @@ async def healthz(request: HttpRequest) -> HttpResponse:
     return HttpResponse("ok\n", content_type="text/plain")
 
 
-handler400, handler500 = "evaweb.refusals.bad_request", "evaweb.refusals.server_error"
+handler400, handler500 = "evaweb.serving.error_pages.bad_request", "evaweb.serving.error_pages.server_error"
 urlpatterns = [
     path("healthz", healthz),
     path(

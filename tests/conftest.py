@@ -57,7 +57,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 # The files that take longest, first: else the other cores wait for the last of them.
 _LONGEST = (
-    "tests/evaweb/test_blinding.py",
+    "tests/evaweb/blinding/test_visibility.py",
     "tests/runtime/processes/lockstep/test_lockstep.py",
     "tests/evaweb/plans/test_design.py",
     "tests/runtime/clients/channel/test_server.py",

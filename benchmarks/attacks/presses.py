@@ -9,7 +9,7 @@ from uuid import uuid4
 from benchmarks.attacks.requests import again_and_again
 from benchmarks.attacks.target import Target
 from benchmarks.estop_presses import RestPresser
-from evaweb.roles import Role
+from evaweb.accounts.roles import Role
 
 _TOKENS, _HALTS = 64, 32
 

@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 
 from benchmarks.attacks.target import Target
 from benchmarks.estop_lab import GUESSED_ACCOUNT, PRESSED
+from evaweb.accounts.roles import Role
 from evaweb.lab.rest_client import RestClient
 from evaweb.lab.stall_detection import DemoFailed
-from evaweb.roles import Role
 
 _CONNECTIONS, _LOGINS, _BODIES = 1100, 10, 4
 _BODY, _CHUNK = 200_000_000, bytes(1_000_000)

@@ -7,8 +7,8 @@ from typing import Any
 from django.http import HttpRequest
 from ninja import Router, Schema
 
+from evaweb.accounts.roles import Role, role_of
 from evaweb.api.responses import FAILURES
-from evaweb.roles import Role, role_of
 
 router = Router(tags=["accounts"])
 

@@ -16,8 +16,8 @@ from django.db.models import QuerySet
 from django.http import HttpRequest
 from django.utils import timezone
 
+from evaweb.accounts.roles import Role, role_of, set_role
 from evaweb.api.models import Token
-from evaweb.roles import Role, role_of, set_role
 
 log = logging.getLogger(__name__)
 _MEANINGS = (

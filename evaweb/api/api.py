@@ -31,10 +31,10 @@ from evaweb.api import (
 from evaweb.api.auth import NOT_LOGGED_IN, Bearer, Session
 from evaweb.api.request_validation import BoundedParser, reject_unknown_parameters
 from evaweb.api.responses import describe_errors
-from evaweb.errors import EvaError, refusal
-from evaweb.races import TAKEN, was_taken
-from evaweb.refusals import retrying
-from evaweb.storage import storage_error_response
+from evaweb.core.errors import EvaError, refusal
+from evaweb.core.storage_errors import storage_error_response
+from evaweb.core.write_conflicts import TAKEN, was_taken
+from evaweb.serving.error_pages import retrying
 from runtime.core import bounded_documents as bounded
 
 log = logging.getLogger(__name__)

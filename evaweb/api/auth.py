@@ -7,11 +7,11 @@ from typing import Any
 from django.http import HttpRequest
 from ninja.security import HttpBearer, SessionAuth
 
-from evaweb import audit
+from evaweb.accounts import login_audit
+from evaweb.accounts.client_addresses import client_address
+from evaweb.accounts.credentials import SESSION, TOKEN, credentials
 from evaweb.api.tokens import UNKNOWN
-from evaweb.callers import client_address
-from evaweb.credentials import SESSION, TOKEN, credentials
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from runtime.core.sentences import Pattern, fixed
 
 _UNKNOWN_TOKEN = Pattern(
@@ -43,7 +43,7 @@ class Bearer(HttpBearer):
         """
         user = credentials.look_up(TOKEN, token)
         if user is None:
-            audit.log_token_refused(client_address(request), UNKNOWN)
+            login_audit.log_token_refused(client_address(request), UNKNOWN)
             raise NotLoggedIn(_UNKNOWN_TOKEN(unknown=UNKNOWN))
         return user
 

@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema
 
 from evaweb.api.responses import FAILURES, Page, Paging
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.trials import selectors
 from evaweb.trials.models import Checkpoint
 

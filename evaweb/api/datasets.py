@@ -11,9 +11,9 @@ from ninja import Router, Schema, Status
 
 from evaweb.api.jobs import JobOut
 from evaweb.api.responses import FAILURES
+from evaweb.core.errors import Conflict
 from evaweb.datasets import dataset_jobs, dataset_orders, episode_list
 from evaweb.datasets.overview import Overview, overview, overviews
-from evaweb.errors import Conflict
 from runtime.recording.files import RecordingError
 
 router = Router(tags=["datasets"])

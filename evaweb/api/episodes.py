@@ -10,16 +10,16 @@ from asgiref.sync import async_to_sync
 from django.http import HttpRequest
 from ninja import Field, Query, Router, Schema, Status
 
+from evaweb.accounts.roles import Role, require_role
 from evaweb.api.jobs import JobOut
 from evaweb.api.responses import FAILURES, Page, Paging
-from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.blinding.visibility import Visibility, visibility_for_request
 from evaweb.collect.selectors import PUBLISHED_RESULTS, accepted_demonstrations
+from evaweb.core.errors import Conflict, NotFound
 from evaweb.episodes import services
 from evaweb.episodes.export_table import CONTENT_TYPE, table_file
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.streaming import file_answer
-from evaweb.errors import Conflict, NotFound
-from evaweb.roles import Role, require_role
 from evaweb.stations.selectors import station_get
 from evaweb.trials.models import TrialStatus
 from runtime.core.sentences import Pattern

@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from ninja import Query, Router, Schema, Status
 
 from evaweb.api.responses import FAILURES, Page, Paging
-from evaweb.blinding import HIDDEN, Visibility, visibility_for_request
+from evaweb.blinding.visibility import HIDDEN, Visibility, visibility_for_request
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_get

@@ -16,7 +16,7 @@ from evaweb.api.responses import (
     Paging,
 )
 from evaweb.api.trials import TrialDetail
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.plans import allocation, services
 from evaweb.plans import bench_checks as bench
 from evaweb.plans.allocation import plan_progress

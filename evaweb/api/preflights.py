@@ -15,7 +15,7 @@ from evaweb.api.responses import (
     Page,
     Paging,
 )
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.preflights import selectors, services
 from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight, PreflightStatus

@@ -13,10 +13,10 @@ from typing import Any
 from django.http import HttpRequest
 from ninja.parser import Parser
 
-from evaweb.errors import EvaError
-from evaweb.posts import body_limit_for
-from evaweb.refusals import is_text
-from evaweb.roles import require_role
+from evaweb.accounts.roles import require_role
+from evaweb.core.errors import EvaError
+from evaweb.serving.body_limits import body_limit_for
+from evaweb.serving.error_pages import is_text
 from evaweb.stations.commands import STOPPING
 from runtime.core import bounded_documents as bounded
 from runtime.core.sentences import Pattern

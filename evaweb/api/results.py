@@ -14,7 +14,8 @@ from pydantic import create_model
 
 from evaweb.api.responses import FAILURES, Page, Paging
 from evaweb.api.tables import Format, table_response
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
+from evaweb.core.tabular_export import in_pages
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
@@ -37,7 +38,6 @@ from evaweb.results.reports.document import (
 from evaweb.results.reports.reporting import planned_document
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
 from evaweb.results.selectors import plan_at_reveal, plan_get
-from evaweb.tabular_export import in_pages
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score
 from runtime.core.sentences import Pattern

@@ -9,13 +9,13 @@ from uuid import UUID
 from django.http import HttpRequest
 from ninja import Field, Router, Schema, Status
 
+from evaweb.accounts.roles import Role, require_role
 from evaweb.api.jobs import JobOut
 from evaweb.api.responses import FAILURES, Body
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.episodes.selectors import episode_get, tag_counts
 from evaweb.reviews import selectors, services
 from evaweb.reviews.models import Review, Segment, SegmentLabel
-from evaweb.roles import Role, require_role
 
 router = Router(tags=["reviews"])
 

@@ -16,7 +16,7 @@ from evaweb.api.responses import (
     Page,
     Paging,
 )
-from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.blinding.visibility import Visibility, visibility_for_request
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
 from evaweb.collect.work import QueueItem, session_queue

@@ -14,11 +14,11 @@ from pydantic import AfterValidator, ValidationError, field_validator
 
 from evaweb.api.responses import FAILURES, Body, ErrorOut
 from evaweb.api.trials import TrialDetail
-from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.blinding.visibility import Visibility, visibility_for_request
 from evaweb.collect.selectors import session_get
 from evaweb.collect.station_commands import session_command
+from evaweb.core.errors import EvaError, StationGone, reasoned
 from evaweb.datasets.robot_replay import replay_command
-from evaweb.errors import EvaError, StationGone, reasoned
 from evaweb.stations import commands, leases, selectors, stops
 from evaweb.stations import redaction as veil
 from evaweb.stations.lease_holders import holder_display_name

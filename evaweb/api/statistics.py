@@ -10,7 +10,7 @@ from ninja import Query, Router, Schema
 from evaweb.api.responses import FAILURES
 from evaweb.api.tables import Format, table_response
 from evaweb.api.trials import Filters
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.trials import selectors
 from evaweb.trials.selectors import StatisticsRow
 

@@ -24,14 +24,10 @@ from django.utils import timezone
 from ninja.utils import check_csrf
 from pydantic import ValidationError
 
-from evaweb import audit
-from evaweb.api.auth import NOT_LOGGED_IN
-from evaweb.api.responses import describe_errors
-from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
-from evaweb.api.tokens import UNKNOWN
-from evaweb.callers import client_address, client_key
-from evaweb.cookies import MOST, cookie_values, session_keys
-from evaweb.credentials import (
+from evaweb.accounts import login_audit
+from evaweb.accounts.client_addresses import client_address, client_key
+from evaweb.accounts.cookies import MOST, cookie_values, session_keys
+from evaweb.accounts.credentials import (
     RETRY_AFTER_S,
     SESSION,
     TOKEN,
@@ -42,10 +38,14 @@ from evaweb.credentials import (
     Unverifiable,
     credentials,
 )
-from evaweb.errors import EvaError, NotAllowed, refusal
-from evaweb.headers import DEFAULT_HEADERS
-from evaweb.origins import is_own_origin, scheme_of
-from evaweb.roles import Role
+from evaweb.accounts.roles import Role
+from evaweb.api.auth import NOT_LOGGED_IN
+from evaweb.api.responses import describe_errors
+from evaweb.api.stations import HTTP_OF, CommandIn, EStopIn
+from evaweb.api.tokens import UNKNOWN
+from evaweb.core.errors import EvaError, NotAllowed, refusal
+from evaweb.serving.headers import DEFAULT_HEADERS
+from evaweb.serving.origins import is_own_origin, scheme_of
 from evaweb.stations import commands, stops
 from evaweb.stations import redaction as veil
 from evaweb.stations.models import Station
@@ -198,7 +198,7 @@ async def _estop(scope: dict[str, Any], station: str, said: Mapping[str, Any]) -
         login = await _resolve_presser(scope)
     except (Unverifiable, LookupOverload) as fault:  # overload must not refuse an e-stop
         unverified = str(fault)
-        audit.estop_unverified(station, fault)
+        login_audit.estop_unverified(station, fault)
     else:
         username, user = login.username, login.account
     uuid = given.uuid or uuid4()
@@ -269,7 +269,7 @@ async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
 def _unknown_credentials(found: list[Credential], scope: dict[str, Any]) -> Refused:
     if all(kind != TOKEN for kind, _ in found):
         return Refused(NOT_LOGGED_IN, 401)
-    audit.log_token_refused(client_address(ASGIRequest(scope, BytesIO())), UNKNOWN)
+    login_audit.log_token_refused(client_address(ASGIRequest(scope, BytesIO())), UNKNOWN)
     return Refused(_UNKNOWN_TOKEN(unknown=UNKNOWN), 401)
 
 

@@ -7,8 +7,13 @@ from typing import Any, Literal
 
 from django.http import HttpRequest, StreamingHttpResponse
 
-from evaweb.downloads import CSV, download
-from evaweb.tabular_export import Pages, csv_cell, iter_csv, iter_parquet
+from evaweb.core.tabular_export import (
+    Pages,
+    csv_cell,
+    iter_csv,
+    iter_parquet,
+)
+from evaweb.serving.downloads import CSV, download
 
 __all__ = ["Format", "Pages", "csv_cell", "csv_response", "table_response"]
 

@@ -13,10 +13,15 @@ from django.db.models.signals import post_delete
 from django.dispatch import receiver
 from django.utils import timezone
 
+from evaweb.accounts.credentials import (
+    EXPIRED_ALLOWED,
+    TOKEN,
+    credentials,
+    digest,
+)
 from evaweb.api.models import Token
-from evaweb.credentials import EXPIRED_ALLOWED, TOKEN, credentials, digest
-from evaweb.errors import Conflict, EvaError
-from evaweb.lock_wait import lock_wait
+from evaweb.core.errors import Conflict, EvaError
+from evaweb.core.lock_wait import lock_wait
 from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from evaweb.api.responses import (
     Paging,
 )
 from evaweb.api.tables import Format, table_response
-from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.blinding.visibility import Visibility, visibility_for_request
 from evaweb.trials import corrections, selectors, services, voids
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Score, Trial, TrialStatus, VoidRequest

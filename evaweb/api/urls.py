@@ -7,14 +7,14 @@ from django.http import HttpRequest, JsonResponse
 from django.urls import URLPattern, path
 from django.views.decorators.csrf import csrf_exempt
 
-from evaweb import refusals
 from evaweb.api.api import api
+from evaweb.serving import error_pages
 
 
 @csrf_exempt  # it changes nothing, and 404 is the more accurate answer
 def nowhere(request: HttpRequest, rest: str) -> JsonResponse:
     """Answer 404 at an unknown address, in the format of all answers."""
-    return JsonResponse({"error": refusals.unknown_address_sentence(request.path)}, status=404)
+    return JsonResponse({"error": error_pages.unknown_address_sentence(request.path)}, status=404)
 
 
 patterns, app_name, namespace = api.urls

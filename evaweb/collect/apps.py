@@ -10,7 +10,7 @@ class CollectConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import protect
         from evaweb.collect import restoring  # noqa: F401  it declares itself to those that reconcile
+        from evaweb.records.append_only import protect
 
         protect(self)

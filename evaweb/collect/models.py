@@ -8,8 +8,8 @@ from django.conf import settings
 from django.db import models
 from django.utils import timezone
 
-from evaweb.append_only import AppendOnly
 from evaweb.episodes.models import Episode
+from evaweb.records.append_only import AppendOnly
 from evaweb.stations.models import Station
 
 

@@ -7,7 +7,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from evaweb.collect.models import SessionEvent
-from evaweb.journal import Journal, Line, Moment, Person, RowPath
+from evaweb.records.journal import (
+    Journal,
+    Line,
+    Moment,
+    Person,
+    RowPath,
+)
 from evaweb.stations.models import STATION_NAME
 
 _OPENED = ("station", "dataset", "task", "setup")  # constant values

@@ -9,17 +9,17 @@ from uuid import UUID
 from django.db import transaction
 from django.utils import timezone
 
+from evaweb.accounts.roles import get_or_create_person
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 from evaweb.collect.record import SESSIONS, EventLine
 from evaweb.collect.setups import setup_from_manifest
 from evaweb.collect.station_events import bind_demonstration, sync_label
+from evaweb.core.errors import EvaError
 from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.manifest import read_recorded_episode
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import RestorableRun, register_restorer
 from evaweb.episodes.services import get_or_create_station
-from evaweb.errors import EvaError
-from evaweb.roles import get_or_create_person
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
 from runtime.recording.files import read_json

@@ -8,10 +8,10 @@ from uuid import UUID
 from django.db.models import Count, F, Q, QuerySet
 
 from evaweb.collect.models import CollectSession, Demonstration, Result
+from evaweb.core.errors import NotFound
 from evaweb.episodes.folders import datasets_dir
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.episodes.publishing import session_dataset
-from evaweb.errors import NotFound
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
 from runtime.datasets.catalog import Catalog

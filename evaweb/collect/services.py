@@ -8,16 +8,16 @@ from typing import Any
 from django.db import IntegrityError, transaction
 from django.utils import timezone
 
+from evaweb.accounts.roles import Role, require_role
 from evaweb.collect import selectors
 from evaweb.collect.models import CollectSession, Result, SessionEvent, SessionEventKind
 from evaweb.collect.record import SESSIONS, EventLine
 from evaweb.collect.setups import require_same_setup, setup_from_snapshot
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.episodes.publishing import DATASET_NAME
 from evaweb.episodes.services import request_publish
-from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
-from evaweb.journal import clean_text
-from evaweb.roles import Role, require_role
+from evaweb.records.journal import clean_text
 from evaweb.stations.lease_holders import holder_display_name
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import connection_to

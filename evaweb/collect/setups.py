@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from evaweb.errors import Conflict
+from evaweb.core.errors import Conflict
 from runtime.core.sentences import Pattern
 
 _COLLECTS_NOTHING_DEPLOYMENT_HAS_NO = Pattern(

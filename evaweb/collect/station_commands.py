@@ -8,13 +8,13 @@ from uuid import UUID
 
 from django.db import transaction
 
+from evaweb.accounts.roles import Role, require_role
 from evaweb.collect.models import CollectSession
 from evaweb.collect.selectors import session_get
 from evaweb.collect.setups import require_same_setup, setup_from_snapshot
 from evaweb.collect.station_events import bind_demonstration
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.episodes.services import record_opened
-from evaweb.errors import Conflict, EvaError
-from evaweb.roles import Role, require_role
 from evaweb.stations.commands import issue_command, parse_command_uuid
 from evaweb.stations.models import CARRIED_OUT, Command
 from evaweb.stations.runtime_client import connection_to

@@ -14,10 +14,10 @@ from uuid import uuid4
 
 import numpy as np
 
-from evaweb.binary_frames import to_json_value
+from evaweb.accounts.roles import Role
 from evaweb.console.requests import Aim
-from evaweb.errors import EvaError
-from evaweb.roles import Role
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import EvaError
 from evaweb.stations.lease_holders import with_display_names
 from evaweb.stations.models import Station
 from evaweb.stations.request_coalescer import RequestCoalescer, TooManyRequests

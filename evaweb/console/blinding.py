@@ -9,7 +9,7 @@ from typing import Any
 from channels.db import database_sync_to_async
 from django.db import Error
 
-from evaweb.blinding import Visibility, visibility_for_user
+from evaweb.blinding.visibility import Visibility, visibility_for_user
 
 log = logging.getLogger(__name__)
 

@@ -20,8 +20,16 @@ from channels.db import database_sync_to_async
 from channels.generic.websocket import AsyncWebsocketConsumer
 from django.db import Error
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility, visibility_for_user
-from evaweb.callers import client_key
+from evaweb.accounts.client_addresses import client_key
+from evaweb.accounts.cookies import session_keys
+from evaweb.accounts.credentials import (
+    COUNTS_S,
+    SESSION,
+    Login,
+    credentials,
+)
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility, visibility_for_user
 from evaweb.console import requests
 from evaweb.console.aim_queries import AimQueries
 from evaweb.console.hub import StationRoom, hub
@@ -30,10 +38,7 @@ from evaweb.console.mailbox import Mailbox
 from evaweb.console.page_stops import PageStops
 from evaweb.console.quota import PER_SECOND, MessageQuota
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
-from evaweb.cookies import session_keys
-from evaweb.credentials import COUNTS_S, SESSION, Login, credentials
-from evaweb.errors import NotFound, StationGone, reasoned
-from evaweb.roles import Role, role_of
+from evaweb.core.errors import NotFound, StationGone, reasoned
 from evaweb.stations import leases
 from evaweb.stations.models import Station
 from evaweb.stations.request_coalescer import RequestCoalescer, TooManyRequests

@@ -14,7 +14,7 @@ import daphne.server  # noqa: F401  first: it decides which reactor there is
 from django.template.loader import render_to_string
 from twisted.web.http import HTTPChannel
 
-from evaweb.headers import DEFAULT_HEADERS, PLAIN_PAGE
+from evaweb.serving.headers import DEFAULT_HEADERS, PLAIN_PAGE
 
 _REST = b"/api/"
 _STOPS = re.compile(rb"/api/v1/stations/[^/]+/(estop|commands)")

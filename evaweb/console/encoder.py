@@ -14,7 +14,7 @@ from evaweb.console import frame_parts
 from evaweb.console.chunks import encode_chunk
 from evaweb.console.frame_parts import EncodedPart
 from evaweb.console.recent_samples import RecentSamples
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations import redaction as veil
 from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import zmq
 
-from evaweb.binary_frames import to_json_value
-from evaweb.errors import StationGone
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import StationGone
 from evaweb.stations.runtime_client import StationConnection, connection_to
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber

@@ -1,6 +1,6 @@
 """Parts of frames, each encoded once for all viewers: a viewer's frame is a concatenation of parts.
 
-The layout is that of evaweb.binary_frames, which also reads it.
+The layout is that of evaweb.core.binary_frames, which also reads it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.binary_frames import to_json_value
+from evaweb.core.binary_frames import to_json_value
 
 _ALIGNMENT = 8
 _AGE = "age"  # placeholder of a part's age

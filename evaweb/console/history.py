@@ -11,7 +11,7 @@ from typing import Any
 
 from django.utils import timezone
 
-from evaweb.blinding import Visibility
+from evaweb.blinding.visibility import Visibility
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.results.presentation.drawings.svg import (

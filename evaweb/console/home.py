@@ -14,7 +14,8 @@ from django.db.models import Q
 from django.urls import reverse
 from django.utils import timezone
 
-from evaweb.blinding import Visibility
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import Visibility
 from evaweb.console.feed import feeds
 from evaweb.console.views_jobs import Row, row_of
 from evaweb.episodes.verification import unverified
@@ -26,7 +27,6 @@ from evaweb.results import selectors as results
 from evaweb.results.ratings.result_visibility import sealed_reason
 from evaweb.results.selectors import PlanRow
 from evaweb.reviews.selectors import unreviewed_episodes
-from evaweb.roles import Role, role_of
 from evaweb.stations.models import LeaseRequest, Station
 from evaweb.trials.models import Trial, TrialStatus, VoidRequest
 from evaweb.trials.selectors import UNFINISHED

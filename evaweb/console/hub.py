@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
 from evaweb.console import blinding as sights
 from evaweb.console import change_marks, frame_parts
 from evaweb.console.encoder import StreamEncoder

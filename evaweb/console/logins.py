@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from evaweb.credentials import SESSION, credentials
-from evaweb.roles import Role, role_of
+from evaweb.accounts.credentials import SESSION, credentials
+from evaweb.accounts.roles import Role, role_of
 
 
 def current_role(session_key: str) -> Role | None:

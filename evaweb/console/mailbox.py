@@ -10,10 +10,10 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
 from evaweb.console.feed import History, LinkState
 from evaweb.console.frame_parts import EncodedPart
-from evaweb.errors import reasoned
+from evaweb.core.errors import reasoned
 from evaweb.stations import redaction as veil
 
 CREDITS = 2

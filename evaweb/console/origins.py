@@ -7,7 +7,7 @@ from typing import Any
 
 from channels.security.websocket import WebsocketDenier
 
-from evaweb.origins import is_own_origin, scheme_of
+from evaweb.serving.origins import is_own_origin, scheme_of
 
 
 class SameOrigin:

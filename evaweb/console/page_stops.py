@@ -16,11 +16,18 @@ from uuid import UUID
 
 from django.utils import timezone
 
-from evaweb import audit
+from evaweb.accounts import login_audit
+from evaweb.accounts.credentials import (
+    UNVERIFIED,
+    Credential,
+    Login,
+    LookupOverload,
+    Unverifiable,
+    credentials,
+)
+from evaweb.accounts.roles import Role
 from evaweb.console.requests import EStop, Stop
-from evaweb.credentials import UNVERIFIED, Credential, Login, LookupOverload, Unverifiable, credentials
-from evaweb.errors import reasoned
-from evaweb.roles import Role
+from evaweb.core.errors import reasoned
 from evaweb.stations import commands, stops
 from evaweb.stations.models import CommandStatus, Station
 
@@ -68,7 +75,7 @@ class PageStops:
         try:
             login = await credentials.resolve_presser(self._found, self._share)
         except (Unverifiable, LookupOverload) as fault:  # overload must not refuse an e-stop
-            audit.estop_unverified(self._station, fault)
+            login_audit.estop_unverified(self._station, fault)
             self._press(request, None, at, str(fault))
         else:
             if login is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import UUID, uuid4
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from runtime.core import bounded_documents as bounded
 from runtime.core.sentences import Pattern
 from runtime.ipc import estop_requests as pressing

@@ -7,7 +7,7 @@ from typing import Any
 
 from django.contrib.sessions.backends.base import SessionBase
 
-from evaweb.blinding import Visibility
+from evaweb.blinding.visibility import Visibility
 from evaweb.plans.allocation import Progress, plan_progress
 from evaweb.plans.bench_checks import cameras_of, current_camera_check, references
 from evaweb.plans.models import CameraCheck, Handout, Plan, Reference

@@ -21,7 +21,7 @@ from twisted.internet import reactor, task
 from evaweb.console.connection_limits import ConnectionLimiter, LimitedFactory, Request
 from evaweb.console.reading import until_read
 from evaweb.console.websocket_limits import LimitedWebSocket
-from evaweb.lock_wait import limit_page_waits
+from evaweb.core.lock_wait import limit_page_waits
 
 _ACCEPTED = 16  # connections accepted per turn of the event loop
 _MOST_WAITING = 4096  # connections without a whole request, unless a quarter of the file limit is less

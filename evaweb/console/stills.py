@@ -7,7 +7,7 @@ import time
 from collections import defaultdict
 
 from evaweb.console.feed import feeds
-from evaweb.errors import Conflict, NotFound
+from evaweb.core.errors import Conflict, NotFound
 from evaweb.plans import image_store
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.stations.models import Station

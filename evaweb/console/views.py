@@ -12,19 +12,19 @@ from django.templatetags.static import static
 from django.urls import reverse
 from django.views.decorators.http import require_safe
 
-from evaweb.blinding import visibility_for_request
+from evaweb.accounts.roles import role_of
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.collect import panel as collecting
 from evaweb.console import selectors
 from evaweb.console.history import histories
 from evaweb.console.home import alarms, now
 from evaweb.console.stills import still_of
+from evaweb.core.errors import EvaError, NotFound
+from evaweb.core.lock_wait import lock_wait
 from evaweb.datasets.robot_replay import make_offer, playable_episode
-from evaweb.errors import EvaError, NotFound
-from evaweb.lock_wait import lock_wait
-from evaweb.roles import role_of
+from evaweb.serving.stop_port import origin_for
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import request_list, station_get
-from evaweb.stop_port import origin_for
 from evaweb.trials.selectors import checkpoint_list
 
 log = logging.getLogger(__name__)

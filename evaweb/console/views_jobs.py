@@ -13,19 +13,19 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.blinding import HIDDEN, Visibility, visibility_for_request
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.blinding.visibility import HIDDEN, Visibility, visibility_for_request
+from evaweb.core.errors import EvaError
+from evaweb.core.printed_names import is_name
 from evaweb.datasets import dataset_jobs
 from evaweb.datasets.dataset_orders import KIND as DATASET
-from evaweb.errors import EvaError
 from evaweb.jobs import services
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import Pace, job_get, jobs_listed, pace_of
 from evaweb.jobs.workers import Served, served
-from evaweb.lists import Column, Filter, Listing
-from evaweb.names import is_name
 from evaweb.plans.covered_jobs import Cover, cover_of
 from evaweb.plans.models import Plan
-from evaweb.roles import Role, require_role, role_of
+from evaweb.serving.lists import Column, Filter, Listing
 
 PER_PAGE = 50
 # Display names of the kinds.

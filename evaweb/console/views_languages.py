@@ -7,8 +7,8 @@ import hashlib
 from django.http import HttpRequest, HttpResponse, JsonResponse
 from django.utils.cache import get_conditional_response
 
-from evaweb.errors import NotFound
-from evaweb.languages import language, offered
+from evaweb.core.errors import NotFound
+from evaweb.core.languages import language, offered
 from runtime.core.sentences import Pattern
 
 _NO_LANGUAGE = Pattern("console.languages.none", "language {code!r:.20} is not there; there are: {known}")

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, ValidationError
 
 import robots
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.datasets.overview import dataset_found, dataset_names, folder_named
-from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
-from evaweb.roles import Role, require_role
 from runtime.core.sentences import Pattern
 from runtime.datasets.layout import INFO
 from runtime.datasets.operations import fingerprint

@@ -9,7 +9,7 @@ from uuid import UUID
 
 from evaweb.datasets.overview import open_cached
 from evaweb.episodes.models import Episode
-from evaweb.lists import words_of
+from evaweb.serving.lists import words_of
 from runtime.datasets import layout
 from runtime.datasets.reader import Dataset
 from runtime.recording.files import RecordingError

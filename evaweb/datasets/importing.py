@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
+from evaweb.core.errors import EvaError
 from evaweb.datasets.dataset_orders import full_name
 from evaweb.datasets.overview import folder_named
 from evaweb.episodes import services
 from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir, datasets_dir, episodes_dir
-from evaweb.errors import EvaError
 from runtime.core.sentences import Pattern
 from runtime.datasets.episode_uuids import copy_with_uuids
 from runtime.datasets.importing import import_episode, resolve_source_robot

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from evaweb.core.errors import EvaError
 from evaweb.datasets.dataset_orders import KIND, least_for
 from evaweb.datasets.overview import dataset_found, folder_named
 from evaweb.episodes.dataset_membership import sync_memberships
-from evaweb.errors import EvaError
 from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
 from runtime.recording.files import RecordingError
 

@@ -6,7 +6,12 @@ from collections.abc import Sequence
 
 from evaweb.datasets.episode_list import RESULTS, VERDICTS
 from evaweb.datasets.overview import Overview
-from evaweb.lists import SEARCH, Column, Filter, words_of
+from evaweb.serving.lists import (
+    SEARCH,
+    Column,
+    Filter,
+    words_of,
+)
 
 COLUMNS = (
     Column("dataset", "Dataset", ("short",), lambda row: row.short),

@@ -9,9 +9,9 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from evaweb.core.errors import EvaError, NotFound
+from evaweb.core.printed_names import is_name
 from evaweb.episodes.folders import data_dir
-from evaweb.errors import EvaError, NotFound
-from evaweb.names import is_name
 from runtime.core.sentences import Pattern
 from runtime.datasets import layout
 from runtime.datasets.entries import episode_lines

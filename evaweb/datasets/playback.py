@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 import robots
+from evaweb.core.errors import NotFound
 from evaweb.datasets.episode_list import recorded_lines, result_of
 from evaweb.datasets.overview import camera_keys, open_cached
-from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import drawn_robot
 from runtime.core.sentences import Pattern
 from runtime.datasets import layout

@@ -10,13 +10,13 @@ from uuid import UUID
 from django.urls import reverse
 
 import robots
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import Conflict, NotFound
 from evaweb.datasets.dataset_orders import full_name
 from evaweb.datasets.playback import PlayedEpisode, load_played_episode
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import episode_get, playback_stage
 from evaweb.episodes.views import replay_config
-from evaweb.errors import Conflict, NotFound
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 

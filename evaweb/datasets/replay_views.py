@@ -12,7 +12,8 @@ from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
 import robots
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import Conflict, EvaError, NotFound
 from evaweb.datasets import playback
 from evaweb.datasets.dataset_orders import full_name
 from evaweb.datasets.playback import PlayedEpisode, as_recording
@@ -30,7 +31,6 @@ from evaweb.episodes.models import Episode
 from evaweb.episodes.poses import pose_streams
 from evaweb.episodes.streaming import file_answer
 from evaweb.episodes.views import player
-from evaweb.errors import Conflict, EvaError, NotFound
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.models import Station
 from runtime.core.sentences import Pattern
@@ -137,7 +137,7 @@ def picture(request: HttpRequest, name: str, index: int, camera: str) -> HttpRes
 
 @require_GET
 def curves(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Return joint curves, and the action streams if there is a sidecar, as one message of evaweb.binary_frames."""
+    """Return joint curves, and action streams if there is a sidecar, as one message of evaweb.core.binary_frames."""
     episode = _episode(request, name, index)
     recording = _recording(episode)
     covered = recording is not None and visibility_for_request(request).hides_episode(recording)
@@ -155,7 +155,7 @@ def geometry_json(request: HttpRequest, name: str, index: int) -> HttpResponse:
 
 @require_GET
 def poses(request: HttpRequest, name: str, index: int) -> HttpResponse:
-    """Return the poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
+    """Return the poses of the robot's parts from row ?first= on, as one message of evaweb.core.binary_frames."""
     episode = _episode(request, name, index)
     first = _number(request, "first")
     return _binary_response(lambda: pose_streams(as_recording(episode), first))

@@ -12,13 +12,18 @@ from uuid import UUID
 from django.urls import reverse
 
 import robots
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotFound,
+    StationGone,
+)
 from evaweb.datasets.dataset_orders import full_name
 from evaweb.datasets.playback import PlayedEpisode, load_played_episode
 from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.models import EpisodeStatus
 from evaweb.episodes.selectors import episode_get
-from evaweb.errors import Conflict, EvaError, NotFound, StationGone
-from evaweb.roles import Role, require_role
 from evaweb.stations.commands import issue_command
 from evaweb.stations.models import Command, Station
 from evaweb.stations.robot_geometry import describe_robot

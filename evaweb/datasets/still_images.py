@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 import simplejpeg
 from PIL import Image
 
+from evaweb.core.errors import NotFound
 from evaweb.datasets.playback import PlayedEpisode
-from evaweb.errors import NotFound
 from runtime.core.picture_bounds import DAMAGED, TooLargeError, require_scans, require_size
 from runtime.core.sentences import Pattern
 from runtime.datasets.video_frames import shown, stored_row

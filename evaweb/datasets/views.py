@@ -15,6 +15,9 @@ from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
+from evaweb.accounts.roles import Role, role_of
+from evaweb.core.errors import Conflict, EvaError
+from evaweb.core.printed_names import is_name
 from evaweb.datasets import (
     dataset_jobs,
     dataset_orders,
@@ -22,10 +25,7 @@ from evaweb.datasets import (
     listed,
 )
 from evaweb.datasets.overview import overview, overviews
-from evaweb.errors import Conflict, EvaError
-from evaweb.lists import Listing
-from evaweb.names import is_name
-from evaweb.roles import Role, role_of
+from evaweb.serving.lists import Listing
 from runtime.core.sentences import Pattern
 from runtime.datasets.__main__ import MOST, is_index
 from runtime.datasets.__main__ import episodes as indices_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evaweb.binary_frames import Stream
+from evaweb.core.binary_frames import Stream
 from runtime.recording.reader import Episode
 
 Array = NDArray[Any]

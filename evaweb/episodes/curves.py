@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from evaweb.binary_frames import Stream, encode
+from evaweb.core.binary_frames import Stream, encode
+from evaweb.core.errors import NotFound
 from evaweb.episodes.bench import milestones_reached
 from evaweb.episodes.chunks import chunk_arrays
 from evaweb.episodes.manifest_robot import drawn_robot_for, robot_of_manifest
-from evaweb.errors import NotFound
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.summary import HELD
 
@@ -34,7 +34,7 @@ def curve_message(
     unscored: bool = False,
     milestones: Sequence[tuple[float, str]] = (),
 ) -> bytes:
-    """Return one message of evaweb.binary_frames with the curves of a recording.
+    """Return one message of evaweb.core.binary_frames with the curves of a recording.
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (one row per joint):
     ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN if nothing was planned or

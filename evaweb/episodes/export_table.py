@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
+from evaweb.core.errors import NotFound
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.errors import NotFound
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.workers import waiting_for

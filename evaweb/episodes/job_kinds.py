@@ -11,6 +11,7 @@ from uuid import UUID
 from django.db.models.functions import Now
 from django.utils import timezone
 
+from evaweb.core.object_stores import the_store
 from evaweb.episodes import services, verification
 from evaweb.episodes.arriving import take_in_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import write_sidecars
@@ -24,7 +25,6 @@ from evaweb.episodes.smoothness import Smoothness, smoothness_in
 from evaweb.episodes.videos import put_videos, unstored
 from evaweb.jobs.kinds import JobContext, job_kind, periodic_task, startup_task
 from evaweb.jobs.services import enqueue
-from evaweb.object_stores import the_store
 from runtime.datasets.publishing import never_published, publish
 from runtime.recording.export import write_export
 from runtime.recording.files import RecordingError

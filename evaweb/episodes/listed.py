@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from evaweb.blinding import Visibility
+from evaweb.blinding.visibility import Visibility
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
 from evaweb.episodes.selectors import QUALITY, REVIEW, tag_counts
-from evaweb.lists import SEARCH, Column, Filter
+from evaweb.serving.lists import SEARCH, Column, Filter
 from evaweb.stations.models import Station
 
 

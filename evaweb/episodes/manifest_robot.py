@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import robots
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations.robot_geometry import DrawnRobot, drawn_robot, groups_of
 from runtime.core.sentences import Pattern
 

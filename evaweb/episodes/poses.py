@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from evaweb.binary_frames import Stream, encode
+from evaweb.core.binary_frames import Stream, encode
+from evaweb.core.errors import NotFound
 from evaweb.episodes.curves import vectors
 from evaweb.episodes.manifest_robot import drawn_robot_for
-from evaweb.errors import NotFound
 from runtime.core.sentences import Pattern
 from runtime.recording.reader import Episode, open_episode
 
@@ -22,7 +22,7 @@ MOST_ROWS = 900  # rows per response: half a minute at 30 Hz
 
 
 def pose_message(folder: Path, first: int) -> bytes:
-    """Return a message of evaweb.binary_frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
+    """Return a message of evaweb.core.binary_frames with stream `poses`: f4 [rows, P, 16], column-major world <- part.
 
     Rows `first` to at most `first` + MOST_ROWS - 1, from the measured joints.
     Raises: NotFound for an unknown robot or row; RecordingError, which names the absent or damaged file.

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from evaweb.episodes.manifest import RecordedEpisode
-from evaweb.journal import read_numbered_lines
+from evaweb.records.journal import read_numbered_lines
 from runtime.recording.files import RecordingError
 
 DATASET_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")

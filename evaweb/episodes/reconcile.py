@@ -11,12 +11,12 @@ from uuid import UUID
 
 from django.db import DataError, IntegrityError
 
+from evaweb.core.errors import EvaError
 from evaweb.episodes import services
 from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir, episodes_dir
 from evaweb.episodes.models import Episode
-from evaweb.errors import EvaError
-from evaweb.journal import Journal, folders
+from evaweb.records.journal import Journal, folders
 from runtime.recording.files import RecordingError
 
 log = logging.getLogger(__name__)

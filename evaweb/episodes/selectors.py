@@ -9,17 +9,17 @@ from uuid import UUID
 
 from django.db.models import Count, F, Q, QuerySet
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
+from evaweb.core.errors import NotFound
 from evaweb.episodes.arriving import whereabouts
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus, Tag
 from evaweb.episodes.services import station_elsewhere
-from evaweb.errors import NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.workers import waiting_for
-from evaweb.lists import words_of
+from evaweb.serving.lists import words_of
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError, read_json
 from runtime.recording.layout import Layout

@@ -13,11 +13,11 @@ from django.db.models import Q
 from django.db.models.functions import Now
 from django.utils import timezone
 
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.episodes.export_table import exported, job_key
 from evaweb.episodes.folders import data_dir, journal_folder, preview_folder
 from evaweb.episodes.manifest import CLOSED, RecordedEpisode, read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeMode, EpisodeStatus
-from evaweb.errors import Conflict, EvaError
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
 from evaweb.stations.models import Station, StationKey

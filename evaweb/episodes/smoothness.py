@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evaweb.core.errors import NotFound
 from evaweb.episodes.curves import vectors
 from evaweb.episodes.manifest_robot import robot_for
-from evaweb.errors import NotFound
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.smoothness import CUT_OFF, sparc
 from runtime.kinematics.forward import ChainForward

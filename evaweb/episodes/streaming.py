@@ -14,6 +14,7 @@ from typing import BinaryIO
 from django.http import HttpRequest, HttpResponse, HttpResponseNotAllowed, StreamingHttpResponse
 from django.http.response import HttpResponseBase
 
+from evaweb.core.errors import NotFound
 from evaweb.episodes.http_ranges import (
     Span,
     Unsatisfiable,
@@ -22,7 +23,6 @@ from evaweb.episodes.http_ranges import (
     range_holds,
     span_asked,
 )
-from evaweb.errors import NotFound
 from runtime.core.sentences import Pattern
 
 _THIS_EPISODE_NOT_ON_THIS = Pattern(

@@ -6,8 +6,14 @@ import json
 from pathlib import Path
 from uuid import UUID
 
+from evaweb.core.object_stores import (
+    StoreError,
+    compared,
+    required_store,
+    the_cache,
+    the_store,
+)
 from evaweb.episodes.folders import data_dir, preview_folder, preview_video
-from evaweb.object_stores import StoreError, compared, required_store, the_cache, the_store
 from runtime.core.sentences import Pattern
 from runtime.recording.files import write_atomic
 

@@ -17,7 +17,9 @@ from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
 import robots
-from evaweb.blinding import visibility_for_request
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import Conflict, EvaError, NotFound
 from evaweb.episodes import listed, selectors, services
 from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curve_message
@@ -30,9 +32,7 @@ from evaweb.episodes.selectors import episode_get
 from evaweb.episodes.sheets import Grid
 from evaweb.episodes.streaming import file_answer
 from evaweb.episodes.videos import TYPE, video_address, video_file
-from evaweb.errors import Conflict, EvaError, NotFound
-from evaweb.lists import Listing
-from evaweb.roles import Role, require_role, role_of
+from evaweb.serving.lists import Listing
 from evaweb.stations.geometry import scene_geometry
 from runtime.core.sentences import Pattern
 from runtime.recording.base import IMPORTED
@@ -209,7 +209,7 @@ async def _known_camera(uuid: UUID, camera: str) -> None:
 
 @require_GET
 def episode_curves(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Return joint curves and events as one message of evaweb.binary_frames."""
+    """Return joint curves and events as one message of evaweb.core.binary_frames."""
     episode, sight = episode_get(uuid=uuid), visibility_for_request(request)
     told = {
         "covered": sight.hides_episode(episode),
@@ -241,7 +241,7 @@ def episode_bench(request: HttpRequest, uuid: UUID) -> HttpResponse:
 
 @require_GET
 def episode_poses(request: HttpRequest, uuid: UUID) -> HttpResponse:
-    """Return the poses of the robot's parts from row ?first= on, as one message of evaweb.binary_frames."""
+    """Return the poses of the robot's parts from row ?first= on, as one message of evaweb.core.binary_frames."""
     episode_get(uuid=uuid)
     first = request.GET.get("first", "0")
     if not (first.isascii() and first.isdecimal()) or len(first) > 9:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from django.urls import NoReverseMatch, reverse
 
-from evaweb.roles import Role
+from evaweb.accounts.roles import Role
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,16 +13,16 @@ from django.db.models import Case, IntegerField, Q, QuerySet, Value, When
 from django.urls import reverse
 from django.utils.timezone import localtime
 
-from evaweb.blinding import Visibility
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import Visibility
+from evaweb.core.errors import EvaError
 from evaweb.datasets.overview import dataset_names
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import tag_counts
-from evaweb.errors import EvaError
 from evaweb.find.pages import pages_of
 from evaweb.find.ranking import rank, words_of
 from evaweb.plans.models import Handout
 from evaweb.plans.selectors import plan_list
-from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import Trial
 from evaweb.trials.selectors import checkpoint_list, scene_list

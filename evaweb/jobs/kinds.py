@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from evaweb.errors import EvaError
-from evaweb.roles import Role
+from evaweb.accounts.roles import Role
+from evaweb.core.errors import EvaError
 
 Args = Mapping[str, Any]
 

@@ -12,7 +12,7 @@ from django.db.models import Case, Exists, IntegerField, OuterRef, Q, QuerySet, 
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.jobs.kinds import without_folder
 from evaweb.jobs.models import Job, JobStatus
 from runtime.core.sentences import Pattern

@@ -22,7 +22,8 @@ from django.db import IntegrityError, connection, transaction
 from django.db.models import F, QuerySet
 from django.db.models.functions import Now
 
-from evaweb.errors import Conflict
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict
 from evaweb.jobs import doorbell
 from evaweb.jobs.database_retry import retry_while_locked
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
@@ -31,7 +32,6 @@ from evaweb.jobs.locks import ClaimantState, claimant_state, exclusive_job
 from evaweb.jobs.models import Hold, Job, JobStatus
 from evaweb.jobs.selectors import jobs_ready
 from evaweb.jobs.workers import has_lab_folder
-from evaweb.roles import Role, require_role
 from runtime.core.sentences import Pattern
 
 log = logging.getLogger(__name__)

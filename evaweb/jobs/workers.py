@@ -19,7 +19,7 @@ from django.db import connection, transaction
 from django.db.models import Q, QuerySet
 from django.db.models.functions import Now
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.jobs.kinds import Queue, UnknownKind, declared
 from evaweb.jobs.models import Job, JobStatus, LabFolder, WorkerProcess
 from runtime.core.sentences import Pattern, fixed

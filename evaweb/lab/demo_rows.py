@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from django.contrib.auth.models import User
 from django.db import transaction
 
+from evaweb.accounts.roles import Role, set_role
 from evaweb.plans.frozen_document import checkpoint_of
 from evaweb.plans.models import Allocation, Plan, PlanState, StoppingRule
 from evaweb.plans.services import amend_plan, freeze_plan
-from evaweb.roles import Role, set_role
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 

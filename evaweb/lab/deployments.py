@@ -27,7 +27,12 @@ from django.db.models import ProtectedError
 from django.utils import timezone
 
 import robots
-from evaweb.errors import Conflict, EvaError, NotFound, StationGone
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotFound,
+    StationGone,
+)
 from evaweb.lab.processes import LabError
 from evaweb.plans.models import Plan
 from evaweb.stations.models import STATION_NAME, Station

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import robots
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.lab.deployments import BY_HAND
 from runtime.config import draft
 from runtime.config.draft import Entry

@@ -10,9 +10,9 @@ from django.conf import settings
 from django.contrib.auth.models import User
 from django.db import Error, transaction
 
-from evaweb.errors import Conflict
+from evaweb.accounts.roles import Role, set_role
+from evaweb.core.errors import Conflict
 from evaweb.lab.demo_rows import fresh_password, has_no_accounts
-from evaweb.roles import Role, set_role
 from runtime.recording.files import write_atomic
 
 log = logging.getLogger(__name__)

@@ -10,7 +10,7 @@ from typing import Any
 from django.db import transaction
 from django.urls import NoReverseMatch, reverse
 
-from evaweb.errors import StationGone
+from evaweb.core.errors import StationGone
 from evaweb.lab import deployments
 from evaweb.lab.demo_rows import demo_scene
 from evaweb.lab.deployments import Kept, Standing, is_simulated, kept_of, standing_of

@@ -7,8 +7,8 @@ from typing import Any
 
 from django.contrib.auth.models import User
 
+from evaweb.accounts.roles import Role
 from evaweb.jobs.kinds import JobContext, job_kind
-from evaweb.roles import Role
 
 _KEPT = 3  # bundles per user
 

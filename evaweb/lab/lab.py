@@ -18,8 +18,8 @@ from evaweb.lab.pickup import Pickup
 from evaweb.lab.processes import ChildProcesses
 from evaweb.lab.progress import Progress, silent
 from evaweb.lab.simulated import Benches
-from evaweb.listening import open_listener
-from evaweb.stop_port import StopPort, remove_stop_port
+from evaweb.serving.listeners import open_listener
+from evaweb.serving.stop_port import StopPort, remove_stop_port
 from runtime.core.environment import program_environment
 
 _WATCH_S = 0.5

@@ -17,12 +17,12 @@ from pathlib import Path
 from django.conf import settings
 from django.db import Error
 
-from evaweb.errors import EvaError, StationGone
+from evaweb.core.errors import EvaError, StationGone
 from evaweb.lab import lifetime
 from evaweb.lab.deployments import lab_runs
+from evaweb.serving.stop_port import read_stop_port
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import connection_to
-from evaweb.stop_port import read_stop_port
 
 _PATIENCE_S = 10.0
 _STATION_S = 1.0

@@ -7,7 +7,7 @@ from collections.abc import Generator
 
 from django.db import Error, close_old_connections
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.lab import deployments, simulated
 from evaweb.lab.benches import Bench, program_of, registered
 from evaweb.lab.deployments import Kept, Standing, is_simulated

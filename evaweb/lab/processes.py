@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from runtime.core.environment import without_web_secrets
 
 log = logging.getLogger(__name__)

@@ -25,8 +25,8 @@ from urllib.request import (
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
-from evaweb.binary_frames import decode
-from evaweb.errors import EvaError
+from evaweb.core.binary_frames import decode
+from evaweb.core.errors import EvaError
 from evaweb.lab.stall_detection import DemoFailed, NoReply, ProgressTimeout
 
 _RENEW_S = 1.0

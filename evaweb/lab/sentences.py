@@ -17,10 +17,10 @@ from typing import Any
 
 from django.apps import apps
 
+from evaweb.accounts.roles import Role
+from evaweb.core.languages import label_id
 from evaweb.datasets.episode_list import RESULTS, VERDICTS
 from evaweb.episodes.selectors import QUALITY, REVIEW
-from evaweb.languages import label_id
-from evaweb.roles import Role
 from runtime.core.sentences import Pattern, known, names_of
 
 _ROOT = Path(__file__).parents[2]

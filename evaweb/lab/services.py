@@ -9,12 +9,12 @@ from pathlib import Path
 from django.contrib.auth.models import User
 from django.utils import timezone
 
-from evaweb.errors import NotFound
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.services import enqueue
 from evaweb.lab.diagnosis.bundle import folder
-from evaweb.roles import Role, require_role
 
 log = logging.getLogger(__name__)
 _NAME = re.compile(r"eva-diagnosis-\d{8}-\d{6}\.zip")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.lab import demo_rows, lifetime, programs
 from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec
 from evaweb.trials.models import Checkpoint

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 
 STILL_S = 180.0  # longest time without progress
 _AGAIN_S = 0.25

@@ -17,7 +17,8 @@ from django.urls import reverse
 from django.views.decorators.http import require_GET, require_http_methods, require_POST
 
 import robots
-from evaweb.errors import EvaError, NotFound
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import EvaError, NotFound
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.workers import waiting_for
 from evaweb.lab import deployments, first_account, first_steps, machine_check, services
@@ -26,7 +27,6 @@ from evaweb.lab.draft_form import form_of
 from evaweb.lab.first_steps import Walk, walk
 from evaweb.plans import image_store
 from evaweb.plans.bench_checks import cameras_of, confirm_cameras
-from evaweb.roles import Role, require_role
 from evaweb.stations.selectors import station_get
 
 _BACKEND = "django.contrib.auth.backends.ModelBackend"

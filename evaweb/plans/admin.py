@@ -15,7 +15,7 @@ from django.urls import URLPattern, path
 from django.utils.html import format_html_join
 from django.utils.safestring import SafeString, mark_safe
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.design import looks_of
 from evaweb.plans.models import Plan, PlanEvent, PlanState
 from evaweb.plans.references import LARGEST, unpacked

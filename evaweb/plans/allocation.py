@@ -12,7 +12,8 @@ from django.contrib.auth.models import User
 from django.db import transaction
 from django.db.models import Case, Max, OuterRef, Subquery, When
 
-from evaweb.errors import Conflict, NotAllowed
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict, NotAllowed
 from evaweb.plans import commitment as blinding
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.counting import require_scored_first
@@ -28,7 +29,6 @@ from evaweb.plans.frozen_document import require_checkpoints, require_scene, uni
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.selectors import without_dropped
 from evaweb.plans.services import end_plan_if_decided, slots_of
-from evaweb.roles import Role, require_role
 from evaweb.stations.models import Station
 from evaweb.trials import lifecycle
 from evaweb.trials.models import Trial, TrialStatus

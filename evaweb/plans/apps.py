@@ -10,8 +10,6 @@ class PlansConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import protect
-
         # They register visibility rules, checks before a plan's trial runs, and the end of plans.
         from evaweb.plans import bench_checks as bench  # noqa: F401
         from evaweb.plans import blinding_rules as sight  # noqa: F401
@@ -20,5 +18,6 @@ class PlansConfig(AppConfig):
             services,  # noqa: F401
         )
         from evaweb.plans import setup_padding as pacing  # noqa: F401
+        from evaweb.records.append_only import protect
 
         protect(self)

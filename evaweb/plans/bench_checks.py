@@ -11,8 +11,8 @@ from django.contrib.auth.models import User
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.journal import clean_text
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import image_store, region_matching
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import has_looked_at_the_same
@@ -20,7 +20,7 @@ from evaweb.plans.counting import fails_by
 from evaweb.plans.design import ended_at_an_ask
 from evaweb.plans.frozen_document import require_checkpoints, require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
-from evaweb.roles import Role, require_role
+from evaweb.records.journal import clean_text
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import describe_robot
 from evaweb.trials.models import Position, Trial, TrialStatus

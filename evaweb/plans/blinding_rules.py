@@ -15,12 +15,17 @@ from typing import Any
 from django.db import transaction
 from django.db.models import Count, Q, QuerySet
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility, plan_titles, register_visibility_rule
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import (
+    FULL_VISIBILITY,
+    Visibility,
+    plan_titles,
+    register_visibility_rule,
+)
+from evaweb.core.errors import NotAllowed
 from evaweb.episodes.reconcile import register_conclusion
-from evaweb.errors import NotAllowed
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
 from evaweb.plans.selectors import plans_beside
-from evaweb.roles import Role, role_of
 from evaweb.trials.models import Checkpoint, Evaluation, Trial
 from evaweb.trials.selectors import UNFINISHED
 
@@ -66,7 +71,7 @@ def can_unblind(plan: Plan, user: Any) -> bool:
 
 
 def visibility_for(user: Any) -> Visibility:
-    """Return the user's Visibility under the current plans; see evaweb.blinding."""
+    """Return the user's Visibility under the current plans; see evaweb.blinding.visibility."""
     plans = Plan.objects.filter(blind=True, state__in=(PlanState.FROZEN, PlanState.CLOSED))
     if user.pk is not None:
         plans = plans.exclude(looks__user=user)

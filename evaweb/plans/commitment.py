@@ -10,8 +10,8 @@ import hashlib
 import hmac
 from collections.abc import Sequence
 
-from evaweb.canonical import digest
-from evaweb.errors import EvaError
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import EvaError
 from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import KEY_BYTES, SeededDraws
 from runtime.core.sentences import Pattern

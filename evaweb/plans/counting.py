@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from evaweb.core.errors import Conflict
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import EpisodeStatus
-from evaweb.errors import Conflict
 from evaweb.plans.models import CountsAs, Handout, Plan
 from evaweb.trials.endings import ENDINGS, ending_of
 from evaweb.trials.models import Trial, TrialStatus

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any
 
-from evaweb.blinding import Visibility
+from evaweb.blinding.visibility import Visibility
 from evaweb.episodes.models import Episode
 from evaweb.jobs.models import Job
 

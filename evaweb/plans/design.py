@@ -17,8 +17,8 @@ from typing import Any
 from django.db.models import Count, Max, OuterRef, Subquery
 from django.utils import timezone
 
-from evaweb.canonical import digest
-from evaweb.errors import EvaError
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import EvaError
 from evaweb.plans.models import Allocation, Comparing, Plan
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.designs import (

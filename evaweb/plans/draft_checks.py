@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from django.core.exceptions import ValidationError
 
-from evaweb.blinding import Visibility
-from evaweb.errors import EvaError
+from evaweb.blinding.visibility import Visibility
+from evaweb.core.errors import EvaError
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import check_drafted, planned
 from evaweb.plans.models import Allocation, Comparing, CountsAs, Plan, PrimaryOutcome, StoppingRule

@@ -9,7 +9,7 @@ from django import forms
 from django.contrib.auth.models import User
 from django.http import QueryDict
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.design import looks_of
 from evaweb.plans.drafting import HIDDEN, Values
 from evaweb.plans.models import Comparing, Plan, Position

@@ -11,8 +11,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
-from evaweb.canonical import digest
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
+from evaweb.core.canonical_json import digest
 from evaweb.plans.models import Comparing, Plan
 from evaweb.trials.models import Checkpoint
 

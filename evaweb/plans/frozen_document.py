@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Any
 
-from evaweb.canonical import digest
-from evaweb.errors import Conflict, EvaError
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import draft_design, planned
 from evaweb.plans.models import Allocation, Plan

@@ -19,7 +19,7 @@ import simplejpeg
 import zmq
 from django.conf import settings
 
-from evaweb.errors import Conflict, EvaError, NotFound
+from evaweb.core.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import connection_to
 from runtime.core.picture_bounds import MOST_PIXELS, require_scans

@@ -9,8 +9,8 @@ from django.core.validators import MaxValueValidator, MinValueValidator
 from django.db import models
 from django.db.models import Q
 
-from evaweb.append_only import AppendOnly
-from evaweb.names import check_name
+from evaweb.core.printed_names import check_name
+from evaweb.records.append_only import AppendOnly
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Evaluation, Position, Scene, Trial
 from evaweb.trials.tables import check_strategy

@@ -20,7 +20,7 @@ from typing import Any
 
 from django.contrib.auth.models import User
 
-from evaweb.errors import EvaError, NotFound
+from evaweb.core.errors import EvaError, NotFound
 from evaweb.plans import image_store
 from evaweb.plans import region_matching as drawing
 from evaweb.plans.models import Reference

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.image_store import brought, decoded
 from runtime.core.sentences import Pattern
 

@@ -14,8 +14,13 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from pydantic import Field
 
-from evaweb.journal import Journal, Line, Moment, Person
 from evaweb.plans.models import Plan
+from evaweb.records.journal import (
+    Journal,
+    Line,
+    Moment,
+    Person,
+)
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.seeded_draws import SeededDraws
 from runtime.core.sentences import Pattern
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from django.db.models import Q, QuerySet
 
-from evaweb.errors import NotFound
+from evaweb.accounts.roles import Role, role_of
+from evaweb.core.errors import NotFound
 from evaweb.plans.models import Handout, Plan, PlanState, Reference, Slot
-from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Trial, TrialStatus
 from runtime.core.sentences import Pattern

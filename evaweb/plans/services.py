@@ -16,9 +16,11 @@ from django.db.models import QuerySet
 from django.utils import timezone
 from django.utils.text import slugify
 
-from evaweb.blinding import visibility_for_user
-from evaweb.canonical import difference, digest
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.blinding.visibility import visibility_for_user
+from evaweb.core.canonical_json import difference, digest
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.write_conflicts import once_more
 from evaweb.plans import commitment as blinding
 from evaweb.plans import reveals
 from evaweb.plans.counting import fails_by
@@ -39,8 +41,6 @@ from evaweb.plans.models import Plan, PlanEvent, PlanState, Slot
 from evaweb.plans.schedule import Unit
 from evaweb.plans.seeded_draws import new_key
 from evaweb.plans.selectors import handout_of, remaining
-from evaweb.races import once_more
-from evaweb.roles import Role, require_role, role_of
 from evaweb.trials.lifecycle import OPEN_STATES
 from evaweb.trials.models import Evaluation, Trial, TrialStatus
 from evaweb.trials.services import register_settled

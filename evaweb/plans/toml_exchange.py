@@ -22,8 +22,9 @@ from django.core.exceptions import ValidationError as Invalid
 from django.db import models, transaction
 from pydantic import ValidationError
 
-from evaweb.canonical import difference
-from evaweb.errors import Conflict, EvaError
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.canonical_json import difference
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.plans.frozen_document import checkpoint_of, scene_of
 from evaweb.plans.models import Comparing, Plan, PlanState, Reference
 from evaweb.plans.references import packed, reference_tables, take_references
@@ -34,7 +35,6 @@ from evaweb.plans.toml_schema import (
     PlanTable,
     SceneTable,
 )
-from evaweb.roles import Role, require_role
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
 from evaweb.trials.scene_reading import kept_positions

@@ -7,11 +7,11 @@ from django.shortcuts import render
 from django.urls import reverse
 from django.views.decorators.http import require_safe
 
+from evaweb.accounts.roles import Role, role_of
 from evaweb.plans import region_matching
 from evaweb.plans.bench_checks import references
 from evaweb.plans.image_store import load_image
 from evaweb.plans.selectors import reference_get
-from evaweb.roles import Role, role_of
 
 
 @require_safe

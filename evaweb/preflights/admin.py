@@ -8,7 +8,7 @@ from django.contrib import admin, messages
 from django.http import HttpRequest, HttpResponse, HttpResponseNotAllowed, HttpResponseRedirect
 from django.urls import URLPattern, path, reverse
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.preflights.models import Preflight
 from evaweb.preflights.selectors import preflight_newest
 from evaweb.preflights.services import refresh_preflight, start_preflight

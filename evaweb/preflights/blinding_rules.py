@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.blinding import visibility_for_user
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import visibility_for_user
 from evaweb.preflights.models import Preflight
-from evaweb.roles import Role, role_of
 from evaweb.trials.models import Checkpoint
 
 _TOLD = ("verdict", "stage", "advice", "ok")  # keys of a report that everybody may see

@@ -6,8 +6,8 @@ from uuid import UUID
 
 from django.db.models import QuerySet
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
-from evaweb.errors import NotFound
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
+from evaweb.core.errors import NotFound
 from evaweb.preflights.models import Preflight
 from evaweb.trials.models import Checkpoint
 from runtime.core.sentences import Pattern

@@ -15,15 +15,15 @@ from uuid import uuid4
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.binary_frames import to_json_value
-from evaweb.blinding import visibility_for_user
-from evaweb.errors import Conflict, StationGone
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.blinding.visibility import visibility_for_user
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import Conflict, StationGone
 from evaweb.jobs.models import JobStatus
 from evaweb.jobs.selectors import job_newest
 from evaweb.jobs.services import enqueue
 from evaweb.jobs.workers import waiting_for
 from evaweb.preflights.models import Preflight, PreflightStatus
-from evaweb.roles import Role, require_role, role_of
 from evaweb.stations.commands import TABLES
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import NoAnswer, connection_to

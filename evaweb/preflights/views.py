@@ -10,7 +10,7 @@ from django.shortcuts import render
 from django.utils import timezone
 from django.views.decorators.http import require_GET
 
-from evaweb.blinding import visibility_for_request
+from evaweb.blinding.visibility import visibility_for_request
 from evaweb.preflights import services
 from evaweb.preflights.blinding_rules import visible_preflight
 from evaweb.preflights.models import Preflight, PreflightStatus

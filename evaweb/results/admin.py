@@ -9,7 +9,7 @@ from django.contrib import admin, messages
 from django.db.models import QuerySet
 from django.http import HttpRequest
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results.models import AutomaticJudge
 from evaweb.results.ratings.automatic import judge_allow, judge_forbid
 

@@ -10,7 +10,7 @@ class ResultsConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import protect
+        from evaweb.records.append_only import protect
         from evaweb.results.ratings import rating_queue, restoring  # noqa: F401  it declares what is asked before a failure is corrected  # noqa: F401  it declares itself to those that reconcile
         from evaweb.results.reports import sealing  # noqa: F401  it declares what a reveal keeps
 

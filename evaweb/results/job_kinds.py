@@ -6,10 +6,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from evaweb.accounts.roles import Role
 from evaweb.jobs.kinds import JobContext, Queue, job_kind
 from evaweb.plans.models import Plan
 from evaweb.results.ratings import automatic
-from evaweb.roles import Role
 
 _TURN_S = 20.0  # time slice, so that other jobs get their turn
 _NAMED = 50  # codes of trials without images in the result

@@ -11,9 +11,9 @@ from django.db import models
 from django.db.models import F, Q
 from django.utils import timezone
 
-from evaweb.append_only import AppendOnly
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.models import Plan
+from evaweb.records.append_only import AppendOnly
 from evaweb.results.judges import KINDS
 from evaweb.results.judges.base import PATIENCE_S, Setup
 from evaweb.results.judges.loading import build_judge

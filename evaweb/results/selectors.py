@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 
 from django.db.models import Case, Count, Exists, IntegerField, Max, Min, OuterRef, Q, QuerySet, Value, When
 
-from evaweb.errors import EvaError, NotFound
+from evaweb.core.errors import EvaError, NotFound
 from evaweb.plans.models import Plan, PlanState, Slot
 from evaweb.stations.models import Station
 from evaweb.trials.failure_text import is_not_said

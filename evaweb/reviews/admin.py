@@ -5,7 +5,7 @@ from __future__ import annotations
 from django.contrib import admin
 from django.http import HttpRequest
 
-from evaweb.administration import LabelledRows
+from evaweb.accounts.admin_site import LabelledRows
 from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 
 

@@ -10,7 +10,7 @@ class ReviewsConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import protect
+        from evaweb.records.append_only import protect
         from evaweb.reviews import dataset_sidecars as beside  # noqa: F401  they declare themselves to apps below
         from evaweb.reviews import restoring  # noqa: F401  they declare themselves to apps below
 

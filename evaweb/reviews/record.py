@@ -8,7 +8,13 @@ from uuid import UUID
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from evaweb.journal import Journal, Line, Moment, Person, RowPath
+from evaweb.records.journal import (
+    Journal,
+    Line,
+    Moment,
+    Person,
+    RowPath,
+)
 
 _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 

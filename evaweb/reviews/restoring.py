@@ -10,7 +10,7 @@ from django.db import transaction
 
 from evaweb.episodes.models import Episode, Tag
 from evaweb.episodes.reconcile import RestorableRun, register_restorer
-from evaweb.journal import missing_rows
+from evaweb.records.journal import missing_rows
 from evaweb.reviews import selectors, services
 from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing

@@ -8,10 +8,10 @@ from uuid import UUID
 
 from django.db.models import F, Q, QuerySet
 
-from evaweb.blinding import Visibility
+from evaweb.blinding.visibility import Visibility
+from evaweb.core.errors import Conflict, NotFound
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.errors import Conflict, NotFound
 from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 from runtime.core.sentences import Pattern

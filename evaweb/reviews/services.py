@@ -13,15 +13,20 @@ from django.db import transaction
 from django.db.models.functions import Now
 from django.utils import timezone
 
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
+from evaweb.core.printed_names import check_name
 from evaweb.episodes.models import LONGEST_TAG, Episode, EpisodeStatus, Tag
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
-from evaweb.journal import clean_text
-from evaweb.names import check_name
+from evaweb.records.journal import clean_text
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing, Verdict
 from evaweb.reviews.record import REVIEWS, RemovalLine, ReviewLine, SegmentLine, TagLine, UntagLine
-from evaweb.roles import Role, require_role, role_of
 from runtime.core.sentences import Pattern, fixed
 
 _VERDICT_ALLOWED = Pattern("reviews.services.verdict_allowed", "verdict = {verdict!r:.40}; allowed: {values}")

@@ -10,12 +10,12 @@ from django.contrib.auth.models import User
 from django.db.models import Count, QuerySet
 from django.urls import reverse
 
-from evaweb.blinding import Visibility
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import Visibility
 from evaweb.plans.models import PlanState
 from evaweb.plans.selectors import plan_list
 from evaweb.preflights.models import PreflightStatus, Verdict
 from evaweb.preflights.selectors import preflight_list
-from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import Scene
 from evaweb.trials.selectors import checkpoint_list, scene_list

@@ -9,10 +9,10 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_http_methods, require_POST
 
-from evaweb.blinding import visibility_for_request
-from evaweb.errors import EvaError, NotFound
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import EvaError, NotFound
 from evaweb.plans import image_store
-from evaweb.roles import Role, require_role, role_of
 from evaweb.setup import editing, selectors
 from evaweb.stations.selectors import station_get
 from evaweb.trials.scene_writing import ChangedMeanwhile, SceneRefused, scene_write

@@ -12,7 +12,7 @@ from django.shortcuts import get_object_or_404, render
 from django.urls import URLPattern, path, reverse
 
 import robots
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.stations.enrolment import VALID, code_make, key_withdraw
 from evaweb.stations.models import Command, Lease, LeaseRequest, Station, StationKey
 

@@ -19,9 +19,14 @@ from django.contrib.auth import get_user_model
 from django.db import Error, IntegrityError, transaction
 from django.utils import timezone
 
-from evaweb.binary_frames import to_json_value
-from evaweb.errors import Conflict, EvaError, NotAllowed, StationGone
-from evaweb.roles import Role, require_role, role_of
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    StationGone,
+)
 from evaweb.stations.lease_holders import holder_of
 from evaweb.stations.models import CARRIED_OUT, Command, CommandStatus, Station
 from evaweb.stations.runtime_client import NoAnswer, connection_to

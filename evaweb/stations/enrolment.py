@@ -12,8 +12,8 @@ from django.conf import settings
 from django.db import transaction
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError
-from evaweb.roles import Role, require_role
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.stations.models import EnrolmentCode, Station, StationKey
 from runtime.link import codes, key_files
 from runtime.link.admission import Allowed

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from django.conf import settings
 from django.db import Error, close_old_connections
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.stations.enrolment import key_enrol, keys_allowed
 from runtime.core import file_limits, logs
 from runtime.ipc.bus import TransportError

@@ -16,8 +16,13 @@ from django.db import transaction
 from django.db.models import Max
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.roles import Role, require_role, role_of
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.stations.lease_holders import holder_display_name, holder_of, with_display_names
 from evaweb.stations.models import Lease, LeaseRequest, Station
 from evaweb.stations.runtime_client import connection_to

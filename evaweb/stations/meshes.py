@@ -7,7 +7,7 @@ from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations.robot_geometry import drawn_robot
 from runtime.core.sentences import Pattern
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from evaweb.blinding import COVERED, COVERED_AT_REST, Visibility
+from evaweb.blinding.visibility import COVERED, COVERED_AT_REST, Visibility
 from runtime.core.sentences import Sentence, heard, identity, shows, texts
 from runtime.ipc.session_state import SessionState
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import robots
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from robots.units import units_of
 from runtime.core.sentences import Pattern
 from runtime.kinematics.links import LinkPoses

@@ -18,8 +18,8 @@ import zmq
 from django.conf import settings
 from django.utils.timezone import localtime
 
-from evaweb.binary_frames import to_json_value
-from evaweb.errors import NotFound, StationGone
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import NotFound, StationGone
 from evaweb.stations.models import STATION_NAME
 from runtime.core.sentences import Pattern, checked_row
 from runtime.ipc.bus import CodecError, CommandClient, Endpoints, Key, TransportError

@@ -6,8 +6,8 @@ from uuid import UUID
 
 from django.db.models import QuerySet
 
-from evaweb.errors import NotFound
-from evaweb.refusals import is_text
+from evaweb.core.errors import NotFound
+from evaweb.serving.error_pages import is_text
 from evaweb.stations.models import NOT_CARRIED_OUT, Command, Lease, LeaseRequest, Station
 from runtime.core.sentences import Pattern
 

@@ -16,7 +16,7 @@ from threading import Condition, Thread
 
 from django.conf import settings
 
-from evaweb.rarely import LogThrottle
+from evaweb.core.log_throttle import LogThrottle
 from evaweb.stations.models import Command, CommandStatus
 
 log = logging.getLogger(__name__)

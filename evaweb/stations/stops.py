@@ -14,8 +14,8 @@ from uuid import UUID
 
 from django.conf import settings
 
-from evaweb.binary_frames import to_json_value
-from evaweb.errors import StationGone
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import StationGone
 from evaweb.stations.lease_holders import holder_of, with_display_names
 from evaweb.stations.models import CommandStatus
 from evaweb.stations.request_coalescer import RequestCoalescer, TooManyRequests

@@ -22,7 +22,7 @@ from django.conf import settings
 from django.contrib.auth import get_user_model
 from django.db import DataError, Error, IntegrityError, connection
 
-from evaweb.rarely import LogThrottle
+from evaweb.core.log_throttle import LogThrottle
 from evaweb.stations.models import Command, Station
 from evaweb.stations.process_journal import ProcessJournal, recover_journals
 from evaweb.stations.stop_recorder import merge_key

@@ -5,7 +5,7 @@ from __future__ import annotations
 from django.http import Http404, HttpRequest, HttpResponse, JsonResponse
 from django.views.decorators.http import condition, require_safe
 
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations import geometry, meshes
 from evaweb.stations.selectors import station_get
 

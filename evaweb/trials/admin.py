@@ -17,9 +17,9 @@ from django.http import HttpRequest
 from django.urls import reverse
 from django.utils.html import format_html
 
-from evaweb.administration import LabelledRows
-from evaweb.blinding import visibility_for_request
-from evaweb.canonical import difference
+from evaweb.accounts.admin_site import LabelledRows
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.canonical_json import difference
 from evaweb.trials.models import (
     Checkpoint,
     Evaluation,

@@ -10,7 +10,7 @@ class TrialsConfig(AppConfig):
     default_auto_field = "django.db.models.BigAutoField"
 
     def ready(self) -> None:
-        from evaweb.append_only import protect
+        from evaweb.records.append_only import protect
         from evaweb.trials import restoring  # noqa: F401  it declares itself to those that reconcile
 
         protect(self)

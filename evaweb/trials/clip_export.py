@@ -7,11 +7,11 @@ import zipfile
 from collections.abc import Iterator
 from typing import Any
 
-from evaweb.blinding import Visibility, code_of
+from evaweb.blinding.visibility import Visibility, code_of
+from evaweb.core.errors import EvaError
+from evaweb.core.object_stores import StoreError
+from evaweb.core.tabular_export import iter_csv
 from evaweb.episodes.videos import video_file
-from evaweb.errors import EvaError
-from evaweb.object_stores import StoreError
-from evaweb.tabular_export import iter_csv
 from evaweb.trials.clips import clip_of
 from evaweb.trials.gallery import COLUMNS, FailureFilters, failed_list, failure_trials, row_of
 from evaweb.trials.models import Trial

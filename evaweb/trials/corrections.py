@@ -8,9 +8,9 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from django.db import transaction
 
-from evaweb.errors import Conflict
-from evaweb.journal import clean_text
-from evaweb.roles import Role, require_role
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict
+from evaweb.records.journal import clean_text
 from evaweb.stations.commands import parse_command_uuid
 from evaweb.trials import failures
 from evaweb.trials.failure_text import UNSPECIFIED, failure_text

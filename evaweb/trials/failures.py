@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from evaweb.errors import EvaError
-from evaweb.journal import clean_text
+from evaweb.core.errors import EvaError
+from evaweb.records.journal import clean_text
 from evaweb.trials.failure_text import is_not_said
 from evaweb.trials.models import FailureTerm, Scene, Score
 from evaweb.trials.scoring import LONGEST_FAILURE

@@ -19,8 +19,8 @@ from django.db.models import (
     When,
 )
 
-from evaweb.blinding import HIDDEN, Visibility, code_of
-from evaweb.errors import EvaError
+from evaweb.blinding.visibility import HIDDEN, Visibility, code_of
+from evaweb.core.errors import EvaError
 from evaweb.trials.clips import clip_of
 from evaweb.trials.failure_text import UNSPECIFIED, is_not_said
 from evaweb.trials.models import Trial, TrialStatus

@@ -10,12 +10,12 @@ from django.shortcuts import render
 from django.urls import reverse
 from django.views.decorators.http import require_GET
 
-from evaweb.blinding import visibility_for_request
-from evaweb.downloads import CSV, download
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import EvaError
+from evaweb.core.tabular_export import iter_csv
 from evaweb.episodes.selectors import playback_stage
-from evaweb.errors import EvaError
-from evaweb.roles import Role, role_of
-from evaweb.tabular_export import iter_csv
+from evaweb.serving.downloads import CSV, download
 from evaweb.trials import clip_export, failures, gallery
 from evaweb.trials.clips import clip_of
 from evaweb.trials.gallery import FailureFilters

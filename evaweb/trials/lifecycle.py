@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from evaweb.errors import Conflict
+from evaweb.core.errors import Conflict
 from evaweb.trials.models import Trial, TrialStatus
 from runtime.core.sentences import Pattern
 

@@ -11,9 +11,9 @@ from django.db import models
 from django.db.models.functions import Lower
 from django.utils import timezone
 
-from evaweb.append_only import AppendOnly
+from evaweb.core.printed_names import check_name
 from evaweb.episodes.models import Episode
-from evaweb.names import check_name
+from evaweb.records.append_only import AppendOnly
 from evaweb.stations.models import Station
 from evaweb.trials.failure_text import failure_text
 from evaweb.trials.tables import check_bench, check_policy, check_strategy, check_tags, check_term

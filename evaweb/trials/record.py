@@ -15,8 +15,16 @@ from uuid import UUID
 
 from pydantic import Field, StrictBool, field_validator
 
-from evaweb.blinding import HIDDEN, Visibility, code_of
-from evaweb.journal import Journal, Line, Moment, Person, RowPath, parse_model, resolve_path
+from evaweb.blinding.visibility import HIDDEN, Visibility, code_of
+from evaweb.records.journal import (
+    Journal,
+    Line,
+    Moment,
+    Person,
+    RowPath,
+    parse_model,
+    resolve_path,
+)
 from evaweb.stations.models import STATION_NAME
 from evaweb.trials.models import Evaluation, Score, Trial, TrialStatus
 

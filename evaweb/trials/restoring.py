@@ -17,15 +17,15 @@ from django.db import connection, transaction
 from django.db.models import Max
 from django.utils import timezone
 
+from evaweb.accounts.roles import get_or_create_person
+from evaweb.core.errors import EvaError
 from evaweb.episodes import services as episodes
 from evaweb.episodes.folders import journal_folder
 from evaweb.episodes.manifest import CLOSED, read_recorded_episode
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import RestorableRun, register_restorer
 from evaweb.episodes.selectors import why_unrecorded
-from evaweb.errors import EvaError
-from evaweb.journal import missing_rows
-from evaweb.roles import get_or_create_person
+from evaweb.records.journal import missing_rows
 from evaweb.trials import lifecycle, placeholders
 from evaweb.trials.models import (
     Milestone,

@@ -11,7 +11,7 @@ from django.db import models
 from django.db.models import Count, Q
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from evaweb.refusals import is_text
+from evaweb.serving.error_pages import is_text
 from evaweb.trials.models import Scene
 
 _FROZEN = ("frozen", "closed", "revealed")  # states of plans; evaweb.plans defines the relation

@@ -17,10 +17,10 @@ from django.core.exceptions import ValidationError as Invalid
 from django.db import models, transaction
 from pydantic import ValidationError
 
-from evaweb.canonical import difference
-from evaweb.errors import Conflict, EvaError
-from evaweb.races import once_more
-from evaweb.roles import Role, require_role
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.canonical_json import difference
+from evaweb.core.errors import Conflict, EvaError
+from evaweb.core.write_conflicts import once_more
 from evaweb.stations.surroundings import AREA
 from evaweb.trials.models import Milestone, Position, Scene
 from evaweb.trials.scene_reading import (

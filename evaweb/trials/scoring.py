@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.trials.models import Milestone
 from runtime.core.sentences import Pattern, fixed
 

@@ -14,9 +14,9 @@ from django.db.models.functions import Cast
 from django.utils import timezone
 from django.utils.dateparse import parse_date, parse_datetime
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
-from evaweb.errors import EvaError, NotFound
-from evaweb.memo import FingerprintCache
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
+from evaweb.core.errors import EvaError, NotFound
+from evaweb.core.fingerprint_cache import FingerprintCache
 from evaweb.stations.models import Command, Station
 from evaweb.statistics.proportions import Summary, summary
 from evaweb.trials import lifecycle

@@ -12,11 +12,16 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Max
 
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.episodes.selectors import why_unrecorded
 from evaweb.episodes.services import request_publish
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.journal import clean_text
-from evaweb.roles import Role, require_role, role_of
+from evaweb.records.journal import clean_text
 from evaweb.stations.commands import parse_command_uuid
 from evaweb.stations.models import Station
 from evaweb.stations.selectors import lease_open

@@ -12,10 +12,10 @@ from uuid import UUID
 from django.contrib.auth.models import User
 from django.db import transaction
 
-from evaweb.binary_frames import to_json_value
-from evaweb.blinding import visibility_for_user
-from evaweb.errors import Conflict, EvaError
-from evaweb.roles import Role, require_role
+from evaweb.accounts.roles import Role, require_role
+from evaweb.blinding.visibility import visibility_for_user
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.stations.commands import TABLES, issue_command, parse_command_uuid
 from evaweb.stations.models import CARRIED_OUT, NOT_CARRIED_OUT, Command
 from evaweb.stations.runtime_client import connection_to

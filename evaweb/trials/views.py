@@ -11,11 +11,16 @@ from django.http import HttpRequest, HttpResponse
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.blinding import Visibility, visibility_for_request
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import Visibility, visibility_for_request
+from evaweb.core.errors import EvaError, NotAllowed
 from evaweb.episodes.selectors import playback_stage
-from evaweb.errors import EvaError, NotAllowed
-from evaweb.lists import DAY, Column, Filter, Listing
-from evaweb.roles import Role, role_of
+from evaweb.serving.lists import (
+    DAY,
+    Column,
+    Filter,
+    Listing,
+)
 from evaweb.stations.selectors import station_list
 from evaweb.trials import failures, lifecycle, selectors, services, voids
 from evaweb.trials.lifecycle import Transition

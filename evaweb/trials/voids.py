@@ -16,8 +16,8 @@ from django.db import transaction
 from django.db.models import QuerySet
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
-from evaweb.roles import Role, require_role
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.trials import lifecycle
 from evaweb.trials.lifecycle import Transition
 from evaweb.trials.models import Trial, TrialStatus, VoidRequest

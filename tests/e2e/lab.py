@@ -23,7 +23,7 @@ DEAD = "dead-policy"
 _MORE = f"""
 import json
 from evaweb.lab.demo_rows import demo_checkpoint, demo_login
-from evaweb.roles import Role
+from evaweb.accounts.roles import Role
 people = [demo_login(username="ann", role=Role.OPERATOR), demo_login(username="visitor", role=Role.VIEWER)]
 demo_checkpoint(name="{DEAD}", description="", policy={{"url": "ws://127.0.0.1:1"}})
 print(json.dumps({{login.username: login.password for login in people}}))

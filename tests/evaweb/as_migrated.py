@@ -10,7 +10,7 @@ from django.apps import apps
 from django.core.management.color import no_style
 from django.db import DEFAULT_DB_ALIAS, connections, transaction
 
-from evaweb.append_only import guards, install, removal
+from evaweb.records.append_only import guards, install, removal
 
 Rows = Mapping[str, tuple[tuple[Any, ...], ...]]  # by table, in the order of their keys
 

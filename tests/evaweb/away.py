@@ -12,7 +12,7 @@ os.environ["DJANGO_SETTINGS_MODULE"] = "evaweb.settings"
 from asgiref.testing import ApplicationCommunicator
 
 from evaweb.asgi import application
-from evaweb.lock_wait import limit_page_waits
+from evaweb.core.lock_wait import limit_page_waits
 from tests.processes import PATIENCE_S
 
 

@@ -14,9 +14,9 @@ from django.db import Error, connections
 from django.test import TransactionTestCase
 from pytest_django import DjangoDbBlocker
 
-from evaweb import computing
-from evaweb.computing import Busy
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
+from evaweb.serving import computations
+from evaweb.serving.computations import Busy
 from evaweb.stations import commands, stops
 from evaweb.stations.models import Command, Station
 from evaweb.trials import selectors as trial_selectors
@@ -52,10 +52,10 @@ def _estops_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _computing_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody's budget is used up, and no slow machine is a refusal."""
-    here = computing.Questions(
+    here = computations.Questions(
         lambda work, *given: (work(*given), 0.0), patience_s=PATIENCE_S, soon_s=PATIENCE_S
     )
-    monkeypatch.setattr(computing, "questions", here)
+    monkeypatch.setattr(computations, "questions", here)
 
 
 @pytest.fixture(autouse=True)
@@ -147,7 +147,7 @@ def nobody_computes(monkeypatch: pytest.MonkeyPatch) -> None:
     def busy(*asked: object, soon: bool = False) -> None:
         raise Busy("it computes for others")
 
-    monkeypatch.setattr("evaweb.computing.questions.ask", busy)
+    monkeypatch.setattr("evaweb.serving.computations.questions.ask", busy)
 
 
 @pytest.fixture

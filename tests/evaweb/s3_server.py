@@ -11,7 +11,7 @@ import urllib.request
 from importlib.util import find_spec
 from pathlib import Path
 
-from evaweb.environment import Bucket
+from evaweb.core.environment import Bucket
 from tests.processes import PATIENCE_S, eventually
 
 KEY, SECRET = "TESTKEYTESTKEY", "a-secret-of-tests"

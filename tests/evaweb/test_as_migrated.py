@@ -4,7 +4,7 @@ import pytest
 from django.contrib.auth.models import Group, Permission
 from django.db import IntegrityError
 
-from evaweb.roles import Role, role_of
+from evaweb.accounts.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import FailureTerm, Score
 from tests.evaweb.as_migrated import AsMigrated

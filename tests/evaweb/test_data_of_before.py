@@ -8,7 +8,7 @@ import json
 import pytest
 from django.contrib.auth.models import User
 
-from evaweb.blinding import visibility_for_user
+from evaweb.blinding.visibility import visibility_for_user
 from evaweb.episodes.reconcile import reconcile
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan, reveal_plan

@@ -12,10 +12,10 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
-from evaweb import audit
+from evaweb.accounts import login_audit
 from evaweb.api.tokens import create_token
-from evaweb.lockout import MOST_NAMES
-from evaweb.rarely import LogThrottle
+from evaweb.core.log_throttle import LogThrottle
+from evaweb.serving.lockout_page import MOST_NAMES
 from tests.evaweb.trials import builders
 
 pytestmark = pytest.mark.django_db
@@ -140,7 +140,7 @@ def test_who_is_logged_in_goes_on_and_stops_while_the_name_is_locked(ann, live):
 
 def test_a_name_that_nobody_has_is_locked_as_well_and_not_logged(db, caplog):
     assert locked(name="Hunter2").status_code == 429
-    said = [row.getMessage() for row in caplog.records if row.name == "evaweb.audit"]
+    said = [row.getMessage() for row in caplog.records if row.name == "evaweb.accounts.login_audit"]
     assert said[0] == "login of a name that nobody has (7 characters) failed from 10.0.0.5"
     assert "Hunter2" not in caplog.text
 
@@ -151,7 +151,7 @@ def test_logins_and_logouts_are_logged(ann, caplog):
     client.post("/login/", {"username": "ann", "password": WRONG})
     client.post("/login/", {"username": "ann", "password": "ann"})
     client.post("/logout/")
-    assert [row.getMessage() for row in caplog.records if row.name == "evaweb.audit"] == [
+    assert [row.getMessage() for row in caplog.records if row.name == "evaweb.accounts.login_audit"] == [
         "login of 'ann' failed from 10.0.0.5",
         "'ann' has logged in from 10.0.0.5",
         "'ann' has logged out from 10.0.0.5",
@@ -169,11 +169,11 @@ def test_control_characters_of_a_name_are_escaped(caplog):
 
 def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, caplog):
     now = [100.0]
-    monkeypatch.setattr(audit, "_refused", LogThrottle(60.0, 10, clock=lambda: now[0]))
+    monkeypatch.setattr(login_audit, "_refused", LogThrottle(60.0, 10, clock=lambda: now[0]))
     for _ in range(3):
-        audit.log_token_refused("10.0.0.5", "is not known")
+        login_audit.log_token_refused("10.0.0.5", "is not known")
     now[0] += 61
-    audit.log_token_refused("10.0.0.5", "is not known")
+    login_audit.log_token_refused("10.0.0.5", "is not known")
     assert caplog.messages == [
         "a token from 10.0.0.5 is not known",
         "a token from 10.0.0.5 is not known (2 before it)",
@@ -182,12 +182,12 @@ def test_refused_tokens_are_logged_once_a_minute_for_an_address(monkeypatch, cap
 
 def test_a_crowd_of_unverified_presses_is_a_line_in_ten_seconds_of_each_station(caplog, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr(audit, "_unverified", LogThrottle(10.0, 16, clock=lambda: now[0]))
+    monkeypatch.setattr(login_audit, "_unverified", LogThrottle(10.0, 16, clock=lambda: now[0]))
     for _ in range(500):
-        audit.estop_unverified("bench-1", TimeoutError("no turn"))
-    audit.estop_unverified("bench-2", TimeoutError("no turn"))
+        login_audit.estop_unverified("bench-1", TimeoutError("no turn"))
+    login_audit.estop_unverified("bench-2", TimeoutError("no turn"))
     now[0] = 11.0
-    audit.estop_unverified("bench-1", TimeoutError("no turn"))
+    login_audit.estop_unverified("bench-1", TimeoutError("no turn"))
     assert [record.getMessage() for record in caplog.records] == [
         "an e-stop of 'bench-1' is obeyed, of nobody knows whom: no turn",
         "an e-stop of 'bench-2' is obeyed, of nobody knows whom: no turn",

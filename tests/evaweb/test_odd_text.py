@@ -12,7 +12,7 @@ from django.test import Client
 from django.urls import NoReverseMatch, get_resolver, reverse
 
 from evaweb.api.api import api
-from evaweb.headers import DEFAULT_HEADERS
+from evaweb.serving.headers import DEFAULT_HEADERS
 from tests.evaweb.crawling import named
 
 pytestmark = [pytest.mark.django_db(transaction=True), pytest.mark.slow]

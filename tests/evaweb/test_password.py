@@ -5,7 +5,7 @@ from axes.models import AccessAttempt
 from django.conf import settings
 from django.contrib.auth.models import User
 
-from evaweb import hashing
+from evaweb.accounts import password_hashing
 from tests.evaweb.test_logins import login
 
 pytestmark = pytest.mark.django_db
@@ -61,12 +61,12 @@ def test_the_administration_has_no_page_of_its_own_where_nobody_counts(client, a
 
 
 def test_where_too_many_passwords_are_being_checked_it_says_so(client, ann, settings, monkeypatch):
-    settings.PASSWORD_HASHERS = ["evaweb.hashing.QueuedHasher"]
-    monkeypatch.setattr(hashing.QueuedHasher, "iterations", 1)
+    settings.PASSWORD_HASHERS = ["evaweb.accounts.password_hashing.QueuedHasher"]
+    monkeypatch.setattr(password_hashing.QueuedHasher, "iterations", 1)
     ann.set_password("the-old-one-2")
     ann.save()
     client.force_login(ann)
-    monkeypatch.setattr(hashing._turns, "_place_for", lambda share, answer: answer)
+    monkeypatch.setattr(password_hashing._turns, "_place_for", lambda share, answer: answer)
     answer = client.post(
         "/password/", {"old_password": "the-old-one-2", "new_password1": NEW, "new_password2": NEW}
     )

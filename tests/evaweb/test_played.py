@@ -1,7 +1,7 @@
 import pytest
 from django.contrib.auth.models import Group, User
 
-from evaweb.roles import Role, role_of
+from evaweb.accounts.roles import Role, role_of
 from evaweb.stations.models import Station
 from tests.evaweb.played import played, state
 from tests.evaweb.trials import builders

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from django.apps import apps
 from django.db import connection
 
-from evaweb.append_only import guards, install, removal
+from evaweb.records.append_only import guards, install, removal
 
 
 @contextmanager

@@ -38,7 +38,7 @@ _TIMELINE = "runtime/motion/timeline.py"
 _FILTER = "runtime/safety/filter.py"
 _LEASE = "runtime/processes/coordinator/lease.py"
 _LEASES = "evaweb/stations/leases.py"
-_JOURNAL = "evaweb/journal.py"
+_JOURNAL = "evaweb/records/journal.py"
 
 _OF_TIMELINE = ("tests/runtime/motion/test_timeline.py",)
 _OF_STRATEGIES = ("tests/runtime/strategies/test_base.py",)
@@ -47,7 +47,7 @@ _OF_LEASE = ("tests/runtime/processes/coordinator/test_lease.py",)
 _OF_LEASES = ("tests/evaweb/stations/test_leases.py",)
 _OF_REDACTION = ("tests/evaweb/stations/test_redaction.py",)
 _OF_PLANS = ("tests/evaweb/plans/test_services.py",)
-_OF_JOURNAL = ("tests/evaweb/test_journal.py",)
+_OF_JOURNAL = ("tests/evaweb/records/test_journal.py",)
 _OF_SCORES = ("tests/evaweb/trials/test_services.py",)
 
 MUTANTS = (
@@ -197,14 +197,14 @@ MUTANTS = (
     # --- who knows which checkpoint it is ------------------------------------------------------------------
     Mutant(
         "blinding/tells-what-may-name",
-        "evaweb/blinding.py",
+        "evaweb/blinding/visibility.py",
         "if text and not _HARMLESS.fullmatch(text):",
         "if text and _HARMLESS.fullmatch(text):",
         _OF_REDACTION,
     ),
     Mutant(
         "blinding/only-what-is-hidden",
-        "evaweb/blinding.py",
+        "evaweb/blinding/visibility.py",
         'rows.exclude(**{f"{checkpoint}__in": self.checkpoints})',
         'rows.filter(**{f"{checkpoint}__in": self.checkpoints})',
         ("tests/evaweb/find/test_selectors.py",),

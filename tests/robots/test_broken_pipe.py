@@ -34,7 +34,7 @@ NOT_OF_A_TERMINAL = {
     "benchmarks.results_pages",
     "benchmarks.sleeper",
     "benchmarks.wires_receiver",
-    "evaweb.computing",
+    "evaweb.serving.computations",
     "evaweb.results.reports.recompute.__main__",  # stands alone in a report
 }
 

@@ -207,7 +207,7 @@ def _tables(path: str, annotation: Any, base: type) -> Iterator[tuple[str, Any]]
 
 def journals() -> dict[str, Any]:
     """Fields of the lines of every journal, by their kinds."""
-    from evaweb.journal import Line
+    from evaweb.records.journal import Line
 
     found = {}
     for kind in _below(Line):

@@ -6,8 +6,8 @@ from typing import Any
 
 from django import template
 
+from evaweb.accounts.roles import role_of
 from evaweb.console import tabs
-from evaweb.roles import role_of
 
 register = template.Library()
 

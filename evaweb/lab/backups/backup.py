@@ -19,11 +19,11 @@ from django.db.migrations.loader import MigrationLoader
 from django.db.migrations.recorder import MigrationRecorder
 from django.utils import timezone
 
-from evaweb.environment import database_files
+from evaweb.core.environment import database_files
+from evaweb.core.file_checks import RESTORING
 from evaweb.lab.backups import databases
 from evaweb.lab.backups.errors import BackupError
 from evaweb.lab.backups.file_copies import FileCopies, Listed, copied, digest_of, read_list, write_list
-from evaweb.private import RESTORING
 from runtime.recording.files import sync_folder
 
 FORMAT = 1

@@ -15,7 +15,7 @@ from typing import Protocol
 from django.conf import settings
 from django.db import connection, transaction
 
-from evaweb.environment import database_files
+from evaweb.core.environment import database_files
 from evaweb.lab.backups.errors import BackupError
 
 Rows = Mapping[str, int]

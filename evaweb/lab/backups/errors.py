@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 
 
 class BackupError(EvaError):

@@ -15,8 +15,8 @@ from django.conf import settings
 from django.db import Error
 from django.utils import timezone
 
-from evaweb.blinding import Visibility, visibility_for_user
-from evaweb.errors import EvaError
+from evaweb.blinding.visibility import Visibility, visibility_for_user
+from evaweb.core.errors import EvaError
 from evaweb.lab.diagnosis import contents, summary
 from evaweb.lab.diagnosis.scrubbing import Scrubber, known_secrets
 from evaweb.stations.models import Station

@@ -20,9 +20,9 @@ from django.db import connection
 from django.db.migrations.executor import MigrationExecutor
 from django.utils import timezone
 
-from evaweb.binary_frames import to_json_value
-from evaweb.blinding import HIDDEN, Visibility
-from evaweb.errors import StationGone
+from evaweb.blinding.visibility import HIDDEN, Visibility
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import StationGone
 from evaweb.jobs.models import Job
 from evaweb.lab import deployments, machine_check
 from evaweb.stations import redaction

@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 
 from django.conf import settings
 
-from evaweb.blinding import HIDDEN
+from evaweb.blinding.visibility import HIDDEN
 from runtime.core.environment import without_web_secrets
 
 REMOVED = "(removed)"

@@ -2,7 +2,7 @@
 
 from django.db import migrations, models
 
-import evaweb.names
+import evaweb.core.printed_names
 
 
 class Migration(migrations.Migration):
@@ -14,6 +14,6 @@ class Migration(migrations.Migration):
         migrations.AlterField(
             model_name="plan",
             name="title",
-            field=models.CharField(max_length=120, validators=[evaweb.names.check_name]),
+            field=models.CharField(max_length=120, validators=[evaweb.core.printed_names.check_name]),
         ),
     ]

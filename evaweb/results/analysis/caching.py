@@ -13,7 +13,7 @@ from typing import Any
 
 from django.db.models import Count, Max, Q, Sum
 
-from evaweb.memo import FingerprintCache, rounded_sum
+from evaweb.core.fingerprint_cache import FingerprintCache, rounded_sum
 from evaweb.plans.design import compared, findings_of, frozen_design, planned
 from evaweb.plans.models import Allocation, Plan
 from evaweb.results.analysis.analysis import Analysis, Verdict, analyse

@@ -16,7 +16,7 @@ from django.contrib.admin.models import CHANGE, LogEntry
 from django.db.models import Count, F, Q
 from django.utils import timezone
 
-from evaweb.memo import FingerprintCache
+from evaweb.core.fingerprint_cache import FingerprintCache
 from evaweb.plans.bench_checks import HOLDS
 from evaweb.plans.counting import end_of
 from evaweb.plans.design import Names, compared

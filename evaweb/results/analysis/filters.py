@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TypeVar
 from urllib.parse import urlencode
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results.analysis.outcomes import Interruption, Outcome
 
 Run = TypeVar("Run", Outcome, Interruption)

@@ -6,9 +6,9 @@ from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from evaweb import computing
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.models import Comparing
+from evaweb.serving import computations
 from evaweb.statistics.boundaries import MOST
 from evaweb.statistics.design_power import DesignPower, Outlook, outlook
 from evaweb.statistics.designs import RULES
@@ -123,7 +123,7 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     tried = min(affordable, MOST)
     gains = tuple(gain for gain in _GAINS if q.rate + gain <= 1)
-    found: Outlook = computing.questions.ask(
+    found: Outlook = computations.questions.ask(
         person, outlook, q.rate, q.better, q.power, alpha, tried, gains, soon=soon
     )
     return {

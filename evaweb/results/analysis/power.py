@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from threading import Condition
 from typing import Any
 
-from evaweb import computing
 from evaweb.results.analysis.planner import Question, told
+from evaweb.serving import computations
 from evaweb.statistics import score_courses
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.boundaries import MOST
@@ -96,7 +96,7 @@ class Figures:
 
 def _computed(work: Callable[..., Any], *given: Any) -> Any:
     """Compute outside the web process; all drafts have one share, because they are computed one after the other."""
-    return computing.questions.compute("drafts", work, *given)
+    return computations.questions.compute("drafts", work, *given)
 
 
 _Step = Callable[[Figures], Figures]

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results.judges.base import (
     CaseJudgement,
     MilestoneJudgement,

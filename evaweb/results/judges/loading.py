@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results.judges.base import CaseJudgement, Judge, NoVerdict, Setup, TrialCase
 from runtime.core.plugins import variants
 from runtime.core.sentences import Pattern

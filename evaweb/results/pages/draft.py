@@ -10,7 +10,8 @@ from typing import Any
 
 from django.contrib.auth.models import User
 
-from evaweb.blinding import Visibility
+from evaweb.accounts.roles import Role
+from evaweb.blinding.visibility import Visibility
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import planned
 from evaweb.plans.draft_checks import Remark, covered, problems, thoughts
@@ -22,7 +23,6 @@ from evaweb.results.analysis.planner import Question
 from evaweb.results.analysis.power import Asked, Figures
 from evaweb.results.presentation.drawings import time_courses
 from evaweb.results.templatetags.results_tags import design_words
-from evaweb.roles import Role
 from evaweb.stations.models import Station
 from evaweb.statistics.designs import RULES
 from evaweb.statistics.score_courses import LARGEST, Scores

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import frozen_design
 from evaweb.plans.models import Plan

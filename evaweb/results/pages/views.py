@@ -14,9 +14,9 @@ from django.shortcuts import redirect, render
 from django.urls import reverse
 from django.views.decorators.http import require_GET, require_POST
 
-from evaweb.blinding import visibility_for_request
-from evaweb.errors import EvaError
-from evaweb.lists import Listing
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import EvaError
 from evaweb.plans import services
 from evaweb.plans.blinding_rules import can_unblind, record_unblinding
 from evaweb.plans.counting import declared_failures
@@ -39,7 +39,7 @@ from evaweb.results.ratings.result_visibility import (
     sealing_plans,
 )
 from evaweb.results.reports.reporting import write_report
-from evaweb.roles import Role, role_of
+from evaweb.serving.lists import Listing
 from evaweb.trials.models import Trial
 from evaweb.trials.voids import open_void_requests
 

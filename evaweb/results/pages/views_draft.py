@@ -12,8 +12,9 @@ from django.urls import reverse
 from django.utils import timezone
 from django.views.decorators.http import require_GET, require_http_methods
 
-from evaweb.blinding import visibility_for_request
-from evaweb.errors import EvaError
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import visibility_for_request
+from evaweb.core.errors import EvaError
 from evaweb.plans.draft_form import read
 from evaweb.plans.drafting import Values, digest_of, values_of
 from evaweb.plans.models import Comparing, Plan, PlanState, PrimaryOutcome, StoppingRule
@@ -22,7 +23,6 @@ from evaweb.plans.services import plan_change, plan_draft, require_drafter, requ
 from evaweb.results.analysis.planner import Question, question_of
 from evaweb.results.analysis.power import figures
 from evaweb.results.pages import draft
-from evaweb.roles import Role, role_of
 from runtime.core import bounded_documents as bounded
 from runtime.core.sentences import Pattern, fixed
 

@@ -9,15 +9,15 @@ from django.http import HttpRequest, HttpResponse, QueryDict
 from django.shortcuts import redirect, render
 from django.views.decorators.http import require_http_methods
 
+from evaweb.accounts.roles import Role, role_of
+from evaweb.core.errors import EvaError
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import playback_stage
-from evaweb.errors import EvaError
 from evaweb.plans.models import Handout
 from evaweb.results.models import Preference
 from evaweb.results.ratings import rating_queue
 from evaweb.results.ratings.video_available import is_watchable
 from evaweb.results.selectors import plan_get
-from evaweb.roles import Role, role_of
 from evaweb.trials import failures
 from evaweb.trials.services import failing
 from runtime.core.sentences import Pattern

@@ -9,15 +9,15 @@ from django.http import HttpRequest, HttpResponse
 from django.shortcuts import render
 from django.views.decorators.http import require_GET
 
-from evaweb import computing
-from evaweb.blinding import Visibility, visibility_for_request
-from evaweb.errors import EvaError
+from evaweb.accounts.roles import Role, role_of
+from evaweb.blinding.visibility import Visibility, visibility_for_request
+from evaweb.core.errors import EvaError
 from evaweb.plans.models import Comparing, PlanState
-from evaweb.refusals import retrying
 from evaweb.results import selectors
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.ratings.result_visibility import sealed_reason
-from evaweb.roles import Role, role_of
+from evaweb.serving import computations
+from evaweb.serving.error_pages import retrying
 
 RUNNING = 12  # plans on one page; the list has all
 RECENT = 12
@@ -46,7 +46,7 @@ def planner(request: HttpRequest) -> HttpResponse:
     try:
         question = question_of(request.GET)
         table = table_of(question, request.user.pk, soon=True)
-    except computing.UnderWay:
+    except computations.UnderWay:
         waiting = True
     except EvaError as error:
         fault = error

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from evaweb.memo import FingerprintCache
+from evaweb.core.fingerprint_cache import FingerprintCache
 from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import Attempt, arms_of, attempts_of, blocks_of, compared, frozen_design, kept_blocks
 from evaweb.plans.models import Plan

@@ -9,7 +9,7 @@ from typing import Any
 
 from django.urls import reverse
 
-from evaweb.errors import Conflict
+from evaweb.core.errors import Conflict
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import (
     arms_of,

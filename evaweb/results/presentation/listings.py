@@ -9,7 +9,6 @@ from typing import Any
 from django.urls import reverse
 
 from evaweb.episodes.models import Episode
-from evaweb.lists import SEARCH, UNSEEN, Column, Filter
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis, Arm
@@ -20,6 +19,12 @@ from evaweb.results.presentation.drawings import conditions
 from evaweb.results.presentation.wording import format_interval
 from evaweb.results.ratings.video_available import is_watchable
 from evaweb.results.selectors import TrialQuery
+from evaweb.serving.lists import (
+    SEARCH,
+    UNSEEN,
+    Column,
+    Filter,
+)
 from evaweb.statistics.bounded import BoundedMean
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials.failure_text import UNSPECIFIED

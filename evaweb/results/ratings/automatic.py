@@ -16,7 +16,13 @@ from django.db import transaction
 from django.db.models import Exists, OuterRef
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.accounts.roles import Role, require_role
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import enqueue
 from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState
@@ -26,7 +32,6 @@ from evaweb.results.models import AutomaticJudge, Judgement
 from evaweb.results.ratings.record import RATINGS, JudgementLine
 from evaweb.results.ratings.stills import trial_stills
 from evaweb.results.ratings.video_available import is_watchable
-from evaweb.roles import Role, require_role
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import journal_uuid
 from evaweb.trials.scoring import reached_in_truth

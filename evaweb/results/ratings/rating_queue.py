@@ -13,17 +13,22 @@ from django.contrib.auth.models import User
 from django.db import IntegrityError, transaction
 from django.db.models import Exists, OuterRef, QuerySet
 
+from evaweb.accounts.roles import Role, require_role, role_of
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
-from evaweb.journal import clean_text
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.plans.seeded_draws import SeededDraws
+from evaweb.records.journal import clean_text
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
 from evaweb.results.ratings.video_available import is_watchable, may_become_watchable, require_video
 from evaweb.reviews.selectors import still_judges
-from evaweb.roles import Role, require_role, role_of
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus
 from evaweb.trials.record import journal_uuid

@@ -11,7 +11,13 @@ from uuid import UUID
 
 from pydantic import Field, StrictBool
 
-from evaweb.journal import Journal, Line, Moment, Person, RowPath
+from evaweb.records.journal import (
+    Journal,
+    Line,
+    Moment,
+    Person,
+    RowPath,
+)
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.trials.record import Name, TrialRecord
 

@@ -6,8 +6,8 @@ import logging
 
 from django.db import DataError, IntegrityError, transaction
 
+from evaweb.core.errors import EvaError
 from evaweb.episodes.reconcile import RestorableRun, register_restorer
-from evaweb.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.ratings.record import JudgementLine, PreferenceLine, RatingLine

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from evaweb.blinding import Visibility, plan_titles, visibility_for_user
-from evaweb.errors import NotAllowed
+from evaweb.blinding.visibility import Visibility, plan_titles, visibility_for_user
+from evaweb.core.errors import NotAllowed
 from evaweb.plans.blinding_rules import is_sealed_for
 from evaweb.plans.models import Plan, PlanState
 

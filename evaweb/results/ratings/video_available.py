@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from evaweb.core.errors import Conflict
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.selectors import playback_stage
-from evaweb.errors import Conflict
 from evaweb.plans.models import Handout
 from runtime.core.sentences import Pattern
 

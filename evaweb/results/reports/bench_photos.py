@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.plans import image_store
 from evaweb.plans.models import Achieved, Plan
 

@@ -14,7 +14,8 @@ from django.contrib.staticfiles import finders
 from django.template.loader import render_to_string
 from django.utils import timezone
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
+from evaweb.core.tabular_export import iter_csv
 from evaweb.plans.counting import ENDS, declared_failures
 from evaweb.plans.design import blocks_that_count, compared, frozen_design
 from evaweb.plans.models import CountsAs, Plan, PlanState
@@ -34,7 +35,6 @@ from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.tables import COLUMNS, JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.statistics.designs import estimated, findings
 from evaweb.statistics.difference import Difference
-from evaweb.tabular_export import iter_csv
 from evaweb.trials.failures import ordered_terms
 from runtime.core.sentences import Pattern
 

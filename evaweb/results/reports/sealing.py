@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Any
 
-from evaweb.canonical import digest
+from evaweb.core.canonical_json import digest
+from evaweb.core.tabular_export import plain
 from evaweb.plans.design import declare_kept
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.caveats import caveats_of
@@ -15,7 +16,6 @@ from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.integrity import integrity_document
 from evaweb.results.presentation.setting import setting_now
 from evaweb.results.reports.tables import JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
-from evaweb.tabular_export import plain
 from evaweb.trials.models import TrialStatus
 
 # Columns of an attempt in the report's table; recompute/record.py has the same.

@@ -10,12 +10,12 @@ from typing import Any, get_args
 
 from django.db.models import QuerySet
 
+from evaweb.core.tabular_export import in_pages
 from evaweb.plans.counting import end_of
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.models import Judgement, Rating
 from evaweb.results.presentation.headline import headline
-from evaweb.tabular_export import in_pages
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 from evaweb.trials.record import COLUMNS as RECORDED
 from evaweb.trials.record import HINTS, TrialRecord

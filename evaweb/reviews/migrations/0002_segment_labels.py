@@ -2,7 +2,7 @@ import django.core.validators
 import django.db.models.functions.text
 from django.db import migrations, models
 
-import evaweb.names
+import evaweb.core.printed_names
 
 # Words, colour, key: what a lab begins with, in this order.
 LABELS = (
@@ -38,7 +38,9 @@ class Migration(migrations.Migration):
                 (
                     "words",
                     models.CharField(
-                        help_text="As segments have it.", max_length=120, validators=[evaweb.names.check_name]
+                        help_text="As segments have it.",
+                        max_length=120,
+                        validators=[evaweb.core.printed_names.check_name],
                     ),
                 ),
                 (

@@ -2,7 +2,7 @@ import django.core.validators
 import django.db.models.functions.text
 from django.db import migrations, models
 
-from evaweb.append_only import triggers_suspended
+from evaweb.records.append_only import triggers_suspended
 
 # level, words, key: what a lab begins with, in this order.
 TERMS = (

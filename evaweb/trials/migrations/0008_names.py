@@ -2,7 +2,7 @@
 
 from django.db import migrations, models
 
-import evaweb.names
+import evaweb.core.printed_names
 import evaweb.trials.tables
 
 
@@ -15,7 +15,9 @@ class Migration(migrations.Migration):
         migrations.AlterField(
             model_name="checkpoint",
             name="name",
-            field=models.CharField(max_length=120, unique=True, validators=[evaweb.names.check_name]),
+            field=models.CharField(
+                max_length=120, unique=True, validators=[evaweb.core.printed_names.check_name]
+            ),
         ),
         migrations.AlterField(
             model_name="failureterm",
@@ -23,22 +25,24 @@ class Migration(migrations.Migration):
             field=models.CharField(
                 help_text="As scores have it.",
                 max_length=60,
-                validators=[evaweb.names.check_name, evaweb.trials.tables.check_term],
+                validators=[evaweb.core.printed_names.check_name, evaweb.trials.tables.check_term],
             ),
         ),
         migrations.AlterField(
             model_name="milestone",
             name="text",
-            field=models.CharField(max_length=200, validators=[evaweb.names.check_name]),
+            field=models.CharField(max_length=200, validators=[evaweb.core.printed_names.check_name]),
         ),
         migrations.AlterField(
             model_name="position",
             name="label",
-            field=models.CharField(blank=True, max_length=120, validators=[evaweb.names.check_name]),
+            field=models.CharField(
+                blank=True, max_length=120, validators=[evaweb.core.printed_names.check_name]
+            ),
         ),
         migrations.AlterField(
             model_name="scene",
             name="title",
-            field=models.CharField(max_length=120, validators=[evaweb.names.check_name]),
+            field=models.CharField(max_length=120, validators=[evaweb.core.printed_names.check_name]),
         ),
     ]

@@ -2,7 +2,7 @@
 
 from django.db import migrations, models
 
-import evaweb.names
+import evaweb.core.printed_names
 
 
 class Migration(migrations.Migration):
@@ -16,7 +16,7 @@ class Migration(migrations.Migration):
                 blank=True,
                 default="",
                 max_length=120,
-                validators=[evaweb.names.check_name],
+                validators=[evaweb.core.printed_names.check_name],
                 help_text="What it is a training run of: the same data and settings, another seed. Frozen with a plan, "
                 "whose results sum up the runs of a recipe.",
             ),

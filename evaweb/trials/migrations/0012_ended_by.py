@@ -1,6 +1,6 @@
 from django.db import migrations, models
 
-from evaweb.append_only import triggers_suspended
+from evaweb.records.append_only import triggers_suspended
 
 
 class Migration(migrations.Migration):

@@ -1,4 +1,4 @@
-// The binary layout of evaweb/binary_frames.py: u32 little-endian header length, UTF-8 JSON header, and from the next
+// The binary layout of evaweb/core/binary_frames.py: u32 little-endian header length, UTF-8 JSON header, and from the next
 // multiple of 8 on the body; offsets in the header count from the start of the body.
 
 const ARRAYS = { f4: Float32Array, f8: Float64Array, i4: Int32Array, i8: BigInt64Array, u1: Uint8Array };

@@ -12,7 +12,7 @@ from django.core.management import execute_from_command_line
 
 if __name__ == "__main__":
     django.setup()
-    from evaweb import credentials  # not before models are there
+    from evaweb.accounts import credentials  # not before models are there
 
     credentials._PATIENCE_S = credentials._TURN_S = 600.0
     execute_from_command_line(sys.argv)

@@ -2,9 +2,9 @@ import pytest
 from django.contrib.auth.models import User
 from django.test import Client
 
+from evaweb.accounts.roles import Role, role_of, set_role
 from evaweb.api.models import Token
 from evaweb.api.tokens import create_token
-from evaweb.roles import Role, role_of, set_role
 from tests.evaweb.trials import builders
 
 

@@ -8,9 +8,9 @@ import uuid
 import pytest
 from django.test import Client
 
+from evaweb.accounts.roles import Role
 from evaweb.api.management.commands.openapi_snapshot import PLACE  # a test holds it to what the interface is
-from evaweb.posts import body_limit_for
-from evaweb.roles import Role
+from evaweb.serving.body_limits import body_limit_for
 from evaweb.stations.models import Command
 from runtime.core import bounded_documents as bounded
 

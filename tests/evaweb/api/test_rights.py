@@ -6,7 +6,7 @@ from uuid import uuid4
 import pytest
 from django.test import Client
 
-from evaweb.roles import Role, set_role
+from evaweb.accounts.roles import Role, set_role
 from evaweb.stations.models import Command
 from evaweb.trials.tables import _kinds
 from runtime.core.bounded_documents import MAX_DEPTH

@@ -7,7 +7,7 @@ from django.db import OperationalError, connection
 from django.test import Client
 
 from evaweb.api.tokens import create_token
-from evaweb.errors import StationGone
+from evaweb.core.errors import StationGone
 from evaweb.stations import commands
 from evaweb.stations.models import Command, Lease, Station
 from evaweb.stations.runtime_client import NoAnswer

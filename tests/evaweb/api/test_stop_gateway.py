@@ -16,14 +16,14 @@ from django.db import OperationalError, connections
 from django.test import Client
 from django.utils import timezone
 
-from evaweb import audit
-from evaweb import credentials as module
+from evaweb.accounts import credentials as module
+from evaweb.accounts import login_audit
+from evaweb.accounts.credentials import credentials
+from evaweb.accounts.lookup_pool import FairLookupPool
 from evaweb.api.models import Token
 from evaweb.api.tokens import create_token
 from evaweb.asgi import application
-from evaweb.credentials import credentials
-from evaweb.lookups import FairLookupPool
-from evaweb.rarely import LogThrottle
+from evaweb.core.log_throttle import LogThrottle
 from evaweb.stations import leases
 from evaweb.stations.models import Command
 from runtime.ipc.session_state import SessionState
@@ -44,7 +44,7 @@ def _data_dir():
 
 @pytest.fixture(autouse=True)
 def _nobody_was_refused_before(monkeypatch):
-    monkeypatch.setattr(audit, "_refused", LogThrottle(60.0, 10))
+    monkeypatch.setattr(login_audit, "_refused", LogThrottle(60.0, 10))
 
 
 @pytest.fixture

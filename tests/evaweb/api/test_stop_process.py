@@ -13,9 +13,9 @@ from django.db import connections
 from django.test import Client
 from django.utils import timezone
 
+from evaweb.accounts.credentials import SESSION, credentials
 from evaweb.api.stop_gateway import stop_application
 from evaweb.api.tokens import create_token
-from evaweb.credentials import SESSION, credentials
 from evaweb.stations import leases
 from evaweb.stations.models import Command
 from runtime.ipc.session_state import SessionState

@@ -11,7 +11,7 @@ from django.utils import timezone
 
 from evaweb.api.models import Token
 from evaweb.api.tokens import create_token, user_of_token
-from evaweb.errors import Conflict, EvaError
+from evaweb.core.errors import Conflict, EvaError
 from tests.evaweb.api.conftest import Rest
 from tests.evaweb.trials import builders
 

@@ -13,8 +13,8 @@ from evaweb.collect.models import CollectSession, Demonstration
 from evaweb.collect.station_commands import session_command
 from evaweb.console.event_ingest import ingest_events
 from evaweb.console.feed import History
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.episodes.models import Episode
-from evaweb.errors import Conflict, EvaError
 from evaweb.stations.models import Command, CommandStatus, Station
 from runtime.ipc import messages
 from tests.evaweb.collect.conftest import SETUP, collecting

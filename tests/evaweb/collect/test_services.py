@@ -12,8 +12,8 @@ from django.db import IntegrityError, connection, transaction
 from evaweb.collect import selectors, services
 from evaweb.collect.models import CollectSession
 from evaweb.collect.record import SESSIONS
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.datasets import episode_list
-from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue
 from evaweb.reviews import services as reviews

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from evaweb.collect.setups import setup_differences, setup_from_manifest, setup_from_snapshot
-from evaweb.errors import Conflict
+from evaweb.core.errors import Conflict
 from tests.evaweb.collect.conftest import SETUP, collecting
 
 

@@ -11,8 +11,8 @@ from django.db import connections
 from django.test import Client
 
 from evaweb.asgi import application
-from evaweb.binary_frames import decode
 from evaweb.console import hub as hubs
+from evaweb.core.binary_frames import decode
 from tests.processes import PATIENCE_S
 
 

@@ -8,10 +8,10 @@ import threading
 import numpy as np
 import pytest
 
+from evaweb.accounts.roles import Role
 from evaweb.console import aim_queries as aims
 from evaweb.console.aim_queries import AimQueries, query_aim
 from evaweb.console.requests import Aim
-from evaweb.roles import Role
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import drawn_robot
 from runtime.ipc.messages import Ack

@@ -12,8 +12,8 @@ import pytest
 from django.conf import settings
 
 from evaweb.console.body_limits import ANONYMOUS_LIMIT, USER_LIMIT, body_bound
-from evaweb.headers import DEFAULT_HEADERS
 from evaweb.plans.references import LARGEST
+from evaweb.serving.headers import DEFAULT_HEADERS
 from tests.evaweb.console.test_serve import MANAGE, served
 from tests.processes import PATIENCE_S
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaweb.binary_frames import decode
 from evaweb.console import frame_parts
 from evaweb.console.chunks import GHOSTS, encode_chunk
+from evaweb.core.binary_frames import decode
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.robot_geometry import drawn_robot
 

@@ -12,10 +12,10 @@ from django.contrib.auth.models import AnonymousUser, User
 from django.contrib.sessions.models import Session
 from django.db import OperationalError, connections
 
+from evaweb.accounts.credentials import credentials
+from evaweb.accounts.lookup_pool import FairLookupPool
 from evaweb.console import consumers
 from evaweb.console import hub as hubs
-from evaweb.credentials import credentials
-from evaweb.lookups import FairLookupPool
 from evaweb.stations import commands, leases
 from evaweb.stations.models import Command, CommandStatus, LeaseRequest, Station
 from evaweb.stations.runtime_client import StationConnection

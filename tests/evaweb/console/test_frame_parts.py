@@ -1,4 +1,4 @@
-"""Parts put together are the message that evaweb.binary_frames reads."""
+"""Parts put together are the message that evaweb.core.binary_frames reads."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from evaweb.binary_frames import Stream, decode, encode
 from evaweb.console import frame_parts
+from evaweb.core.binary_frames import Stream, decode, encode
 
 VALUES = arrays.arrays("<f4", arrays.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=4))
 NAMES = st.text(min_size=1, max_size=6)

@@ -8,7 +8,7 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
 from evaweb.console.history import DAYS, histories
 from evaweb.episodes.models import Episode
 from tests.evaweb.trials import builders

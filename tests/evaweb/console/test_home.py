@@ -9,11 +9,11 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
-from evaweb.blinding import visibility_for_user
+from evaweb.blinding.visibility import visibility_for_user
 from evaweb.console import home, stills
 from evaweb.console.feed import LinkState, feeds
+from evaweb.core.errors import Conflict
 from evaweb.episodes.models import Episode
-from evaweb.errors import Conflict
 from evaweb.jobs.models import Job
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from evaweb.blinding import FULL_VISIBILITY
+from evaweb.blinding.visibility import FULL_VISIBILITY
 from evaweb.console import hub as hubs
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaweb.binary_frames import decode
 from evaweb.console import frame_parts
 from evaweb.console.recent_samples import SAMPLES, RecentSamples
+from evaweb.core.binary_frames import decode
 
 NOTHING = np.full(3, np.nan, np.float32)
 

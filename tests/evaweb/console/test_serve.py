@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 
 from evaweb.console.server import _address
-from evaweb.listening import PortTaken, open_listener
+from evaweb.serving.listeners import PortTaken, open_listener
 from tests import migrated
 from tests.processes import PATIENCE_S, eventually
 

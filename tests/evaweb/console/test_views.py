@@ -15,10 +15,10 @@ from django.test.utils import CaptureQueriesContext
 from django.urls import reverse
 from django.utils import timezone
 
-from evaweb.blinding import FULL_VISIBILITY
+from evaweb.accounts.roles import Role
+from evaweb.blinding.visibility import FULL_VISIBILITY
 from evaweb.console import selectors
 from evaweb.episodes.models import Episode
-from evaweb.roles import Role
 from evaweb.stations.commands import COLLECTING, KINDS
 from evaweb.stations.models import Command, Lease, LeaseRequest, Station
 from evaweb.trials.models import (

@@ -4,7 +4,7 @@ import pytest
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.blinding import HIDDEN, Visibility
+from evaweb.blinding.visibility import HIDDEN, Visibility
 from evaweb.console.views_jobs import KINDS, row_of
 from evaweb.episodes.models import Episode
 from evaweb.jobs import doorbell, kinds, services

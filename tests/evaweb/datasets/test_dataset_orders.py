@@ -18,9 +18,14 @@ from django.core.management import CommandError, call_command
 from django.test import Client
 from django.urls import reverse
 
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.datasets import dataset_orders
 from evaweb.datasets.overview import dataset_names
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue
 from evaweb.stations.models import Station

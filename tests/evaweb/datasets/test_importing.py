@@ -17,7 +17,7 @@ from django.test import Client
 from django.urls import reverse
 
 import robots
-from evaweb.binary_frames import decode
+from evaweb.core.binary_frames import decode
 from evaweb.datasets.importing import import_dataset
 from evaweb.datasets.job_kinds import dataset as run_order
 from evaweb.datasets.robot_replay import playable_episode

@@ -20,7 +20,7 @@ from django.test import AsyncClient, Client
 from django.urls import reverse
 from PIL import Image
 
-from evaweb.binary_frames import decode
+from evaweb.core.binary_frames import decode
 from evaweb.datasets import still_images
 from evaweb.episodes.models import Episode
 from evaweb.stations.models import Station

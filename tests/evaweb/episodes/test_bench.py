@@ -13,8 +13,8 @@ from django.contrib.auth.models import User
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.binary_frames import decode
-from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
+from evaweb.core.binary_frames import decode
 from evaweb.episodes import services
 from evaweb.episodes.bench import bench_course
 from evaweb.episodes.curves import curve_message

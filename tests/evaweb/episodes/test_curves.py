@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from evaweb.binary_frames import decode
+from evaweb.core.binary_frames import decode
+from evaweb.core.errors import NotFound
 from evaweb.episodes import poses as posing
 from evaweb.episodes.curves import _interventions, curve_message, hold_spans
 from evaweb.episodes.poses import pose_message
-from evaweb.errors import NotFound
 from evaweb.stations.robot_geometry import drawn_robot
 from runtime.kinematics.forward import ChainForward
 from runtime.recording.files import RecordingError

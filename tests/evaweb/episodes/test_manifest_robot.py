@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 import robots
+from evaweb.core.errors import NotFound
 from evaweb.episodes.manifest_robot import drawn_robot_for, groups_of_manifest, robot_of_manifest
-from evaweb.errors import NotFound
 
 
 def manifest(*groups: str, **said: Any) -> dict[str, Any]:

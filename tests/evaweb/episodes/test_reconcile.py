@@ -11,11 +11,11 @@ from uuid import UUID
 import pytest
 from django.core.management import call_command
 
+from evaweb.core.errors import EvaError
 from evaweb.episodes import reconcile as reconciling
 from evaweb.episodes import services
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import RestorableRun, reconcile
-from evaweb.errors import EvaError
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from django.utils import timezone
 
+from evaweb.core.errors import EvaError
 from evaweb.episodes import services
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.selectors import playback_stage
-from evaweb.errors import EvaError
 from evaweb.jobs.models import Job
 from evaweb.stations.models import Station
 from runtime.recording.repair import repair

@@ -13,12 +13,12 @@ from django.contrib.auth.models import User
 from django.test import Client
 from django.utils import timezone
 
+from evaweb.core.errors import Conflict
 from evaweb.datasets.robot_replay import playable_episode
 from evaweb.episodes import selectors, services, verification
 from evaweb.episodes.job_kinds import find_unverified_episodes
 from evaweb.episodes.models import Episode
 from evaweb.episodes.reconcile import reconcile
-from evaweb.errors import Conflict
 from evaweb.jobs import services as jobs
 from evaweb.jobs.models import Job, JobStatus
 from runtime.recording.integrity import UNSEALED

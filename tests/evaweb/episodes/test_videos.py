@@ -13,16 +13,16 @@ from django.contrib.auth.models import User
 from django.test import Client
 from django.urls import reverse
 
+from evaweb.core.object_stores import StoreError
 from evaweb.episodes.folders import preview_folder, preview_video
 from evaweb.episodes.job_kinds import store_at_start
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import playback_stage
 from evaweb.episodes.videos import video_address, video_file
-from evaweb.headers import content_security_policy
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import run_queue
-from evaweb.object_stores import StoreError
 from evaweb.results.ratings.stills import trial_stills
+from evaweb.serving.headers import content_security_policy
 from tests.evaweb.s3_server import SECRET, Server, why_no_server
 
 pytestmark = pytest.mark.django_db

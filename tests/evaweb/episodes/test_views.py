@@ -17,7 +17,7 @@ from django.test import AsyncClient, Client
 from django.urls import reverse
 
 import robots
-from evaweb.binary_frames import decode
+from evaweb.core.binary_frames import decode
 from evaweb.episodes import streaming
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.jobs import services as jobs

@@ -7,8 +7,8 @@ from django.db import connection
 from django.test import Client
 from django.test.utils import CaptureQueriesContext
 
-from evaweb.blinding import visibility_for_user
-from evaweb.errors import EvaError
+from evaweb.blinding.visibility import visibility_for_user
+from evaweb.core.errors import EvaError
 from evaweb.find.selectors import LONGEST, MOST, find
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import record_unblinding

@@ -11,7 +11,7 @@ from django.db import OperationalError
 from django.db.models.functions import Now
 from django.utils import timezone
 
-from evaweb.errors import Conflict, NotAllowed
+from evaweb.core.errors import Conflict, NotAllowed
 from evaweb.jobs import database_retry, locks, services
 from evaweb.jobs.kinds import JobContext, UnknownKind
 from evaweb.jobs.locks import exclusive_job

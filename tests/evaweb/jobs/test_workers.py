@@ -12,7 +12,7 @@ from django.db.models.functions import Now
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.jobs import kinds, services, workers
 from evaweb.jobs.kinds import Queue
 from evaweb.jobs.models import Hold, Job, JobStatus, LabFolder, WorkerProcess

@@ -1,8 +1,8 @@
 import pytest
 from django.contrib.auth.models import User
 
+from evaweb.accounts.roles import Role, role_of
 from evaweb.lab import demo_rows
-from evaweb.roles import Role, role_of
 from evaweb.stations.models import Station
 from evaweb.trials.models import Milestone, Scene
 

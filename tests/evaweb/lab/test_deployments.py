@@ -5,7 +5,12 @@ import tomllib
 import pytest
 
 import robots
-from evaweb.errors import Conflict, EvaError, NotFound, StationGone
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotFound,
+    StationGone,
+)
 from evaweb.lab import deployments, lifetime
 from evaweb.lab.deployments import Standing
 from evaweb.plans.models import Plan

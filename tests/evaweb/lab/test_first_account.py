@@ -4,9 +4,9 @@ import pytest
 from django.contrib.auth.models import User
 from django.db import OperationalError
 
-from evaweb.errors import Conflict
+from evaweb.accounts.roles import Role, role_of
+from evaweb.core.errors import Conflict
 from evaweb.lab import first_account
-from evaweb.roles import Role, role_of
 
 pytestmark = pytest.mark.django_db
 GOOD = "a-bench-and-a-robot"

@@ -4,11 +4,11 @@ import re
 
 import pytest
 
+from evaweb.accounts.roles import Role, set_role
 from evaweb.lab import demo_rows, deployments, first_steps
 from evaweb.lab.deployments import Standing
 from evaweb.lab.first_steps import Progress, walk
 from evaweb.plans.models import CameraCheck
-from evaweb.roles import Role, set_role
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.trials.models import Scene
 from evaweb.trials.services import score_trial

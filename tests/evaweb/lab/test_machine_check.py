@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 from django.core.management import CommandError, call_command
 
-from evaweb.errors import StationGone
+from evaweb.core.errors import StationGone
 from evaweb.lab import machine_check
 from evaweb.lab.machine_check import Line, State
 from evaweb.stations.models import Station

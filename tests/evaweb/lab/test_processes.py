@@ -8,7 +8,7 @@ import pytest
 
 from evaweb.lab import programs
 from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec, processor_s
-from evaweb.listening import PortTaken, open_listener
+from evaweb.serving.listeners import PortTaken, open_listener
 from tests.processes import PATIENCE_S, alive, eventually
 
 ANSWERS = """

@@ -2,7 +2,7 @@
 
 import pytest
 
-from evaweb.errors import Conflict, EvaError
+from evaweb.core.errors import Conflict, EvaError
 from evaweb.plans import services as plans
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.design import counted_now, current_pairs, kept_blocks
@@ -10,7 +10,7 @@ from evaweb.plans.models import Plan, PlanState
 from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.trials import services, voids
 from evaweb.trials.models import Score, Trial, VoidRequest
-from tests.evaweb.test_races import at_once
+from tests.evaweb.core.test_write_conflicts import at_once
 from tests.evaweb.trials import builders
 
 WHY = "the plate had slipped"

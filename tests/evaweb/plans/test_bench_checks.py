@@ -3,7 +3,12 @@ from datetime import timedelta
 import pytest
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.plans import bench_checks as looking
 from evaweb.plans import image_store
 from evaweb.plans.models import Achieved, CameraCheck, Plan, Reference

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from evaweb.errors import Conflict
+from evaweb.core.errors import Conflict
+from evaweb.core.tabular_export import plain
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.draft_checks import problems
 from evaweb.plans.models import CountsAs, Plan
@@ -12,7 +13,6 @@ from evaweb.plans.services import amend_plan, close_plan, freeze_plan
 from evaweb.plans.toml_exchange import export_toml, import_file
 from evaweb.results.reports.recompute.scenes import ending_faults, scene_faults
 from evaweb.results.reports.tables import outcome_pages, score_pages
-from evaweb.tabular_export import plain
 from evaweb.trials import services, voids
 from evaweb.trials.models import Trial
 from tests.evaweb.trials import builders

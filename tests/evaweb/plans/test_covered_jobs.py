@@ -4,7 +4,7 @@ import pytest
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.blinding import HIDDEN
+from evaweb.blinding.visibility import HIDDEN
 from evaweb.episodes.models import Episode
 from evaweb.jobs.models import Job
 from evaweb.plans.allocation import allocate_trial

@@ -3,8 +3,8 @@
 import pytest
 from django.db import IntegrityError, transaction
 
-from evaweb.canonical import digest
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans import services
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import record_unblinding

@@ -1,6 +1,6 @@
 import pytest
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.draft_checks import problems, thoughts
 from evaweb.plans.services import amend_plan, freeze_plan
 from evaweb.trials.models import Checkpoint, Milestone

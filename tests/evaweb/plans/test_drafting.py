@@ -1,7 +1,7 @@
 import pytest
 
-from evaweb.blinding import visibility_for_user
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.blinding.visibility import visibility_for_user
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.drafting import HIDDEN, digest_of, merged, values_of
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan, plan_change, plan_draft

@@ -4,7 +4,7 @@ import pytest
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.blinding import visibility_for_user
+from evaweb.blinding.visibility import visibility_for_user
 from evaweb.episodes.selectors import episode_get, episode_list, tag_counts
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan

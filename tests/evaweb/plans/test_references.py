@@ -11,7 +11,7 @@ from django.core.files.uploadedfile import SimpleUploadedFile
 from django.core.management import call_command
 from django.urls import reverse
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans import image_store, references
 from evaweb.plans.models import Reference
 from evaweb.plans.references import unpacked

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans import image_store
 from evaweb.plans.region_matching import (
     Region,

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.canonical import canonical, difference, digest
-from evaweb.errors import EvaError
+from evaweb.core.canonical_json import canonical, difference, digest
+from evaweb.core.errors import EvaError
 from evaweb.plans.commitment import draw_codes, make_commitment, verify_commitment
 from evaweb.plans.schedule import IMBALANCE, RANDOM, Condition, counts_of, schedule
 from evaweb.plans.seeded_draws import SeededDraws, new_key

@@ -3,10 +3,10 @@ from collections import Counter
 import pytest
 from django.db import IntegrityError, transaction
 
-from evaweb.blinding import HIDDEN, visibility_for_user
-from evaweb.canonical import digest
+from evaweb.blinding.visibility import HIDDEN, visibility_for_user
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.episodes.reconcile import reconcile
-from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import allocate_trial, plan_progress, release_slots
 from evaweb.plans.blinding_rules import is_sealed_for, record_unblinding
 from evaweb.plans.commitment import make_commitment, schedule_digest

@@ -2,7 +2,7 @@
 
 import pytest
 
-from evaweb.errors import Conflict
+from evaweb.core.errors import Conflict
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.design import planned
 from evaweb.plans.draft_checks import problems

@@ -4,8 +4,8 @@ import pytest
 from django.template.loader import render_to_string
 from django.test import Client
 
-from evaweb.blinding import visibility_for_user
-from evaweb.errors import Conflict
+from evaweb.blinding.visibility import visibility_for_user
+from evaweb.core.errors import Conflict
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.counting import ended_by

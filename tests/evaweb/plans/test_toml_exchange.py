@@ -3,7 +3,7 @@ import tomllib
 import pytest
 from django.core.exceptions import ValidationError
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.frozen_document import document_of
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan

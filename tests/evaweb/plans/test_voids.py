@@ -6,7 +6,7 @@ import pytest
 from django.db import IntegrityError, transaction
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import allocate_trial, plan_progress
 from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.design import current_pairs, kept_blocks

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from evaweb.errors import StationGone
+from evaweb.core.errors import StationGone
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint
 from runtime.ipc.messages import Ack, Command

@@ -6,7 +6,7 @@ from uuid import uuid4
 import pytest
 from django.utils import timezone
 
-from evaweb.errors import Conflict, NotAllowed, StationGone
+from evaweb.core.errors import Conflict, NotAllowed, StationGone
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import run_queue
 from evaweb.preflights import job_kinds

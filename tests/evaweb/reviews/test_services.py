@@ -5,9 +5,14 @@ import json
 import pytest
 from django.db import DatabaseError, transaction
 
-from evaweb import journal as disk
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.episodes.models import EpisodeStatus
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.records import journal as disk
 from evaweb.reviews import selectors, services
 from evaweb.reviews.models import Review, Segment, Standing
 from tests.evaweb.episodes.conftest import FRAMES

@@ -5,10 +5,10 @@ import json
 import pytest
 from django.test import Client
 
-from evaweb.blinding import Visibility, visibility_for_user
+from evaweb.blinding.visibility import Visibility, visibility_for_user
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.episodes.models import EpisodeStatus, Tag
 from evaweb.episodes.selectors import episode_get, episode_list, tag_counts
-from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.find.selectors import find
 from evaweb.reviews.services import MOST_TAGS, Tagged, tags_change
 

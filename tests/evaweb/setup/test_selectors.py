@@ -6,7 +6,7 @@ import pytest
 from django.test import Client
 from django.urls import resolve, reverse
 
-from evaweb.blinding import FULL_VISIBILITY, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
 from evaweb.plans.models import Plan
 from evaweb.preflights.models import Preflight
 from evaweb.setup.selectors import cards

@@ -9,7 +9,7 @@ import pytest
 from django.db import OperationalError
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.stations import commands, leases, stops
 from evaweb.stations.commands import NotSent, issue_command, resolve_unknown_outcome
 from evaweb.stations.models import Command, CommandStatus, Station

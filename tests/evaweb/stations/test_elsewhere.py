@@ -9,8 +9,8 @@ from uuid import uuid4
 import pytest
 
 from evaweb.console.feed import StationFeed
+from evaweb.core.errors import StationGone
 from evaweb.episodes.job_kinds import look_for_arrived
-from evaweb.errors import StationGone
 from evaweb.stations import commands, enrolment, leases, stops
 from evaweb.stations.models import CommandStatus, Station
 from evaweb.stations.runtime_client import connection_to

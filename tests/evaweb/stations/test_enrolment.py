@@ -12,8 +12,8 @@ from django.db import OperationalError
 from django.urls import reverse
 from django.utils import timezone
 
-from evaweb.environment import address
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.environment import address
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.stations import enrolment, gate
 from evaweb.stations.models import EnrolmentCode, Station, StationKey
 from runtime.link import codes, key_files

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import robots
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.models import Station
 from evaweb.stations.robot_geometry import drawn_robot

@@ -9,7 +9,12 @@ from django.contrib.auth import get_user_model
 from django.contrib.auth.models import User
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.stations import leases
 from evaweb.stations.lease_holders import holder_display_name
 from evaweb.stations.models import Lease, LeaseRequest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import robots
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations import robot_geometry as looks_module
 from evaweb.stations.robot_geometry import DrawnRobot, describe_robot, drawn_robot, groups_of
 from runtime.kinematics.base import KinematicsError

@@ -9,7 +9,7 @@ from hashlib import sha256
 import pytest
 
 import robots
-from evaweb.errors import NotFound
+from evaweb.core.errors import NotFound
 from evaweb.stations import robot_geometry as looks
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.meshes import mesh_content

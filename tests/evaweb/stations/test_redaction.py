@@ -6,8 +6,8 @@ import pkgutil
 import pytest
 
 import runtime
-from evaweb import blinding_reasons as reasons
-from evaweb.blinding import COVERED, COVERED_AT_REST, FULL_VISIBILITY
+from evaweb.blinding import station_messages as reasons
+from evaweb.blinding.visibility import COVERED, COVERED_AT_REST, FULL_VISIBILITY
 from evaweb.stations import redaction
 from runtime.core.sentences import Pattern, identity, known, plain, within
 from runtime.processes.coordinator import operations

@@ -16,7 +16,7 @@ import pytest
 from django.db import OperationalError, connection
 from django.utils import timezone
 
-from evaweb.errors import Conflict, NotFound
+from evaweb.core.errors import Conflict, NotFound
 from evaweb.stations import commands, leases, unwritten_commands
 from evaweb.stations.models import Command, CommandStatus, Station
 from evaweb.stations.process_journal import recover_journals

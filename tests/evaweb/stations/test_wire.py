@@ -9,7 +9,7 @@ from uuid import uuid4
 import pytest
 from django.conf import settings
 
-from evaweb.errors import NotFound, StationGone
+from evaweb.core.errors import NotFound, StationGone
 from evaweb.stations.runtime_client import NoAnswer, connection_to
 from runtime.ipc.messages import Command
 from runtime.ipc.session_state import SessionState

@@ -1,7 +1,7 @@
 import pytest
 from django.utils import timezone
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Plan

@@ -7,7 +7,7 @@ import pytest
 from django.core.exceptions import ValidationError
 from django.test import Client
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.trials import services, voids
 from evaweb.trials.failures import failure_choices, ordered_terms
 from evaweb.trials.models import FailureTerm, Milestone, Score, Trial

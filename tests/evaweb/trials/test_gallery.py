@@ -5,7 +5,7 @@ import zipfile
 import pytest
 from django.test import Client
 
-from evaweb.blinding import FULL_VISIBILITY, HIDDEN, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, HIDDEN, Visibility
 from evaweb.episodes.folders import preview_folder, preview_video
 from evaweb.episodes.models import Episode
 from evaweb.trials import clip_export, services

@@ -6,11 +6,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from evaweb.blinding import visibility_for_user
+from evaweb.blinding.visibility import visibility_for_user
 from evaweb.console.event_ingest import ingest_events
 from evaweb.console.feed import History
+from evaweb.core.errors import Conflict
 from evaweb.episodes.models import Episode
-from evaweb.errors import Conflict
 from evaweb.jobs.models import Job
 from evaweb.plans import bench_checks as looking
 from evaweb.plans.allocation import allocate_trial, plan_progress

@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.db import OperationalError
 
 from evaweb.api.trials import TrialDetail
-from evaweb.blinding import FULL_VISIBILITY
+from evaweb.blinding.visibility import FULL_VISIBILITY
 from evaweb.episodes import reconcile as reconciling
 from evaweb.episodes.models import Episode, EpisodeStatus
 from evaweb.episodes.reconcile import reconcile

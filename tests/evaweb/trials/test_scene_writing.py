@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from django.contrib.admin.models import LogEntry
 
-from evaweb.errors import Conflict, NotAllowed
+from evaweb.core.errors import Conflict, NotAllowed
 from evaweb.plans.models import Plan, Reference
 from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Station

@@ -3,9 +3,9 @@ from datetime import timedelta
 import pytest
 from django.utils import timezone
 
+from evaweb.core.errors import EvaError, NotFound
 from evaweb.episodes.models import Episode
 from evaweb.episodes.services import trial_changed
-from evaweb.errors import EvaError, NotFound
 from evaweb.trials import selectors, services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from evaweb.trials.selectors import TrialFilters

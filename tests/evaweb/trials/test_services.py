@@ -6,11 +6,16 @@ import pytest
 from django.db import IntegrityError, connection, transaction
 from django.db.models import ProtectedError
 
-from evaweb import journal as disk
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.episodes.models import Episode
 from evaweb.episodes.selectors import why_unrecorded
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job
+from evaweb.records import journal as disk
 from evaweb.trials import services, voids
 from evaweb.trials.lifecycle import TRANSITIONS, Transition
 from evaweb.trials.models import Checkpoint, Evaluation, Milestone, Position, Score, Trial, TrialStatus

@@ -3,7 +3,7 @@ from uuid import uuid4
 
 import pytest
 
-from evaweb.errors import Conflict, EvaError, NotAllowed
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.stations.models import Command
 from evaweb.stations.runtime_client import NoAnswer
 from evaweb.trials import services, voids

@@ -33,7 +33,7 @@ import json
 from django.db import connection
 from evaweb.episodes.models import Episode
 from evaweb.plans.models import Plan
-from evaweb.canonical import digest
+from evaweb.core.canonical_json import digest
 from evaweb.trials.models import Score
 with connection.cursor() as cursor:
     tables = connection.introspection.table_names(cursor)

@@ -8,7 +8,7 @@ from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 from evaweb.api.tokens import DAYS, MOST_DAYS, create_token
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 
 
 class Command(BaseCommand):

@@ -30,9 +30,9 @@ class Command(BaseCommand):
         from evaweb.asgi import application  # imported here, after the models are loaded
         from evaweb.console import server
         from evaweb.console.event_ingest import EventIngest
-        from evaweb.errors import EvaError
+        from evaweb.core.errors import EvaError
         from evaweb.jobs.workers import lab_folder_named
-        from evaweb.listening import PortTaken, open_listener
+        from evaweb.serving.listeners import PortTaken, open_listener
 
         try:
             listener = open_listener(host, port)

@@ -43,8 +43,8 @@ class Command(BaseCommand):
         from evaweb.api.stop_gateway import stop_application  # imported here, after the models are loaded
         from evaweb.console import server
         from evaweb.console.connection_limits import StopRequest
-        from evaweb.listening import PortTaken, open_listener
-        from evaweb.stop_port import StopPort
+        from evaweb.serving.listeners import PortTaken, open_listener
+        from evaweb.serving.stop_port import StopPort
 
         beside = None
         try:

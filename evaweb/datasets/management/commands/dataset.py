@@ -9,6 +9,7 @@ from uuid import UUID
 
 from django.core.management.base import BaseCommand, CommandError
 
+from evaweb.core.errors import EvaError
 from evaweb.datasets import dataset_jobs
 from evaweb.datasets.dataset_orders import full_name
 from evaweb.datasets.importing import import_dataset
@@ -17,7 +18,6 @@ from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.episodes.folders import data_dir
 from evaweb.episodes.job_kinds import publish_episode
 from evaweb.episodes.models import Episode
-from evaweb.errors import EvaError
 from evaweb.jobs.kinds import JobContext
 from runtime.datasets.__main__ import add_commands, renamed
 from runtime.recording.files import RecordingError

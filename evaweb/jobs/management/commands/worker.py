@@ -8,7 +8,7 @@ from typing import Any
 from django.core.checks import Tags
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.jobs import worker
 from evaweb.jobs.kinds import Queue
 from evaweb.jobs.workers import queue_names

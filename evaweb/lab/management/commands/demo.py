@@ -15,8 +15,9 @@ from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
 import robots
-from evaweb.binary_frames import to_json_value
-from evaweb.errors import EvaError
+from evaweb.accounts.roles import Role
+from evaweb.core.binary_frames import to_json_value
+from evaweb.core.errors import EvaError
 from evaweb.lab import demo_rows, plan_runner, programs
 from evaweb.lab.benches import Bench
 from evaweb.lab.demo_rows import DemoLogin
@@ -30,7 +31,6 @@ from evaweb.plans.models import Allocation, Plan, StoppingRule
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.caching import cached_analysis
 from evaweb.results.presentation.headline import headline
-from evaweb.roles import Role
 from evaweb.trials.models import Checkpoint
 
 _DEPLOYMENTS = settings.BASE_DIR / "deployments"

@@ -9,7 +9,7 @@ from typing import Any
 from django.contrib.auth.models import AnonymousUser
 from django.core.management.base import BaseCommand, CommandError
 
-from evaweb.blinding import FULL_VISIBILITY
+from evaweb.blinding.visibility import FULL_VISIBILITY
 from evaweb.lab.diagnosis import bundle
 
 

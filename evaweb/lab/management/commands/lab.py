@@ -9,7 +9,7 @@ from typing import Any
 from django.conf import settings
 from django.core.management.base import BaseCommand, CommandError
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.lab import first_account
 from evaweb.lab.benches import Bench
 from evaweb.lab.demo_rows import has_no_accounts

@@ -8,8 +8,8 @@ from typing import Any
 
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
+from evaweb.core.languages import parse
 from evaweb.lab import sentences
-from evaweb.languages import parse
 
 
 class Command(BaseCommand):

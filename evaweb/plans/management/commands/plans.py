@@ -9,7 +9,7 @@ from typing import Any
 from django.contrib.auth.models import User
 from django.core.management.base import BaseCommand, CommandError, CommandParser
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.plans.models import Plan
 from evaweb.plans.references import unpacked
 from evaweb.plans.toml_exchange import export_archive, export_toml, import_file

@@ -8,7 +8,7 @@ from typing import Any
 
 from django.core.management.base import BaseCommand, CommandError
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results.reports.reporting import write_report
 from evaweb.results.selectors import plan_get
 

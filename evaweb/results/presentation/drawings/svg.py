@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from html import escape as html_escape
 from itertools import count
 
+from evaweb.core.tabular_export import iter_csv
 from evaweb.statistics.proportions import Proportion
-from evaweb.tabular_export import iter_csv
 
 SERIES = 8  # series with a style of their own; further ones start again
 LINE = 15.0  # line spacing of a label

@@ -13,9 +13,9 @@ from contextlib import closing
 import pytest
 from django.core.management import CommandError, call_command
 
+from evaweb.core.file_checks import data_is_whole
 from evaweb.lab.backups import backup, databases
 from evaweb.lab.backups.errors import BackupError
-from evaweb.private import data_is_whole
 from tests import migrated
 
 OURS = {name: value for name, value in os.environ.items() if not name.startswith(("EVA_", "DJANGO_"))}

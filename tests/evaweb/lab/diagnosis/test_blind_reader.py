@@ -1,10 +1,10 @@
-"""A bundle of the lab of tests/evaweb/test_blinding.py, whose runtime says secrets wherever it can."""
+"""A bundle of the lab of tests/evaweb/blinding/test_visibility.py, whose runtime says secrets wherever it can."""
 
 import zipfile
 
 import pytest
 
-from evaweb.blinding import visibility_for_user
+from evaweb.blinding.visibility import visibility_for_user
 from evaweb.lab.diagnosis import bundle
 from evaweb.plans.blinding_rules import record_unblinding
 from tests.evaweb.blind_lab import NAMES, SECRETS, BlindLab

@@ -8,7 +8,7 @@ from django.contrib.auth.models import AnonymousUser
 from django.core.management import CommandError, call_command
 from django.db import OperationalError
 
-from evaweb.blinding import FULL_VISIBILITY, HIDDEN, Visibility
+from evaweb.blinding.visibility import FULL_VISIBILITY, HIDDEN, Visibility
 from evaweb.jobs.kinds import JobContext, kind_named
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.lab.diagnosis import bundle, contents

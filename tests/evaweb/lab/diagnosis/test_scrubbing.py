@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from evaweb.blinding import HIDDEN
+from evaweb.blinding.visibility import HIDDEN
 from evaweb.lab.diagnosis.scrubbing import REMOVED, Scrubber, known_secrets
 
 SECRET = "Zq7-planted-9x"

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results.judges.base import (
     CaseJudgement,
     MilestoneJudgement,

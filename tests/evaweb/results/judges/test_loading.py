@@ -5,7 +5,7 @@ from types import ModuleType
 
 import pytest
 
-from evaweb.errors import EvaError
+from evaweb.core.errors import EvaError
 from evaweb.results import judges
 from evaweb.results.judges.base import (
     CaseJudgement,

@@ -11,8 +11,6 @@ from django.test import Client
 from django.test.utils import CaptureQueriesContext
 from django.utils import timezone
 
-from evaweb import computing
-from evaweb.computing import Questions
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
 from evaweb.plans.services import close_plan
@@ -20,6 +18,8 @@ from evaweb.results.analysis import caching
 from evaweb.results.presentation.facts import comparison_facts
 from evaweb.results.ratings import rating_queue
 from evaweb.results.selectors import PlanRow
+from evaweb.serving import computations
+from evaweb.serving.computations import Questions
 from evaweb.trials import services, voids
 from evaweb.trials.models import Checkpoint, Trial
 from tests.evaweb.trials import builders
@@ -446,7 +446,7 @@ def test_the_planner_answers_and_names_what_is_not_allowed(as_, viewer):
 
 def test_the_planner_shows_its_form_at_once_and_asks_again_by_itself(as_, viewer, monkeypatch):
     never = Questions(lambda work, *given: (work(*given), 0.0), soon_s=0)
-    monkeypatch.setattr(computing, "questions", never)
+    monkeypatch.setattr(computations, "questions", never)
     client, address = as_(viewer), "/result/planner/?rate=0.5&better=0.7"
     answer = client.get(address)
     assert (answer.status_code, "Computing" in answer.content.decode()) == (200, True)

@@ -7,11 +7,16 @@ import pytest
 from django.db import DatabaseError, transaction
 from django.urls import reverse
 
-from evaweb.canonical import digest
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import (
+    Conflict,
+    EvaError,
+    NotAllowed,
+    NotFound,
+)
 from evaweb.episodes.folders import preview_folder, scores_file
 from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
-from evaweb.errors import Conflict, EvaError, NotAllowed, NotFound
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import cancel, retry_job, run_queue
 from evaweb.plans.commitment import make_commitment

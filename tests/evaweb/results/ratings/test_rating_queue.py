@@ -2,13 +2,13 @@ from datetime import timedelta
 
 import pytest
 
-from evaweb import journal as lines
+from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.episodes.folders import journal_folder, preview_folder
 from evaweb.episodes.models import Episode
-from evaweb.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan
+from evaweb.records import journal as lines
 from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.ratings import rating_queue

@@ -7,8 +7,8 @@ import pytest
 from evaweb.episodes.folders import scores_file
 from evaweb.episodes.publishing import success_of
 from evaweb.episodes.reconcile import reconcile
-from evaweb.journal import read_numbered_lines
 from evaweb.plans.models import Plan
+from evaweb.records.journal import read_numbered_lines
 from evaweb.results.analysis.agreement import preference_ranking, rater_agreement
 from evaweb.results.models import Preference, Rating
 from evaweb.results.ratings import rating_queue

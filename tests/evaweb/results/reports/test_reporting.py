@@ -9,8 +9,8 @@ import sys
 import pytest
 from django.core.management import CommandError, call_command
 
-from evaweb.canonical import digest
-from evaweb.errors import Conflict
+from evaweb.core.canonical_json import digest
+from evaweb.core.errors import Conflict
 from evaweb.plans import image_store
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Achieved, Plan, Reference

@@ -1,0 +1,1 @@
+"""Accounts: roles, credentials, passwords, cookies and the audit of logins."""

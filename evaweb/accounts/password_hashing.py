@@ -1,0 +1,51 @@
+"""Password hashing in one low-priority thread, so that many simultaneous logins do not delay a stop.
+
+A hash takes half a second of CPU time. Addresses take turns; if too many logins wait, the address with the most is
+asked to try again.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from functools import partial
+
+from django.contrib.auth.hashers import PBKDF2PasswordHasher
+
+from evaweb.accounts.client_addresses import SHARE
+from evaweb.accounts.lookup_pool import FairLookupPool, LookupQueueFull
+from evaweb.core.errors import EvaError
+from runtime.core.sentences import fixed
+
+_TOO_MANY_PASSWORDS_BEING_CHECKED = fixed(
+    "web.hashing.too_many_passwords_being_checked",
+    "too many passwords are being checked: try again in a few seconds",
+)
+
+_MOST_WAITING = 16
+_NICE = 10
+
+
+class HashingOverload(EvaError):
+    """Too many passwords are being checked."""
+
+    status = 503
+    retry_after_s = 5
+
+
+def _give_way() -> None:
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # on Linux this affects the thread only
+
+
+_turns: FairLookupPool[str] = FairLookupPool(1, _MOST_WAITING, "passwords", _give_way)
+
+
+class QueuedHasher(PBKDF2PasswordHasher):
+    """Django's PBKDF2 hashes, computed in one thread of this process."""
+
+    def encode(self, password: str, salt: str, iterations: int | None = None) -> str:
+        """Return the hash. Raises: HashingOverload if too many are waiting."""
+        try:
+            return _turns.submit(SHARE.get(), partial(super().encode, password, salt, iterations)).result()
+        except LookupQueueFull:
+            raise HashingOverload(_TOO_MANY_PASSWORDS_BEING_CHECKED) from None

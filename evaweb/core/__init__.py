@@ -1,0 +1,1 @@
+"""Ground of the web: errors, environment, files and text; no models."""

@@ -1,0 +1,325 @@
+"""Append-only files with one line per record, written before the database row, from which the row can be restored.
+
+A `Line` declares the fields of a record: it is written from a row, validated when read, and converted back to the
+values of a row. A `Journal` is a folder with one file of lines per episode, trial or session.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import Enum
+from functools import cache
+from io import FileIO
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, Union
+from uuid import UUID
+
+from django.conf import settings
+from django.db.models import Model
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+)
+
+from evaweb.accounts.roles import get_or_create_person
+from evaweb.core.errors import EvaError
+from runtime.core.sentences import Pattern
+from runtime.recording.files import RecordingError
+
+log = logging.getLogger(__name__)
+_CONTAINS_CHARACTER_U_0000_WHICH = Pattern(
+    "web.journal.contains_character_u_0000_which",
+    "{name} contains the character U+0000, which no database keeps: remove it",
+)
+_HAS_CHARACTERS_ALLOWED_AT_MOST = Pattern(
+    "web.journal.has_characters_allowed_at_most",
+    "{name} has {count} characters; allowed: at most {longest}",
+)
+_ITS_IS_OF = Pattern("web.journal.its_is_of", "its {verbose_name} {uuid} is of {belongs} {other}")
+_NOT_KEPT = Pattern("web.journal.not_kept", "not kept: {strerror} ({path}); {done}")
+
+
+class NotWritten(EvaError):
+    """The disk refused the line, and so the database was not changed either."""
+
+    status = 507
+
+
+def clean_text(name: str, given: str, longest: int) -> str:
+    """Return typed text without surrounding blanks. Raises: EvaError if it is too long or contains NUL."""
+    if "\x00" in given:
+        raise EvaError(_CONTAINS_CHARACTER_U_0000_WHICH(name=name))
+    stripped = given.strip()
+    if len(stripped) > longest:
+        raise EvaError(_HAS_CHARACTERS_ALLOWED_AT_MOST(name=name, count=len(stripped), longest=longest))
+    return stripped
+
+
+# --- one line ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RowPath:
+    """Query path to the row attribute that a field of a line holds, such as `rater__username`; "" for its own name."""
+
+    path: str
+
+
+def _moment(given: Any) -> datetime:
+    """Parse a time in ISO 8601 with a zone, in years that every time zone can represent."""
+    found = datetime.fromisoformat(given) if isinstance(given, str) else None
+    if found is None or found.tzinfo is None or not 1900 <= found.year <= 9998:
+        raise ValueError("allowed: date and time of ISO 8601 with a time zone, in the years 1900 to 9998")
+    return found
+
+
+def _storable(value: Any) -> Any:
+    """Return `value` if both databases can store it. Raises: ValueError."""
+    if isinstance(value, str) and "\x00" in value:
+        raise ValueError("it contains the character U+0000, which no database keeps")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("it contains a number that is not finite")
+    inner = (*value, *value.values()) if isinstance(value, dict) else value
+    for each in inner if isinstance(inner, list | tuple) else ():
+        _storable(each)
+    return value
+
+
+Person = Annotated[str, Field(min_length=1, max_length=150)]
+Moment = Annotated[datetime, PlainValidator(_moment)]
+
+
+class Line(BaseModel):
+    """Record as plain JSON, as this program wrote it. Fields added later have a default; unknown fields are ignored."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
+    ELSEWHERE: ClassVar[frozenset[str]] = frozenset({"kind"})  # fields without a column in the row
+
+    @field_validator("*")
+    @classmethod
+    def _kept(cls, value: Any) -> Any:
+        return _storable(value)
+
+    @classmethod
+    def path_of(cls, name: str) -> str:
+        """Return the query path of field `name` from the row."""
+        found = (each.path for each in cls.model_fields[name].metadata if isinstance(each, RowPath))
+        return next(found, "") or name
+
+    @classmethod
+    def names(cls) -> Iterable[str]:
+        """Return the names of the written fields, in order."""
+        return cls.model_fields
+
+    @classmethod
+    def written(cls, row: Any, **given: Any) -> dict[str, Any]:
+        """Return the line of a row that is about to be saved; `given` are values that the row does not have."""
+        return {
+            name: given[name] if name in given else to_json_value(cls._value(row, name))
+            for name in cls.names()
+        }
+
+    @classmethod
+    def _value(cls, row: Any, name: str) -> Any:
+        field = cls.model_fields[name]
+        if name in cls.ELSEWHERE:
+            return field.default
+        value = resolve_path(row, cls.path_of(name))
+        nested = field.annotation
+        return (
+            nested.written(value)
+            if isinstance(nested, type) and issubclass(nested, Line) and value
+            else value
+        )
+
+    def to_row_values(self) -> dict[str, Any]:
+        """Return the values of the row, with people as accounts; values stored in other rows are omitted."""
+        found = {}
+        for name in type(self).names():
+            field, _, further = type(self).path_of(name).partition("__")
+            value = getattr(self, name)
+            if further == "username":
+                found[field] = get_or_create_person(value)
+            elif not further and name not in self.ELSEWHERE and not isinstance(value, Line):
+                found[field] = value
+        return found
+
+
+def resolve_path(row: Any, path: str) -> Any:
+    """Return the value at a query path from `row`; None if an object on the path is None or missing."""
+    for name in path.split("__"):
+        row = getattr(row, name, None) if row is not None else None
+    return row
+
+
+def to_json_value(value: Any) -> Any:
+    """Return a time, enumeration or UUID as JSON value; others unchanged."""
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, Enum):
+        return value.value
+    return str(value) if isinstance(value, UUID) else value
+
+
+AnyLine = TypeVar("AnyLine", bound=Line)
+
+
+def missing_rows(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list[AnyLine]:
+    """Return the lines without a database row; of lines with the same uuid only the last.
+
+    Raises: EvaError if such a row belongs to another owner.
+    """
+    ((belongs, whose),) = owner.items()
+    last = {line.uuid: line for line in lines}  # type: ignore[attr-defined]
+    rows = dict(model._default_manager.filter(uuid__in=last).values_list("uuid", belongs))
+    for uuid, other in rows.items():
+        if other != whose.pk:
+            raise EvaError(
+                _ITS_IS_OF(verbose_name=model._meta.verbose_name, uuid=uuid, belongs=belongs, other=other)
+            )
+    return [line for uuid, line in last.items() if uuid not in rows]
+
+
+# --- the files ---------------------------------------------------------------------------------------------
+
+_kinds: dict[str, tuple[type[Line], ...]] = {}  # by folder; several journals may share its files
+
+
+class Journal(Generic[AnyLine]):
+    """Lines of the given kinds in the files DATA/`folder`/<uuid>.jsonl."""
+
+    def __init__(self, folder: str, *kinds: type[AnyLine]) -> None:
+        self.folder = folder
+        _kinds[folder] = (*_kinds.get(folder, ()), *kinds)
+
+    def path(self, uuid: UUID) -> Path:
+        """Return the file of one episode, trial or session."""
+        return Path(settings.DATA_DIR) / self.folder / f"{uuid}.jsonl"
+
+    def append(self, uuid: UUID, line: Mapping[str, Any]) -> None:
+        """Append one line and wait until it is on the disk; hold a row lock. Raises: NotWritten."""
+        append_line(self.path(uuid), line)
+
+    def read(self, uuid: UUID, say: Callable[[str], None]) -> list[AnyLine]:
+        """Return all valid lines of the file, oldest first, including those of other journals in the folder.
+
+        A truncated or invalid line is skipped: `say` is called with file, line number and field.
+        """
+        path, found, lines = self.path(uuid), [], _reader(_kinds[self.folder])
+        for number, line in read_numbered_lines(path):
+            try:
+                found.append(lines.validate_json(line))
+            except ValidationError as error:
+                say(f"{path}: line {number} {_wrong(error)}")
+        return found
+
+
+@cache
+def _reader(kinds: tuple[type[Line], ...]) -> TypeAdapter[Any]:
+    either = Union[kinds]  # noqa: UP007  made of a list
+    return TypeAdapter(Annotated[either, Field(discriminator="kind")] if len(kinds) > 1 else either)
+
+
+def folders() -> list[str]:
+    """Return the folders of all journals."""
+    return sorted(_kinds)
+
+
+def parse_model(model: type[AnyLine], content: Mapping[str, Any], what: str) -> AnyLine:
+    """Return `content` as an instance of `model`. Raises: EvaError with `what` and the first problem."""
+    try:
+        return model.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        raise EvaError(f"{what} {_wrong(error)}") from None
+
+
+def _wrong(error: ValidationError) -> str:
+    """Return the first problem of a line, to be appended to its name."""
+    first = error.errors()[0]
+    if first["type"] == "json_invalid":
+        why, _, _ = first["ctx"]["error"].partition(" at line ")
+        return f"is not whole and was left out: {why}"
+    place = ".".join(map(str, first["loc"]))
+    return f"was left out: {place}{' is ' if place else ''}{first['input']!r:.80}: {first['msg']}"
+
+
+def append_line(path: Path, line: Mapping[str, Any]) -> None:
+    """Append one line and sync it to the disk; a line torn by an earlier crash stays a separate line.
+
+    The caller holds a database row, so that there is one writer at a time.
+    Raises: NotWritten, which states whether a partly written line was removed.
+    """
+    text = json.dumps(
+        line, allow_nan=False, separators=(",", ":")
+    )  # ASCII output: line separators are escaped
+    done = "nothing was changed"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab+", buffering=0) as file:
+            before = file.seek(0, os.SEEK_END)
+            try:
+                _written(file, text.encode() + b"\n")
+            except OSError:
+                done = _truncate_back(file, before)
+                raise
+    except OSError as error:
+        raise NotWritten(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
+
+
+def _written(file: FileIO, payload: bytes) -> None:
+    new = file.tell() == 0
+    if not new:
+        file.seek(
+            -1, os.SEEK_END
+        )  # a crash may have torn the last line: end it, so that only that one is lost
+        payload = payload if file.read(1) == b"\n" else b"\n" + payload
+    while payload:
+        payload = payload[file.write(payload) :]
+    os.fsync(file.fileno())
+    if new:
+        folder = Path(file.name).parent
+        _sync_folder(folder)
+        _sync_folder(folder.parent)
+
+
+def _truncate_back(file: FileIO, before: int) -> str:
+    """Restore the file's length; return the fate of the line as text for the error message."""
+    try:
+        file.truncate(before)
+        os.fsync(file.fileno())
+    except OSError:
+        log.exception("%s could not be made as long as it was", file.name)
+        return "what was written could not be taken back: the next reconcile may take it for said"
+    return "nothing was changed"
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def read_numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield the non-empty lines with their numbers from 1; none if absent. Raises: RecordingError if unreadable."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+    for number, line in enumerate(data.split(b"\n"), start=1):
+        if line.strip():
+            yield number, line

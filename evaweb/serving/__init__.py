@@ -1,0 +1,1 @@
+"""Serving of requests: listeners, limits, headers, error pages, lists and downloads."""

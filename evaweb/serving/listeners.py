@@ -1,0 +1,30 @@
+"""Listening sockets, opened by the server or by the lab, which keeps them open while the server restarts."""
+
+from __future__ import annotations
+
+import socket
+
+from evaweb.core.errors import EvaError
+
+_BACKLOG = 4096  # beyond it a client's connection attempt is repeated after a second
+
+
+class PortTaken(EvaError):
+    """The address cannot be listened on, usually because the port is in use."""
+
+
+def open_listener(host: str, port: int) -> socket.socket:
+    """Return a non-blocking listening TCP socket; port 0 picks a free port. Raises: PortTaken with advice."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(_BACKLOG)
+    except OSError as error:
+        listener.close()
+        raise PortTaken(
+            f"cannot listen on {host}:{port}: {error.strerror}; name another address or port with --host, --port"
+        ) from None
+    listener.setblocking(False)
+    return listener

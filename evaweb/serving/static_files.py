@@ -1,0 +1,135 @@
+"""Static files served from memory, compressed once, at URLs that contain a digest of all files.
+
+A browser does not request a file again that it has: a page has about a hundred of them. After an upgrade the URLs
+differ, so that no page mixes files of two versions.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import hashlib
+import mimetypes
+import re
+import time
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from django.core.exceptions import SuspiciousFileOperation
+
+from evaweb.serving.headers import DEFAULT_HEADERS
+
+_PREFIX = "/static/"
+_DIGEST = re.compile(r"([0-9a-f]{16})/")
+_KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".json": "application/json"}
+_SMALL = 64 * 1024  # largest file that is compressed in the event loop [bytes]; others in a thread
+_KEPT, _ASKED = b"max-age=31536000, public, immutable", b"max-age=0, public"
+_POLICY = b"default-src 'self'"  # for scripts that run as workers
+
+
+def digest_of(folders: Iterable[Path], *versions: str) -> str:
+    """Return a digest [16 hex digits] of all files in `folders` and of the versions of packages with static files."""
+    found = hashlib.sha256("\n".join(versions).encode())
+    for folder in folders:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            found.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    return found.hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class _File:
+    """File ready for sending; `packed` is empty if gzip does not shrink it.
+
+    `changed`: modification time; a file newer than the process may differ from the content that the digest stands for.
+    """
+
+    content: bytes
+    packed: bytes
+    headers: list[tuple[bytes, bytes]]
+    tag: bytes
+    changed: float
+
+
+class StaticFiles:
+    """ASGI middleware that serves static files and passes all other requests on.
+
+    `digest` is part of the URLs in pages; responses to such URLs may be cached forever. If it is empty, as during
+    development, each file is read anew.
+    """
+
+    def __init__(self, application: Callable[..., Awaitable[Any]], digest: str) -> None:
+        self._application, self._digest, self._began = application, digest, time.time()
+        self._files: dict[str, _File] = {}
+
+    async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
+        path: str = scope["path"]
+        name = path.removeprefix(_PREFIX)
+        asked = _DIGEST.match(name)
+        file = None
+        if path.startswith(_PREFIX) and scope["method"] in ("GET", "HEAD"):
+            file = await self._file(name[asked.end() :] if asked else name)
+        if file is None:
+            await self._application(scope, receive, send)
+        else:
+            current = asked is not None and asked[1] == self._digest and file.changed < self._began
+            await _answer(scope, send, file, _KEPT if current else _ASKED)
+
+    async def _file(self, name: str) -> _File | None:
+        if (kept := self._files.get(name)) is not None:
+            return kept
+        if (path := _found(name)) is None:
+            return None
+        content = path.read_bytes()
+        if len(content) > _SMALL:
+            file = await asyncio.to_thread(_made, path, content)
+        else:
+            file = _made(path, content)
+        if self._digest:
+            self._files[name] = file
+        return file
+
+
+def _found(name: str) -> Path | None:
+    from django.contrib.staticfiles import finders
+
+    try:
+        found = finders.find(name) if name else None
+    except (SuspiciousFileOperation, ValueError):  # a path outside the folder, or with a NUL
+        return None
+    return Path(found) if isinstance(found, str) and Path(found).is_file() else None
+
+
+def _made(path: Path, content: bytes) -> _File:
+    kind = _KINDS.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+    text = kind.startswith("text/") or kind in _KINDS.values()
+    packed = gzip.compress(content, 6, mtime=0) if text else b""
+    headers = [
+        (b"content-type", f"{kind}; charset=utf-8".encode() if text else kind.encode()),
+        (b"vary", b"Accept-Encoding"),
+    ]
+    tag = b'"%s"' % hashlib.sha256(content).hexdigest()[:32].encode()
+    return _File(content, packed if len(packed) < len(content) else b"", headers, tag, path.stat().st_mtime)
+
+
+async def _answer(scope: dict[str, Any], send: Any, file: _File, keeping: bytes) -> None:
+    given = dict(scope["headers"])
+    packs = bool(file.packed) and b"gzip" in given.get(b"accept-encoding", b"")
+    tag = file.tag[:-1] + b'-gzip"' if packs else file.tag
+    headers = [*file.headers, (b"cache-control", keeping), (b"etag", tag)]
+    if tag in given.get(b"if-none-match", b""):
+        await _send(send, 304, headers)
+        return
+    content = file.packed if packs else file.content
+    if packs:
+        headers.append((b"content-encoding", b"gzip"))
+    headers.append((b"content-length", b"%d" % len(content)))
+    await _send(send, 200, headers, content if scope["method"] == "GET" else b"")
+
+
+async def _send(send: Any, status: int, headers: list[tuple[bytes, bytes]], content: bytes = b"") -> None:
+    told = dict(DEFAULT_HEADERS) | {b"content-security-policy": _POLICY} | dict(headers)
+    await send({"type": "http.response.start", "status": status, "headers": list(told.items())})
+    await send({"type": "http.response.body", "body": content})
