@@ -25,7 +25,7 @@ import robots
 from benchmarks.labs import ROOT
 from benchmarks.wires_relay import Relay
 from robots import Robot
-from runtime.core import malloc as heap
+from runtime.core import process_limits as heap
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import ConfigurationError
 from runtime.core.plugins import variants

@@ -19,7 +19,7 @@ from typing import Any
 import robots
 from robots import Robot
 from runtime.cameras.attach import attach_cameras
-from runtime.core import malloc as heap
+from runtime.core import process_limits as heap
 from runtime.core.clock import Clock, MonotonicClock, VirtualClock
 from runtime.core.plugins import variants
 from runtime.core.types import Observation

@@ -16,8 +16,8 @@ from channels.sessions import CookieMiddleware
 from django.conf import settings
 
 from evaweb.api.stop_gateway import StopGateway
-from evaweb.console.origins import SameOrigin
 from evaweb.console.routing import websocket_urlpatterns
+from evaweb.serving.origins import SameOrigin
 from evaweb.serving.request_limiter import RequestLimiter
 from evaweb.serving.static_files import StaticFiles
 

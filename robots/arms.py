@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from robots.chain import Chain
-from robots.copies import copy_of, urdf_copies
 from robots.description import GroupTable
-from robots.errors import RobotError
-from robots.refusals import error_context
-from robots.robot import Group
+from robots.errors import RobotError, error_context
+from robots.robot import Group, copy_of, urdf_copies
 from robots.urdf import Urdf
 
 

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from robots import urdf
 from robots.chain import motion_table, motions
-from robots.copies import urdf_copies
 from robots.errors import RobotError
-from robots.robot import Group, Robot
+from robots.robot import Group, Robot, urdf_copies
 from robots.rotations import Float64, transform_of
 from robots.urdf import Joint, Urdf
 

@@ -2,6 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robots.urdf import Urdf
+
 
 class RobotError(Exception):
     """A robot's folder is missing or wrong; the message names file and key, the given value, and what is allowed."""
+
+
+@contextmanager
+def error_context(key: str) -> Iterator[None]:
+    """Prefix errors that are raised inside with the key that refers to the URDF."""
+    try:
+        yield
+    except RobotError as error:
+        raise RobotError(f"{key}: {error}") from error
+
+
+def reject_duplicates(file: Path, key: str, given: list[str]) -> None:
+    twice = sorted({name for name in given if given.count(name) > 1})
+    if twice:
+        raise RobotError(f"{file}: {key}: {', '.join(twice)} more than once; each is allowed once")
+
+
+def check_movers(key: str, tree: Urdf, names: Iterable[str]) -> None:
+    for name in names:
+        with error_context(key):
+            joint = tree.joint(name)
+        if joint.kind == "fixed" or joint.mimic is not None:
+            raise RobotError(f"{key}: {name} is fixed or a mimic; allowed: joints that move by themselves")

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from robots.description import GripperTable, GroupTable
-from robots.errors import RobotError
+from robots.errors import RobotError, check_movers
 from robots.places import unit_quaternion
-from robots.refusals import check_movers
 from robots.robot import Gripper
 from robots.rotations import Float64, matrix_of_quaternion
 from robots.urdf import Urdf

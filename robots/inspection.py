@@ -12,10 +12,9 @@ import numpy as np
 from robots import description, urdf
 from robots.body import Body
 from robots.clearance import collision_problems
-from robots.copies import urdf_copies
 from robots.description import GroupTable, OverrideTable, RobotTable, RosGroupTable
 from robots.loading import load_robot, load_robot_with_optional_groups
-from robots.robot import Group, Robot
+from robots.robot import Group, Robot, urdf_copies
 from robots.rotations import Float64
 from robots.urdf import Urdf
 from robots.visuals import scene_of

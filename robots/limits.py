@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robots.description import GroupTable, OverrideTable
-from robots.errors import RobotError
-from robots.refusals import reject_duplicates
+from robots.errors import RobotError, reject_duplicates
 from robots.urdf import Urdf
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from robots import description, urdf
 from robots.arms import build_arm_chain, check_arm, check_mounts
 from robots.description import TABLE, GroupTable, RobotTable
-from robots.errors import RobotError
+from robots.errors import RobotError, check_movers, reject_duplicates
 from robots.grippers import (
     GripperChoice,
     apply_gripper_choices,
@@ -20,7 +20,6 @@ from robots.grippers import (
 )
 from robots.limits import group_limits
 from robots.places import pose_vector, read_only
-from robots.refusals import check_movers, reject_duplicates
 from robots.robot import Camera, Group, Robot
 from robots.rotations import Float64
 from robots.urdf import Urdf

@@ -24,7 +24,7 @@ from runtime.core.clock import Clock, VirtualClock
 from runtime.core.errors import PolicyLostError
 from runtime.core.types import EEF_WIDTH, ActionChunk, Conditioning, Float64, Observation
 from runtime.ipc.session_state import SessionState
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.motion.timeline import difference
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.processes.coordinator.inference.runners import LockstepRunner

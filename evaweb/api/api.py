@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from typing import Any
 
+from django.conf import settings
 from django.db import IntegrityError, InterfaceError, InternalError, OperationalError
 from django.http import Http404, HttpRequest, HttpResponse
 from ninja import NinjaAPI
@@ -141,3 +143,9 @@ def _taken(request: HttpRequest, fault: IntegrityError) -> HttpResponse:
 
 def _failure(request: HttpRequest, sentence: str, status: int) -> HttpResponse:
     return api.create_response(request, refusal(sentence), status=status)
+
+
+def openapi_snapshot() -> str:
+    """Return the document sorted and indented for readable differences, with a neutral name of the session cookie."""
+    said = json.dumps(api.get_openapi_schema(path_prefix="/api/v1/"), indent=1, sort_keys=True) + "\n"
+    return said.replace(settings.SESSION_COOKIE_NAME, "eva_session_LAB")

@@ -14,6 +14,6 @@ class ApiConfig(AppConfig):
         """Connect the receiver of password changes, and name the app that counts failed logins."""
         from django.apps import apps
 
-        from evaweb.api import passwords  # noqa: F401  its receiver
+        from evaweb.api import tokens  # noqa: F401  its receiver
 
         apps.get_app_config("axes").verbose_name = "Failed logins"

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import secrets
+from collections.abc import Iterable
 from datetime import timedelta
 from typing import Any
 
 from django.contrib.auth.models import User
 from django.db import IntegrityError, OperationalError, transaction
-from django.db.models.signals import post_delete
+from django.db.models.signals import post_delete, pre_save
 from django.dispatch import receiver
 from django.utils import timezone
 
@@ -102,3 +103,28 @@ def _withdrawn(instance: Token, **named: Any) -> None:
 
 credentials.register_kind(TOKEN, lambda secret: user_of_token(secret=secret))
 credentials.register_kind(EXPIRED_ALLOWED[TOKEN], lambda secret: user_of_token(secret=secret, ended=True))
+
+
+@receiver(pre_save, sender=User)
+def _ended(
+    sender: Any, instance: User, raw: bool, update_fields: Iterable[str] | None = None, **named: Any
+) -> None:
+    """Delete the tokens of an account whose password changes, or that is deactivated."""
+    fields = {"password", "is_active"} if update_fields is None else set(update_fields)
+    if raw or instance.pk is None or not fields & {"password", "is_active"}:
+        return
+    before = User.objects.filter(pk=instance.pk).values("password", "is_active").first()
+    if before is None:
+        return
+    name = instance.get_username()
+    if instance.password != before["password"] and not _hashed_anew(instance, fields):
+        log.info("the password of %a is changed", name)
+        revoke_tokens(user=instance, why="the password is changed")
+    if before["is_active"] and not instance.is_active:
+        log.info("%a is switched off", name)
+        revoke_tokens(user=instance, why="the account is switched off")
+
+
+def _hashed_anew(user: User, fields: set[str]) -> bool:
+    """Return True if Django only updates the hash of the same password at a login."""
+    return fields == {"password"} and user._password is None and user.has_usable_password()

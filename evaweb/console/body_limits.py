@@ -24,7 +24,7 @@ from twisted.internet.threads import deferToThread
 from evaweb.accounts.cookies import session_keys
 from evaweb.accounts.roles import Role
 from evaweb.console.early_refusals import is_stop, raw_refusal, refusal
-from evaweb.console.logins import current_role
+from evaweb.console.viewers import current_role
 from evaweb.plans.references import LARGEST
 from evaweb.serving.body_limits import body_limit_for
 from runtime.ipc import estop_requests as pressing

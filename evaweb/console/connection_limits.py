@@ -22,7 +22,7 @@ from twisted.protocols.policies import ProtocolWrapper, WrappingFactory
 
 from evaweb.console.body_limits import BoundedRequest, stop_bound_of
 from evaweb.console.early_refusals import Channel, is_stop
-from evaweb.console.turns import TurnScheduler
+from evaweb.console.flow_control import TurnScheduler
 
 events: Any = reactor
 WHOLE_REQUEST_S = 15.0  # limit for the first request of a connection

@@ -32,12 +32,12 @@ from evaweb.accounts.roles import Role, role_of
 from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility, visibility_for_user
 from evaweb.console import requests
 from evaweb.console.aim_queries import AimQueries
+from evaweb.console.flow_control import PER_SECOND, MessageQuota
 from evaweb.console.hub import StationRoom, hub
-from evaweb.console.logins import current_role
 from evaweb.console.mailbox import Mailbox
 from evaweb.console.page_stops import PageStops
-from evaweb.console.quota import PER_SECOND, MessageQuota
 from evaweb.console.requests import Aim, BadRequest, Credit, EStop, Events, Renew, Request, Stop, Watch
+from evaweb.console.viewers import current_role
 from evaweb.core.errors import NotFound, StationGone, reasoned
 from evaweb.stations import leases
 from evaweb.stations.models import Station

@@ -9,8 +9,8 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from evaweb.blinding.visibility import FULL_VISIBILITY, Visibility
-from evaweb.console import blinding as sights
 from evaweb.console import change_marks, frame_parts
+from evaweb.console import viewers as sights
 from evaweb.console.encoder import StreamEncoder
 from evaweb.console.feed import Feeds, History, LinkState, feeds
 from evaweb.console.frame_parts import EncodedPart

@@ -10,7 +10,7 @@ from typing import Any
 from daphne.ws_protocol import WebSocketProtocol
 from django.conf import settings
 
-from evaweb.console.quota import MessageQuota
+from evaweb.console.flow_control import MessageQuota
 
 PING = 20  # cost of a ping in messages: a burst of 20 pings, 10 per second
 _MOST_PARTS = 64  # fragments per message

@@ -2,13 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TypeVar
 
-from django.db import connection, connections
+from django.db import InterfaceError, OperationalError, connection, connections
 from django.db.backends.signals import connection_created
+
+log = logging.getLogger(__name__)
+
+_Result = TypeVar("_Result")
+WAITS_S = (0.2, 0.5, 1.0, 2.0, 5.0, 5.0, 5.0, 5.0)
+
+
+def retry_while_locked(action: Callable[[], _Result]) -> _Result:
+    """Return the result of `action`; retry while the database is locked or unreachable, for about 30 s.
+
+    `action` must be a whole transaction, so that a failed attempt leaves nothing behind. Within an open transaction the
+    error is raised at once.
+    """
+    for wait in WAITS_S:
+        try:
+            return action()
+        except (OperationalError, InterfaceError) as error:
+            if connection.in_atomic_block:
+                raise
+            log.warning("the database does not answer, again in %g s: %s", wait, error)
+            connection.close()
+            time.sleep(wait)
+    return action()
+
 
 HURRY_S = 1.5  # longest lock wait of requests that send commands or renew leases
 _WEB_CONNECT_S = 2  # smallest connect timeout of libpq

@@ -21,7 +21,7 @@ from evaweb.episodes.curves import vectors
 from evaweb.episodes.manifest_robot import robot_for
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.smoothness import CUT_OFF, sparc
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.recording.reader import Episode, open_episode
 from runtime.recording.scrub import require_intact
 from runtime.recording.summary import HELD

@@ -24,8 +24,8 @@ from django.db.models.functions import Now
 
 from evaweb.accounts.roles import Role, require_role
 from evaweb.core.errors import Conflict
+from evaweb.core.lock_wait import retry_while_locked
 from evaweb.jobs import doorbell
-from evaweb.jobs.database_retry import retry_while_locked
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
 from evaweb.jobs.kinds import Args, Cancelled, JobContext, TakenOver, declared, kind_named, least_role
 from evaweb.jobs.locks import ClaimantState, claimant_state, exclusive_job

@@ -15,8 +15,8 @@ from django.conf import settings
 from django.db import close_old_connections, connection
 
 from evaweb.celery import app
+from evaweb.core.lock_wait import retry_while_locked
 from evaweb.jobs import services, workers
-from evaweb.jobs.database_retry import retry_while_locked
 from evaweb.jobs.heartbeat import Heartbeat
 from evaweb.jobs.kinds import Queue, periodic_tasks, startup_tasks
 

@@ -17,8 +17,8 @@ from evaweb.jobs.kinds import JobContext, job_kind, periodic_task
 from evaweb.jobs.services import enqueue
 from evaweb.reviews import selectors, services
 from evaweb.reviews.dataset_sidecars import review_lines, write_review_sidecars
-from evaweb.reviews.folders import bounds_file, report_file
 from evaweb.reviews.models import Standing
+from evaweb.reviews.record import bounds_file, report_file
 from runtime.datasets.sidecars import attach_sidecar
 from runtime.recording.files import read_json, to_json, write_atomic
 

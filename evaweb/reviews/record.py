@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Literal
 from uuid import UUID
 
 from pydantic import Field, ValidationInfo, field_validator
 
+from evaweb.episodes.folders import data_dir
 from evaweb.records.journal import (
     Journal,
     Line,
@@ -15,6 +17,17 @@ from evaweb.records.journal import (
     Person,
     RowPath,
 )
+
+
+def report_file(uuid: UUID) -> Path:
+    """Return the file of an episode's quality report."""
+    return data_dir() / "quality" / f"{uuid}.json"
+
+
+def bounds_file() -> Path:
+    """Return the file with this lab's own bounds for quality checks of all episodes."""
+    return data_dir() / "quality.toml"
+
 
 _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 

@@ -12,9 +12,8 @@ from evaweb.episodes.models import Episode, Tag
 from evaweb.episodes.reconcile import RestorableRun, register_restorer
 from evaweb.records.journal import missing_rows
 from evaweb.reviews import selectors, services
-from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import DECIDES, Review, Segment, Standing
-from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, segments_of, tags_of
+from evaweb.reviews.record import REVIEWS, AnyReview, ReviewLine, report_file, segments_of, tags_of
 from runtime.recording.files import RecordingError
 
 

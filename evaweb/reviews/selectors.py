@@ -12,8 +12,8 @@ from evaweb.blinding.visibility import Visibility
 from evaweb.core.errors import Conflict, NotFound
 from evaweb.episodes.manifest import CLOSED
 from evaweb.episodes.models import Episode, EpisodeStatus
-from evaweb.reviews.folders import report_file
 from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
+from evaweb.reviews.record import report_file
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError, read_json
 

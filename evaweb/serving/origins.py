@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
+from channels.security.websocket import WebsocketDenier
 from django.conf import settings
 
 _PORT = re.compile(r":([0-9]{1,5})$")
@@ -53,3 +54,16 @@ def _parts(host: str) -> tuple[str, int]:
     """Return name and port of a Host header over plain HTTP."""
     found = _PORT.search(host)
     return (host[: found.start()], int(found[1])) if found else (host, 80)
+
+
+class SameOrigin:
+    """ASGI middleware that accepts websockets of our own pages only; others get 403."""
+
+    def __init__(self, application: Callable[..., Awaitable[Any]]) -> None:
+        self._application = application
+
+    async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> Any:
+        headers = {name.lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        if is_own_origin(headers.get(b"origin", ""), headers.get(b"host", ""), scheme_of(scope)):
+            return await self._application(scope, receive, send)
+        return await WebsocketDenier()(scope, receive, send)

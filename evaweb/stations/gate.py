@@ -21,7 +21,7 @@ from django.db import Error, close_old_connections
 
 from evaweb.core.errors import EvaError
 from evaweb.stations.enrolment import key_enrol, keys_allowed
-from runtime.core import file_limits, logs
+from runtime.core import logs, process_limits
 from runtime.ipc.bus import TransportError
 from runtime.link import key_files
 from runtime.link.admission import Allowed, AllowList
@@ -122,7 +122,7 @@ def _only_one(path: Path) -> Iterator[None]:
 
 def _serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
     logs.configure_logging("gate")
-    file_limits.raise_file_limit()
+    process_limits.raise_file_limit()
     sys.setswitchinterval(_TURN_S)
     data = settings.DATA_DIR
     ended = threading.Event()

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from runtime.core.errors import ConfigurationError, TransportError
+from runtime.core.sentences import Pattern
 from runtime.core.settings import Settings
 from runtime.core.types import UInt8
 
@@ -127,3 +128,18 @@ class Camera(ABC):
     def faults(self) -> dict[str, int]:
         """Return the count of each fault since the start."""
         return {}
+
+
+NOT_LIVE = Pattern("cameras.not_live", "camera {camera} ({source}) is {condition}: {why}")
+
+
+def describe_camera_problems(
+    cameras: Mapping[str, Mapping[str, Any]], keys: Iterable[str] | None = None
+) -> list[str]:
+    """Return a sentence for each camera, or each of `keys`, that is not live: camera, source, condition, reason."""
+    chosen = cameras if keys is None else [key for key in keys if key in cameras]
+    return [
+        NOT_LIVE(camera=key, source=told["source"], condition=told["condition"], why=told["why"])
+        for key in chosen
+        if (told := cameras[key])["condition"] != CameraCondition.LIVE
+    ]

@@ -7,8 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from runtime.cameras.base import Camera, CameraCondition, CameraHealth
-from runtime.cameras.complaints import NOT_LIVE
+from runtime.cameras.base import NOT_LIVE, Camera, CameraCondition, CameraHealth
 from runtime.core.clock import Clock
 from runtime.core.sentences import Pattern
 from runtime.core.types import Observation

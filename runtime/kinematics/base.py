@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from robots import Robot
 from runtime.core.errors import RuntimeFault
 from runtime.core.settings import Settings
 from runtime.core.types import Float64
@@ -112,3 +113,25 @@ class Kinematics(Forward):
                 it. Without it, the first row is bound by joint limits only.
             anchor_row: first row that will be executed; rows before it are stale, and bound by joint limits only.
         """
+
+
+class ChainForward(Forward):
+    """Forward kinematics by the robot's own chains: tens of microseconds per vector, nothing to compile."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._arms = robot.arms
+        self._dim = robot.dim
+
+    def forward(self, q: Float64) -> Float64:
+        """Return poses [..., arms, 7] of joint vectors [..., D].
+
+        Raises:
+            KinematicsError: another width.
+        """
+        q = np.asarray(q, dtype=np.float64)
+        if q.shape[-1:] != (self._dim,):
+            raise KinematicsError(f"joints of shape {q.shape} were given; allowed: [..., {self._dim}]")
+        poses = np.empty((*q.shape[:-1], len(self._arms), 7))
+        for index, arm in enumerate(self._arms):
+            poses[..., index, :] = arm.pose(q)
+        return poses

@@ -18,8 +18,8 @@ from runtime.core import msgpack_arrays
 from runtime.core.clock import Clock
 from runtime.core.errors import CodecError, ConfigurationError, PolicyError, WrongProtocolError
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
+from runtime.policies.action_layout import ActionFormatSettings
 from runtime.policies.action_rows import parse_action_rows
-from runtime.policies.answers import ActionFormatSettings
 from runtime.policies.base import PolicyInfo
 from runtime.policies.gripper_convention import Convention, GripperConvention
 from runtime.policies.request_layout import RequestLayout, RequestSettings, pose_rows_for

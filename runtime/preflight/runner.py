@@ -11,8 +11,7 @@ import numpy as np
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import ActionChunk, Conditioning, Observation
-from runtime.kinematics.base import Kinematics
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward, Kinematics
 from runtime.kinematics.lazy import LazyKinematics
 from runtime.policies.base import Policy, PolicyInfo
 from runtime.preflight.report import Call, Chunk, Report

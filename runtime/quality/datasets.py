@@ -18,9 +18,18 @@ from runtime.datasets.features import picture_size
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.reader import Dataset
 from runtime.datasets.video_frames import VideoSegment
-from runtime.quality.block import BLOCK_ROWS, Block, Bools, EpisodeSource, JointSpecs, Vector, VectorColumn
+from runtime.quality.block import (
+    BLOCK_ROWS,
+    Block,
+    Bools,
+    EpisodeSource,
+    JointSpecs,
+    Vector,
+    VectorColumn,
+    known_joints,
+    unknown_joints,
+)
 from runtime.quality.frame_stream import FrameStream, StoredFrameStream, VideoFrameStream
-from runtime.quality.joints import known_joints, unknown_joints
 
 STATES = ("observation.state", "observation.qpos")  # names of the state column, in order of preference
 ACTION = "action"

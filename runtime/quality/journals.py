@@ -20,9 +20,10 @@ from runtime.quality.block import (
     Vector,
     VectorColumn,
     VideoEnd,
+    known_joints,
+    unknown_joints,
 )
 from runtime.quality.frame_stream import FrameStream, VideoFrameStream
-from runtime.quality.joints import known_joints, unknown_joints
 from runtime.quality.report import Severity
 from runtime.recording.files import read_json
 from runtime.recording.layout import Layout, simulated

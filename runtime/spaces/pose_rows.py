@@ -27,6 +27,10 @@ from runtime.spaces.orientations import (
 if TYPE_CHECKING:
     from robots import Robot
 
+
+from runtime.core.types import Float32
+from runtime.spaces.end_effectors import EndEffectors
+
 _POSITION, _QUATERNION, _GRIPPER = slice(0, 3), slice(3, 7), EEF_WIDTH - 1
 
 
@@ -180,3 +184,18 @@ def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
     chosen = [robot.group(name).slice for name in pose.groups]
     parts = [np.arange(part.start, part.stop) for part in chosen]
     return np.concatenate([np.zeros(0, np.intp), *parts])
+
+
+class PosePublisher:
+    """Converter of each sent joint command [D] to a pose row float32 [W], which continues the previous row."""
+
+    def __init__(self, rows: PoseRows, end_effectors: EndEffectors) -> None:
+        self._rows = rows
+        self._end_effectors = end_effectors
+        self._previous: Float64 | None = None
+
+    def __call__(self, action: Float64) -> Float32:
+        joints = action[None]
+        row: Float64 = self._rows.encode(self._end_effectors.vectors(joints), joints, self._previous)[0]
+        self._previous = row
+        return row.astype(np.float32)

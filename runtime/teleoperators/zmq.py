@@ -21,7 +21,7 @@ from runtime.core.errors import CodecError, ConfigurationError, TransportError
 from runtime.core.settings import Settings
 from runtime.teleoperators.base import Leader, joints_from_state
 from runtime.transports import node_link
-from runtime.transports.node_settings import Endpoint
+from runtime.transports.node_link import Endpoint
 from runtime.transports.zmq import is_loopback
 
 if TYPE_CHECKING:

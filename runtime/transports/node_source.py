@@ -34,7 +34,7 @@ from runtime.transports.node_messages import (
 
 if TYPE_CHECKING:
     from robots import Robot
-    from runtime.transports.node_settings import NodeSettings
+    from runtime.transports.node_link import NodeSettings
 
 log = logging.getLogger(__name__)
 _REFUSED_LATE = fixed(

@@ -14,7 +14,7 @@ from pydantic import model_validator
 from runtime.core.clock import Clock
 from runtime.core.errors import ConfigurationError
 from runtime.transports.base import Capabilities
-from runtime.transports.node_settings import Endpoint, NodeSettings
+from runtime.transports.node_link import Endpoint, NodeSettings
 from runtime.transports.node_sink import NodeSink
 from runtime.transports.node_source import NodeSource
 

@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from robots import segments
+from robots import clearance
 
 point = st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 3)
 ORIGIN = (0.0, 0.0, 0.0)
@@ -42,18 +42,18 @@ def test_it_is_what_a_search_finds_whatever_way_the_segments_lie(
     lying: tuple[tuple[float, ...], ...],
 ) -> None:
     parts = [np.array(part, float) for part in lying]
-    assert float(segments.segment_distances(*parts)) == pytest.approx(searched(*parts), abs=1e-7)
+    assert float(clearance.segment_distances(*parts)) == pytest.approx(searched(*parts), abs=1e-7)
     start, way, other, other_way = parts
-    assert float(segments.segment_distances(other, other_way, start, way)) == pytest.approx(
+    assert float(clearance.segment_distances(other, other_way, start, way)) == pytest.approx(
         searched(*parts), abs=1e-7
     )
 
 
 def test_many_pairs_are_judged_at_once_as_each_is_alone() -> None:
     parts = np.random.default_rng(1).normal(size=(4, 5, 7, 3))
-    found = segments.segment_distances(*parts)
+    found = clearance.segment_distances(*parts)
     assert found.shape == (5, 7)
     for index in np.ndindex(5, 7):
         assert found[index] == pytest.approx(
-            float(segments.segment_distances(*(part[index] for part in parts)))
+            float(clearance.segment_distances(*(part[index] for part in parts)))
         )

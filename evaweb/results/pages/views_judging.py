@@ -16,7 +16,7 @@ from evaweb.episodes.selectors import playback_stage
 from evaweb.plans.models import Handout
 from evaweb.results.models import Preference
 from evaweb.results.ratings import rating_queue
-from evaweb.results.ratings.video_available import is_watchable
+from evaweb.results.ratings.footage import is_watchable
 from evaweb.results.selectors import plan_get
 from evaweb.trials import failures
 from evaweb.trials.services import failing

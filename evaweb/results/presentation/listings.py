@@ -17,7 +17,7 @@ from evaweb.results.analysis.outcomes import Outcome, Pair
 from evaweb.results.presentation.addresses import beside_address, trials_address
 from evaweb.results.presentation.drawings import conditions
 from evaweb.results.presentation.wording import format_interval
-from evaweb.results.ratings.video_available import is_watchable
+from evaweb.results.ratings.footage import is_watchable
 from evaweb.results.selectors import TrialQuery
 from evaweb.serving.lists import (
     SEARCH,

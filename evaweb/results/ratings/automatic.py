@@ -29,9 +29,8 @@ from evaweb.plans.models import Handout, Plan, PlanEvent, PlanState
 from evaweb.results.judges.base import MilestoneJudgement, MilestonePrompt, NoVerdict, TrialCase
 from evaweb.results.judges.loading import UsableJudge, build_judge
 from evaweb.results.models import AutomaticJudge, Judgement
+from evaweb.results.ratings.footage import is_watchable, trial_stills
 from evaweb.results.ratings.record import RATINGS, JudgementLine
-from evaweb.results.ratings.stills import trial_stills
-from evaweb.results.ratings.video_available import is_watchable
 from evaweb.trials.models import Milestone, Trial, TrialStatus
 from evaweb.trials.record import journal_uuid
 from evaweb.trials.scoring import reached_in_truth

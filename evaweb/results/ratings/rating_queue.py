@@ -26,8 +26,8 @@ from evaweb.plans.models import Handout, Plan, PlanState
 from evaweb.plans.seeded_draws import SeededDraws
 from evaweb.records.journal import clean_text
 from evaweb.results.models import Preference, Rating
+from evaweb.results.ratings.footage import is_watchable, may_become_watchable, require_video
 from evaweb.results.ratings.record import RATINGS, PreferenceLine, RatingLine
-from evaweb.results.ratings.video_available import is_watchable, may_become_watchable, require_video
 from evaweb.reviews.selectors import still_judges
 from evaweb.trials import failures
 from evaweb.trials.models import Score, Trial, TrialStatus

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from runtime.clients.channel import answers
+from runtime.clients.channel import json_answers
 from runtime.clients.channel import status as older
 from runtime.clients.channel.message import Message
 from runtime.clients.channel.outcomes import Outcome, Outcomes, is_long_running
@@ -66,15 +66,15 @@ class CommandExecutor:
         if message.name == "select_collect_task" and outcome.result == "done":
             return {"ok": True, **data}  # as it always was
         special = dict(data) if message.name == "tab_switch" else {}
-        return answers.command_answer(message, outcome, data, self._state(script, outcome)) | special
+        return json_answers.command_answer(message, outcome, data, self._state(script, outcome)) | special
 
     def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
         """Answer with what came of it the first time, as far as it has come now."""
         if known.said != message.name:
             why = f"its id was given to {known.said!r} before"
             other = Outcome(known.id, message.name, "", "refused", why)
-            return answers.command_answer(message, other, {}, None)
-        return answers.command_answer(message, known, {}, self._state(script, known))
+            return json_answers.command_answer(message, other, {}, None)
+        return json_answers.command_answer(message, known, {}, self._state(script, known))
 
     def _state(self, script: Script, outcome: Outcome) -> str | None:
         """After a command; None where the station has just gone, and the answer is still worth having."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from queue import Empty, Full, Queue
 from typing import Any, Protocol
 
-from runtime.clients.channel import answers
+from runtime.clients.channel import json_answers
 from runtime.clients.channel.message import Message
 
 log = logging.getLogger(__name__)
@@ -108,12 +108,15 @@ class RequestWorker:
     def _answer(self, job: Job) -> dict[str, Any]:
         why = self._void(job)
         if why:
-            return answers.error_answer(why) | job.message.echo | {"result": "refused"}
+            return json_answers.error_answer(why) | job.message.echo | {"result": "refused"}
         try:
             return self._clerk.answer(job.holder, job.message)
         except Exception as error:  # whatever a message meets, the channel goes on
             log.exception("%s cannot be answered", job.message.name)
-            return answers.error_answer(f"handler error: {type(error).__name__}: {error}") | job.message.echo
+            return (
+                json_answers.error_answer(f"handler error: {type(error).__name__}: {error}")
+                | job.message.echo
+            )
 
     def _void(self, job: Job) -> str:
         """Why a command is not carried out any more, "" where it is."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import zmq
 
-from runtime.clients.channel import answers, strict
+from runtime.clients.channel import json_answers
 from runtime.clients.channel.executor import CommandExecutor
 from runtime.clients.channel.holder_names import HolderNames
 from runtime.clients.channel.message import LARGEST, Malformed, Message, read
@@ -67,7 +67,7 @@ class ChannelServer:
             self._local.socket = self._context.socket(zmq.PUSH)
             self._local.socket.linger = 0
             self._local.socket.connect(self._inbox)
-        self._local.socket.send_multipart([*address, strict.dumps(answer)])
+        self._local.socket.send_multipart([*address, json_answers.dumps(answer)])
 
     def serve(self, timeout: float) -> None:
         """Wait up to `timeout` seconds for messages and answers; pass on those there are, answers first."""
@@ -89,7 +89,7 @@ class ChannelServer:
         try:
             message = read(body)
         except Malformed as fault:
-            self._send([*address, strict.dumps(answers.error_answer(str(fault)))])
+            self._send([*address, json_answers.dumps(json_answers.error_answer(str(fault)))])
             return
         holder = self._names.holder(address[0], message.client)
         if self._names.is_alive(address[0], message, is_stop(message) or is_estop(message)):
@@ -98,7 +98,7 @@ class ChannelServer:
         if not lane.submit(Job(address, holder, message, time.monotonic(), self._stops)):
             under_way = "so many presses are under way already that this one adds nothing"
             why = under_way if is_estop(message) else "too many commands wait: not carried out"
-            self._send([*address, strict.dumps(answers.error_answer(why) | message.echo)])
+            self._send([*address, json_answers.dumps(json_answers.error_answer(why) | message.echo)])
 
     def _lane_of(self, message: Message) -> RequestWorker:
         if not is_estop(message) and not is_stop(message):

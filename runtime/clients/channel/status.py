@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from runtime.clients.channel.selection import ScriptSelection
+from runtime.clients.channel.scripts import ScriptSelection
 
 _CLI_MODES = {"continuous": "real", "preview": "step"}
 _REPLAY = (

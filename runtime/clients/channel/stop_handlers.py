@@ -6,7 +6,7 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
-from runtime.clients.channel import answers
+from runtime.clients.channel import json_answers
 from runtime.clients.channel.message import Message
 from runtime.clients.channel.outcomes import Outcome, Outcomes
 from runtime.clients.channel.scripts import ScriptActivity
@@ -49,7 +49,7 @@ class StopHandler:
         except Refused as refusal:
             outcome.resolve("refused", f"{refusal}; {_ANYBODY}")
         self._outcomes.add(outcome)
-        return answers.command_answer(message, outcome, {}, state)
+        return json_answers.command_answer(message, outcome, {}, state)
 
     def _stop(self, holder: str, kind: str) -> str:
         """Under the lease that a script of the channel holds, else under one of the asker's own."""
@@ -88,7 +88,7 @@ class EStopHandler:
         finally:
             client.close()
         self._outcomes.add(outcome)
-        return answers.command_answer(message, outcome, {}, None)
+        return json_answers.command_answer(message, outcome, {}, None)
 
     def close(self) -> None:
         """Nothing is kept open."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 from runtime.clients.channel.message import Message
-from runtime.clients.channel.selection import ScriptSelection
+from runtime.clients.channel.scripts import ScriptSelection
 from runtime.core.errors import RuntimeFault
 
 Step = tuple[str, Mapping[str, Any]]

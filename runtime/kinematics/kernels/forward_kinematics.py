@@ -11,8 +11,7 @@ import numpy as np
 from runtime.core.types import Float64
 from runtime.kinematics.chain_records import Record, Records
 from runtime.kinematics.kernels.compilation import device_function, kernel
-from runtime.kinematics.kernels.rotations import quaternion_of
-from runtime.kinematics.kernels.sines import compute_sincos
+from runtime.kinematics.kernels.rotations import compute_sincos, quaternion_of
 
 
 def fk_buffer_type(moving: int) -> np.dtype[np.void]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from runtime.core.types import Float32, Float64
 from runtime.kinematics.kernels.compilation import kernel
-from runtime.kinematics.kernels.sines import compute_sincos
+from runtime.kinematics.kernels.rotations import compute_sincos
 
 
 class LinkTable(NamedTuple):

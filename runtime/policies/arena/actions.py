@@ -12,8 +12,8 @@ from runtime.core.errors import ActionSpaceError, ConfigurationError, ShapeError
 from runtime.core.pose_format import PoseFormat
 from runtime.core.settings import Settings
 from runtime.core.types import ActionChunk, Float32
+from runtime.policies.action_layout import Rate
 from runtime.policies.action_rows import parse_action_rows
-from runtime.policies.answers import Rate
 from runtime.policies.arena.requirements import ActionSpace, ServerRequirements
 from runtime.policies.gripper_convention import Convention, GripperConvention
 from runtime.spaces.pose_rows import PoseRows

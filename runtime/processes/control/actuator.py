@@ -18,7 +18,7 @@ from runtime.ipc.shared_state import EStop, SharedState
 from runtime.motion.timeline import DimensionKinds, difference
 from runtime.motion.trajectories import Brake
 from runtime.processes.control.behaviours import Target
-from runtime.processes.control.node_handover import END
+from runtime.processes.control.node_peers import END
 from runtime.safety.collision import Collision
 from runtime.safety.filter import Limits, RobotState, SafetySettings, braking
 from runtime.safety.limiter import CommandLimiter, LimitedCommand

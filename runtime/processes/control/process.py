@@ -28,7 +28,7 @@ from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink
 
 if TYPE_CHECKING:
-    from runtime.spaces.published_poses import PosePublisher
+    from runtime.spaces.pose_rows import PosePublisher
 
 log = logging.getLogger(__name__)
 _LATENESS_KEPT = 2000
@@ -48,10 +48,9 @@ def make_publisher(spec: StationSpec) -> PosePublisher | None:
     wanted, robot = spec.deployment.publication, spec.robot
     if wanted.space == "joint":
         return None
-    from runtime.kinematics.forward import ChainForward
+    from runtime.kinematics.base import ChainForward
     from runtime.spaces.end_effectors import EndEffectors
-    from runtime.spaces.pose_rows import PoseRows
-    from runtime.spaces.published_poses import PosePublisher
+    from runtime.spaces.pose_rows import PosePublisher, PoseRows
 
     return PosePublisher(
         PoseRows(wanted.pose, robot, "publication.pose"), EndEffectors(robot, ChainForward(robot))

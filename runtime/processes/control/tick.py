@@ -32,10 +32,9 @@ from runtime.processes.control.actuator import (
 from runtime.processes.control.behaviours import EStopHold, NodeDriven
 from runtime.processes.control.chunk_execution import ExecuteChunks, Strategy, build_strategy, dropped_chunk
 from runtime.processes.control.command_pipeline import CommandPipeline
-from runtime.processes.control.command_subscribers import SubscriberCheck
 from runtime.processes.control.displacement import DisplacementMonitor, stale_heartbeat
 from runtime.processes.control.gripper_locks import GripperLocks
-from runtime.processes.control.node_handover import NodeHandover
+from runtime.processes.control.node_peers import NodeHandover, SubscriberCheck
 from runtime.processes.control.plausibility import JointPlausibility, TrustingPlausibility
 from runtime.processes.control.steady_error import SteadyError
 from runtime.processes.control.telemetry import StatusRecord, Telemetry, TickState

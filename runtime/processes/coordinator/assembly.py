@@ -10,7 +10,7 @@ from runtime.ipc.bus import Endpoints, EventLog
 from runtime.ipc.messages import Event, ReceptionReport
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.kinematics.lazy import LazyKinematics
 from runtime.processes.coordinator.builders import (
     MakePolicy,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.cameras.complaints import describe_camera_problems
+from runtime.cameras.base import describe_camera_problems
 from runtime.core.clock import Clock
 from runtime.core.sentences import Pattern, fixed, series
 from runtime.ipc.estop_latch import Latch

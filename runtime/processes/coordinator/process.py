@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import zmq
 
-from runtime.core import file_limits as descriptors
-from runtime.core import malloc as heap
+from runtime.core import process_limits as descriptors
+from runtime.core import process_limits as heap
 from runtime.core.clock import MonotonicClock
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import (

@@ -12,8 +12,8 @@ from typing import Any
 
 import zmq
 
-from runtime.core import file_limits as descriptors
 from runtime.core import logs, realtime
+from runtime.core import process_limits as descriptors
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.sentences import Pattern
 from runtime.ipc.bells import bells

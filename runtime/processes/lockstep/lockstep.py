@@ -26,9 +26,9 @@ from runtime.processes.coordinator.assembly import assemble
 from runtime.processes.coordinator.builders import MakePolicy, make_policy
 from runtime.processes.coordinator.inference.runners import LockstepRunner, Runner
 from runtime.processes.guard.process import Guard
-from runtime.processes.media.episode_closing import Close, at_once
 from runtime.processes.media.process import Media, make_recorder
 from runtime.processes.media.recorder import ClosedEpisode
+from runtime.processes.media.unclosed_episodes import Close, at_once
 from runtime.processes.reception.process import Reception, make_source
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink, Source

@@ -16,7 +16,7 @@ from typing import Any
 
 import zmq
 
-from runtime.core import file_limits as descriptors
+from runtime.core import process_limits as descriptors
 from runtime.core.clock import Clock, MonotonicClock, VirtualClock
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.realtime import LOCKSTEP
@@ -29,9 +29,9 @@ from runtime.processes.coordinator.process import CommandService
 from runtime.processes.guard.process import EStopServer
 from runtime.processes.lockstep.lockstep import Lockstep, LockstepEnvironment, Peers
 from runtime.processes.media.crash_repair import start_repair
-from runtime.processes.media.episode_closing import in_background
 from runtime.processes.media.export_jobs import ExportQueue
 from runtime.processes.media.previews import Previews
+from runtime.processes.media.unclosed_episodes import in_background
 from runtime.station.lock import acquire_station_lock
 from runtime.station.spec import StationSpec
 

@@ -8,8 +8,8 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from runtime.core import file_limits as descriptors
-from runtime.core import malloc as heap
+from runtime.core import process_limits as descriptors
+from runtime.core import process_limits as heap
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RecordingError
 from runtime.core.sentences import Pattern, fixed
@@ -37,15 +37,14 @@ from runtime.ipc.messages import (
 from runtime.ipc.observation_messages import as_observation
 from runtime.ipc.shared_memory import TornReadError
 from runtime.ipc.shared_state import RecorderStage, SharedState
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.processes.child import join_station
 from runtime.processes.media.crash_repair import start_repair
-from runtime.processes.media.episode_closing import Close, at_once, in_background
 from runtime.processes.media.export_jobs import ExportQueue
 from runtime.processes.media.low_priority_worker import LowPriorityWorker
 from runtime.processes.media.previews import Previews
 from runtime.processes.media.recorder import ClosedEpisode, DatasetGrid, Recorder
-from runtime.processes.media.unclosed_episodes import UnclosedEpisodes
+from runtime.processes.media.unclosed_episodes import Close, UnclosedEpisodes, at_once, in_background
 from runtime.recording.episode import EpisodeJournal
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.station.spec import StationSpec

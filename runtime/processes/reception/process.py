@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from robots import Robot
-from runtime.core import malloc as heap
+from runtime.core import process_limits as heap
 from runtime.core import realtime
 from runtime.core.clock import Clock, MonotonicClock
 from runtime.core.errors import RuntimeFault

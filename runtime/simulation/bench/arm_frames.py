@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robots import Body, Chain, urdf
-from robots.copies import copy_of
+from robots.robot import copy_of
 from robots.rotations import transform_of
 from runtime.core.errors import SetupError
 from runtime.core.types import Float64

@@ -16,8 +16,7 @@ from runtime.core.types import Observation
 from runtime.ipc.messages import Event
 from runtime.transports.base import Source
 from runtime.transports.frozen_cameras import FROZEN_S
-from runtime.transports.ros.alignment import Aligned, Alignment, Sample
-from runtime.transports.ros.clock import RosClock
+from runtime.transports.ros.alignment import Aligned, Alignment, RosClock, Sample
 from runtime.transports.ros.message_reading import Names, UnusableMessage
 from runtime.transports.ros.messages import Message, Wire
 from runtime.transports.ros.middleware import Match, Middleware, Quality, Topic

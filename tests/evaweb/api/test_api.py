@@ -7,7 +7,7 @@ from django.db import OperationalError
 from django.test import Client
 from django.urls import reverse
 
-from evaweb.api.snapshot import openapi_snapshot
+from evaweb.api.api import openapi_snapshot
 from tests.evaweb.api.conftest import Rest
 
 READS = [

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaweb.console import frame_parts
-from evaweb.console.chunks import GHOSTS, encode_chunk
+from evaweb.console.encoder import GHOSTS, encode_chunk
 from evaweb.core.binary_frames import decode
 from evaweb.stations.geometry import scene_geometry
 from evaweb.stations.robot_geometry import drawn_robot

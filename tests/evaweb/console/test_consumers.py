@@ -650,8 +650,8 @@ def test_a_viewers_stop_is_refused_before_anything_is_done(live, vera, runtime, 
 def test_a_page_that_floods_is_told_once_and_closed_and_its_presses_are_obeyed(
     live, ann, runtime, monkeypatch
 ):
-    monkeypatch.setattr("evaweb.console.quota.PER_SECOND", 0.0)
-    monkeypatch.setattr("evaweb.console.quota.AT_ONCE", 5.0)
+    monkeypatch.setattr("evaweb.console.flow_control.PER_SECOND", 0.0)
+    monkeypatch.setattr("evaweb.console.flow_control.AT_ONCE", 5.0)
 
     async def scenario():
         page = await Page(live.name, ann).open()

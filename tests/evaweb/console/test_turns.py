@@ -9,9 +9,8 @@ import pytest
 from daphne.ws_protocol import WebSocketProtocol
 from twisted.internet.abstract import FileDescriptor
 
-from evaweb.console.quota import AT_ONCE, MessageQuota
+from evaweb.console.flow_control import AT_ONCE, MessageQuota, TurnScheduler
 from evaweb.console.reading import AHEAD, STALLED_S, until_read
-from evaweb.console.turns import TurnScheduler
 from evaweb.console.websocket_limits import (
     _MOST_PARTS,
     PING,

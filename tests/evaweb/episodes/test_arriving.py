@@ -15,7 +15,7 @@ from evaweb.episodes.reconcile import reconcile
 from evaweb.episodes.selectors import playback_stage, why_unrecorded
 from evaweb.jobs.models import Job
 from evaweb.jobs.services import run_queue
-from evaweb.results.ratings.video_available import may_become_watchable
+from evaweb.results.ratings.footage import may_become_watchable
 from evaweb.reviews.selectors import unchecked_episodes
 from evaweb.stations.models import Station, StationKey
 from runtime.link.contents import contents_of

@@ -16,7 +16,7 @@ from evaweb.episodes import poses as posing
 from evaweb.episodes.curves import _interventions, curve_message, hold_spans
 from evaweb.episodes.poses import pose_message
 from evaweb.stations.robot_geometry import drawn_robot
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.recording.files import RecordingError
 from runtime.recording.reader import open_episode
 from runtime.recording.tables import write_table

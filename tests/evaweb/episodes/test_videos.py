@@ -21,7 +21,7 @@ from evaweb.episodes.selectors import playback_stage
 from evaweb.episodes.videos import video_address, video_file
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import run_queue
-from evaweb.results.ratings.stills import trial_stills
+from evaweb.results.ratings.footage import trial_stills
 from evaweb.serving.headers import content_security_policy
 from tests.evaweb.s3_server import SECRET, Server, why_no_server
 

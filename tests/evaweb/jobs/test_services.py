@@ -11,8 +11,9 @@ from django.db import OperationalError
 from django.db.models.functions import Now
 from django.utils import timezone
 
+from evaweb.core import lock_wait
 from evaweb.core.errors import Conflict, NotAllowed
-from evaweb.jobs import database_retry, locks, services
+from evaweb.jobs import locks, services
 from evaweb.jobs.kinds import JobContext, UnknownKind
 from evaweb.jobs.locks import exclusive_job
 from evaweb.jobs.models import Job, JobStatus
@@ -291,7 +292,7 @@ def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
     toy: Toy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[float] = []
-    monkeypatch.setattr(database_retry.time, "sleep", waited.append)
+    monkeypatch.setattr(lock_wait.time, "sleep", waited.append)
     for name in ("claim", "job_done"):
         monkeypatch.setattr(services, name, locked_twice(getattr(services, name)))
     job = enqueue()
@@ -299,7 +300,7 @@ def test_a_locked_database_is_waited_for_before_a_job_and_after_it(
     job.refresh_from_db()
     assert job.status == JobStatus.DONE
     assert len(toy.asked) == 1
-    assert waited == [*database_retry.WAITS_S[:2], *database_retry.WAITS_S[:2]]
+    assert waited == [*lock_wait.WAITS_S[:2], *lock_wait.WAITS_S[:2]]
 
 
 def locked_twice(action):
@@ -316,7 +317,7 @@ def locked_twice(action):
 
 @pytest.mark.django_db(transaction=True)
 def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(database_retry.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(lock_wait.time, "sleep", lambda seconds: None)
     attempts = []
 
     def away() -> None:
@@ -324,8 +325,8 @@ def test_a_database_that_stays_away_is_told(monkeypatch: pytest.MonkeyPatch) -> 
         raise OperationalError("database is locked")
 
     with pytest.raises(OperationalError, match="locked"):
-        database_retry.retry_while_locked(away)
-    assert len(attempts) == len(database_retry.WAITS_S) + 1
+        lock_wait.retry_while_locked(away)
+    assert len(attempts) == len(lock_wait.WAITS_S) + 1
 
 
 # --- cancelled -----------------------------------------------------------------------------------------------

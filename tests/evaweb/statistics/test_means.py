@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaweb.results.reports.recompute import means
+from evaweb.results.reports.recompute import methods
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.means import average
 
@@ -27,7 +27,7 @@ def test_the_table_of_t(n, t):
     mean = sum(values) / n
     error = math.sqrt(sum((v - mean) ** 2 for v in values) / (n - 1) / n)
     assert (average(values).interval.high - mean) / error == pytest.approx(t, rel=2e-6)
-    assert means.student_t(n - 1) == pytest.approx(t, rel=2e-6)
+    assert methods.student_t(n - 1) == pytest.approx(t, rel=2e-6)
 
 
 def test_one_value_and_equal_ones_have_no_interval():
@@ -44,7 +44,7 @@ def test_what_is_no_number_is_refused():
 
 @given(st.lists(st.floats(-100, 0), min_size=1, max_size=60))
 def test_the_reports_program_comes_to_the_same(values):
-    found, again = average(values), means.student(values)
+    found, again = average(values), methods.student(values)
     assert again["n"] == found.n
     assert again["mean"] == pytest.approx(found.value, abs=1e-12)
     if found.interval is None:

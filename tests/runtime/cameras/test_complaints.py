@@ -1,4 +1,4 @@
-from runtime.cameras.complaints import describe_camera_problems
+from runtime.cameras.base import describe_camera_problems
 
 TOLD = {
     "high": {"source": "rtsp://h/x", "condition": "lost", "why": "mute"},

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.cameras.stamps import StreamTime
+from runtime.cameras.live_camera import StreamTime
 
 
 def test_jitter_of_the_way_is_not_in_the_time_of_capture():

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import robots
-from runtime.kinematics.base import KinematicsError
+from runtime.kinematics.base import ChainForward, KinematicsError
 from runtime.kinematics.compiled import CompiledKinematics
-from runtime.kinematics.forward import ChainForward
 from tests.sources import ROOT
 
 
@@ -36,7 +35,7 @@ def test_control_and_media_load_no_compiler() -> None:
         import sys, numpy, robots
         import runtime.processes.control.process, runtime.processes.media.process, runtime.processes.reception.process
         from runtime.spaces.end_effectors import EndEffectors
-        from runtime.kinematics.forward import ChainForward
+        from runtime.kinematics.base import ChainForward
         robot = robots.load_robot("agilex_piper")
         EndEffectors(robot, ChainForward(robot)).eef_of(numpy.zeros(14))
         print([name for name in ("numba", "llvmlite") if name in sys.modules])

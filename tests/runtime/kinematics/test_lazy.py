@@ -13,8 +13,7 @@ import pytest
 import robots
 from runtime.core.errors import SetupError
 from runtime.kinematics import compiled
-from runtime.kinematics.base import Kinematics
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward, Kinematics
 from runtime.kinematics.lazy import LazyKinematics
 from runtime.processes.coordinator.inference.runners import LockstepRunner, ThreadRunner
 from tests.processes import PATIENCE_S, joined

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.recording.histogram import DurationHistogram
+from runtime.recording.encoder import DurationHistogram
 
 
 @given(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=300))

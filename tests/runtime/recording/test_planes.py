@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runtime.recording.planes import to_yuv_planes
+from runtime.recording.video import to_yuv_planes
 from tests.examples import some
 
 LUMA = np.array([65.481, 128.553, 24.966]) / 255  # ITU-R BT.601, limited range

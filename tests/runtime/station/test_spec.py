@@ -12,7 +12,7 @@ from runtime.core.pose_format import PoseFormat
 from runtime.ipc.bells import Bell
 from runtime.ipc.lifeline import Lifeline
 from runtime.ipc.shared_state import WOKEN, SharedState
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes import child
 from runtime.processes.control.process import make_publisher

@@ -8,7 +8,7 @@ from typing import Any
 from django.conf import settings
 from django.core.management.base import BaseCommand
 
-from evaweb.api.snapshot import openapi_snapshot
+from evaweb.api.api import openapi_snapshot
 
 PLACE = Path(settings.BASE_DIR) / "docs" / "openapi.json"
 

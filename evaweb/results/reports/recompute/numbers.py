@@ -12,7 +12,7 @@ from typing import Any
 
 from . import methods
 from .designs import comparisons_of
-from .means import student
+from .methods import student
 
 DRAWS = 4000
 

@@ -11,7 +11,7 @@ import numpy as np
 from runtime.core.errors import PolicyError
 from runtime.core.pose_format import CANONICAL
 from runtime.core.types import EEF_WIDTH, ActionChunk, Float64, Observation
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.motion.timeline import DimensionKinds, difference
 from runtime.spaces.end_effectors import EndEffectors
 from runtime.spaces.pose_rows import PoseRows

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runtime.cameras.complaints import describe_camera_problems
+from runtime.cameras.base import describe_camera_problems
 from runtime.core.clock import Clock
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.plugins import variants

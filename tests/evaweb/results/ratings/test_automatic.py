@@ -28,7 +28,12 @@ from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import judge_agreement, rater_agreement
 from evaweb.results.models import AutomaticJudge, Judgement
 from evaweb.results.ratings import automatic, rating_queue
-from evaweb.results.ratings.stills import CAMERAS, OF_EACH, sample, trial_stills
+from evaweb.results.ratings.footage import (
+    CAMERAS,
+    OF_EACH,
+    sample,
+    trial_stills,
+)
 from evaweb.results.reports.reporting import report_numbers
 from evaweb.results.reports.tables import outcome_pages
 from evaweb.trials import services

@@ -2,9 +2,9 @@ import json
 
 import pytest
 
-from runtime.clients.channel.selection import ScriptSelection
+from runtime.clients.channel.json_answers import dumps
+from runtime.clients.channel.scripts import ScriptSelection
 from runtime.clients.channel.status import status as older
-from runtime.clients.channel.strict import dumps
 from tests.runtime.terminal_station import status
 
 # Every key that scripts of the older channel may look at.

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.clients.channel.strict import dumps, to_builtin
+from runtime.clients.channel.json_answers import dumps, to_builtin
 
 
 def test_what_is_no_number_in_json_is_null():

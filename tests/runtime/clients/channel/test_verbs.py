@@ -3,7 +3,7 @@ import json
 import pytest
 
 from runtime.clients.channel.message import read
-from runtime.clients.channel.selection import ScriptSelection
+from runtime.clients.channel.scripts import ScriptSelection
 from runtime.clients.channel.verb_commands import UnsupportedVerb, VerbContext
 from runtime.clients.channel.verbs import VERBS, commands_for_verb, stops
 from tests.runtime.terminal_station import status

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from runtime.policies.tunnel import ssh_process
-from runtime.policies.tunnel.listening import is_listening
-from runtime.policies.tunnel.ssh_process import Ssh, free_port
+from runtime.policies.tunnel.ssh_process import Ssh, free_port, is_listening
 from tests.processes import PATIENCE_S, alive, eventually
 
 Begin = Callable[[str], Ssh]

@@ -10,7 +10,7 @@ from runtime.core.errors import TransportError
 from runtime.core.types import RobotCommand
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState, SharedStateLayout
-from runtime.processes.control.command_subscribers import SubscriberCheck
+from runtime.processes.control.node_peers import SubscriberCheck
 from runtime.transports.base import Sink
 from tests.runtime.lockstep_station import Station, stubbed
 

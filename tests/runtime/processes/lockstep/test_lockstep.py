@@ -16,7 +16,7 @@ from runtime.datasets.publishing import publish
 from runtime.ipc.estop_latch import Latch
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.processes.lockstep import lockstep
 from runtime.recording.reader import Episode, open_episode
 from runtime.spaces.end_effectors import EndEffectors

@@ -24,8 +24,8 @@ from runtime.ipc.messages import Ack, Command, decode, encode
 from runtime.ipc.session_state import SessionState
 from runtime.processes.lockstep import server as served_lockstep
 from runtime.processes.lockstep.server import ServedLockstep
-from runtime.processes.media.episode_closing import Close, in_background
 from runtime.processes.media.recorder import ClosedEpisode
+from runtime.processes.media.unclosed_episodes import Close, in_background
 from runtime.recording.reader import Episode, open_episode
 from tests.processes import PATIENCE_S
 from tests.runtime.lockstep_station import STANDS, StubPolicy, StubRobot, Stubs, column, stubbed

@@ -30,9 +30,9 @@ from runtime.ipc.messages import (
 )
 from runtime.ipc.shared_state import PICTURE_SLOTS, SharedState, SharedStateLayout
 from runtime.processes.media.crash_repair import find_open_episodes, repair_open_episodes
-from runtime.processes.media.episode_closing import at_once, in_background
 from runtime.processes.media.process import Media
 from runtime.processes.media.recorder import DatasetGrid, Recorder
+from runtime.processes.media.unclosed_episodes import at_once, in_background
 from runtime.processes.reception.process import Reception
 from runtime.recording.base import Outcome
 from runtime.recording.files import UnclosedError

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.transports.ros.clock import RosClock
+from runtime.transports.ros.alignment import RosClock
 
 WALL = 1_800_000_000.0  # s, a stamp of wall time, far from our clock
 

@@ -13,7 +13,7 @@ import robots
 from runtime.core.pose_format import OrientationName, PoseFormat
 from runtime.core.types import ActionChunk, Conditioning
 from runtime.ipc.messages import ChunkMerged
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix

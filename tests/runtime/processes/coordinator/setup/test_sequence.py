@@ -12,7 +12,7 @@ from runtime.config import loader
 from runtime.core.errors import PolicyError, SetupError
 from runtime.core.types import Observation
 from runtime.ipc.session_state import SessionState
-from runtime.kinematics.forward import ChainForward
+from runtime.kinematics.base import ChainForward
 from runtime.policies.base import PolicyInfo
 from runtime.processes.coordinator import assembly
 from runtime.processes.coordinator.inference.runners import LockstepRunner

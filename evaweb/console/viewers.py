@@ -1,4 +1,4 @@
-"""Current visibilities of the users with open pages, from the database."""
+"""Users with open pages: whether their login is still valid, and which checkpoints they may see."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 from channels.db import database_sync_to_async
 from django.db import Error
 
+from evaweb.accounts.credentials import SESSION, credentials
+from evaweb.accounts.roles import Role, role_of
 from evaweb.blinding.visibility import Visibility, visibility_for_user
 
 log = logging.getLogger(__name__)
@@ -29,3 +31,12 @@ async def current_visibilities(users: Mapping[int, Any]) -> dict[int, Visibility
 
 def _found(users: Mapping[int, Any]) -> dict[int, Visibility]:
     return {key: visibility_for_user(user) for key, user in users.items()}
+
+
+def current_role(session_key: str) -> Role | None:
+    """Return the current role of the session's user, read from the database.
+
+    None if they have logged out, were deactivated, or their password was changed elsewhere.
+    """
+    user = credentials.look_up(SESSION, session_key)
+    return None if user is None else role_of(user)
