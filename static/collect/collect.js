@@ -3,7 +3,7 @@
 import { config } from "../console/live/config.js";
 import { post, RequestFailed } from "../site/api.js";
 import { otherPresses } from "../site/presses.js";
-import { ARM_FIRST, armWords, big, discarding, leaderWords, subject, Twice, whyNotDiscard, whyNotLabel, whyNotStart } from "./moments.js";
+import { ARM_FIRST, armText, primaryAction, discardArguments, leaderText, labelTarget, Twice, discardProblem, labelProblem, startProblem } from "./actions.js";
 import { gamepads } from "./pads.js";
 import { t } from "../site/sentences.js";
 
@@ -85,8 +85,8 @@ export class CollectPanel {
     document.getElementById("collects-nothing").hidden = !snapshot || Boolean(collect);
     const task = document.querySelector("[data-session-uuid]")?.dataset.task;
     write("prompt", task ? `“${task}”` : t("page.collect.no_session", "No session is open."));
-    write("armed", armWords(snapshot ?? {}));
-    const { text, weight } = leaderWords(collect);
+    write("armed", armText(snapshot ?? {}));
+    const { text, weight } = leaderText(collect);
     write("leader", text);
     show("leader").dataset.weight = weight;
     this.#drawArm(collect);
@@ -114,7 +114,7 @@ export class CollectPanel {
 
   #drawBig(snapshot) {
     const button = document.getElementById("big");
-    const { kind, text } = big(snapshot ?? {});
+    const { kind, text } = primaryAction(snapshot ?? {});
     if (kind !== this.#kind) {
       this.#kind = kind;
       this.#changed = performance.now();
@@ -122,22 +122,22 @@ export class CollectPanel {
     }
     button.toggleAttribute("data-settling", kind === "run" && performance.now() - this.#changed < SETTLE_MS);
     button.dataset.gate = kind;
-    button.dataset.blocked = kind === "run" ? whyNotStart(snapshot, this.session) : "";
+    button.dataset.blocked = kind === "run" ? startProblem(snapshot, this.session) : "";
     button.classList.toggle("button-halt", kind === "stop");
     button.classList.toggle("button-primary", kind === "run");
     write("big", text);
   }
 
   #drawEpisode(snapshot, collect) {
-    const episode = subject(collect, this.#seen);
+    const episode = labelTarget(collect, this.#seen);
     const said = collect?.last?.uuid === episode ? collect.last : null;
     const busy = this.#busy === "rerecord" ? t("page.collect.rest_first", "the robot comes to rest first") : "";
     for (const button of document.querySelectorAll('[data-collect="label"]')) {
-      button.dataset.blocked = whyNotLabel(snapshot, episode);
+      button.dataset.blocked = labelProblem(snapshot, episode);
       button.setAttribute("aria-pressed", String(said?.result === button.dataset.result && !said.discarded));
     }
     for (const name of ["discard", "rerecord"]) {
-      document.querySelector(`[data-collect="${name}"]`).dataset.blocked = busy || whyNotDiscard(snapshot, episode);
+      document.querySelector(`[data-collect="${name}"]`).dataset.blocked = busy || discardProblem(snapshot, episode);
       document.querySelector(`[data-collect="${name}"]`).toggleAttribute("data-asks", this.#twice.asks(name));
     }
     write("discard", this.#twice.asks("discard") ? t("page.collect.again_discard", "Again: discard") : t("page.collect.discard", "Discard"));
@@ -209,12 +209,12 @@ export class CollectPanel {
   }
 
   get #episode() {
-    return subject(this.#store.snapshot?.collect, this.#seen);
+    return labelTarget(this.#store.snapshot?.collect, this.#seen);
   }
 
   /** What a question is about: session and episode, until that is discarded. */
   get #asked() {
-    return [this.session, this.#episode, whyNotDiscard(this.#store.snapshot ?? {}, this.#episode)].join();
+    return [this.session, this.#episode, discardProblem(this.#store.snapshot ?? {}, this.#episode)].join();
   }
 
   #give(kind, args = {}) {
@@ -247,7 +247,7 @@ export class CollectPanel {
       this.#commands.say(t("page.collect.discard_again", "Discard: press again to discard the episode; its files stay, it is never published"), "pressed");
       return;
     }
-    await this.#commands.give("discard", discarding(this.#store.snapshot?.collect, this.#episode));
+    await this.#commands.give("discard", discardArguments(this.#store.snapshot?.collect, this.#episode));
   }
 
   async #rerecord() {
@@ -256,7 +256,7 @@ export class CollectPanel {
       return;
     }
     this.draw();
-    const answer = await this.#commands.give("discard", discarding(this.#store.snapshot?.collect, this.#episode));
+    const answer = await this.#commands.give("discard", discardArguments(this.#store.snapshot?.collect, this.#episode));
     if (!answer) return;
     const why = await this.#rested();
     if (why) this.#commands.say(t("page.collect.rerecord_not_started", "Re-record: discarded, not started: {why}", { why }), "refused");
@@ -269,7 +269,7 @@ export class CollectPanel {
     let why = "";
     while (performance.now() < until) {
       const { snapshot } = this.#store;
-      why = whyNotStart(snapshot, this.session) || this.#commands.reason("run");
+      why = startProblem(snapshot, this.session) || this.#commands.reason("run");
       const open = Boolean(snapshot?.collect?.episode) || snapshot?.state_is.going;
       if (!open && !why) return "";
       if (!open && !snapshot?.state_is.held && why === ARM_FIRST) return snapshot.collect.why_not || why;

@@ -23,7 +23,7 @@ export function buttonName(button, mapping) {
   return mapping === "standard" && NAMES[button] ? `${NAMES[button]} (${button})` : t("page.pads.button", "button {button}", { button });
 }
 
-export function delivered() {
+export function defaultMapping() {
   return Object.fromEntries(Object.entries(ACTIONS).map(([action, { button }]) => [action, button]));
 }
 
@@ -35,13 +35,13 @@ export function whyNotKey(key, taken) {
 }
 
 /** `mapping` with `action` on `button`, or on a key; whatever was on that before is on none. */
-export function assigned(mapping, action, button) {
+export function withAssignment(mapping, action, button) {
   const freed = Object.entries(mapping).map(([other, at]) => [other, at === button ? null : at]);
   return { ...Object.fromEntries(freed), [action]: button };
 }
 
 /** What was kept, as far as it is a mapping; the delivered one for the rest. */
-export function restored(text) {
+export function parseMapping(text) {
   let kept = {};
   try {
     kept = JSON.parse(text ?? "{}") ?? {};
@@ -49,7 +49,7 @@ export function restored(text) {
     kept = {};
   }
   const fits = (at) => at === null || (Number.isInteger(at) && at >= 0 && at < 64) || (typeof at === "string" && at !== "" && !whyNotKey(at, []));
-  return Object.fromEntries(Object.entries(delivered()).map(([action, at]) => [action, fits(kept[action]) ? kept[action] : at]));
+  return Object.fromEntries(Object.entries(defaultMapping()).map(([action, at]) => [action, fits(kept[action]) ? kept[action] : at]));
 }
 
 /** Follows pads from look to look. */

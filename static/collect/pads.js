@@ -1,7 +1,7 @@
 // A gamepad at the Collect page: looked at while the page is visible, its buttons shown and changed. A pedal's key, too.
 
 import { PRESSED } from "../site/presses.js";
-import { ACTIONS, assigned, buttonName, delivered, Presses, restored, whyNotKey } from "./pad_buttons.js";
+import { ACTIONS, withAssignment, buttonName, defaultMapping, Presses, parseMapping, whyNotKey } from "./pad_buttons.js";
 import { t } from "../site/sentences.js";
 
 const KEY = "eva-pad";
@@ -13,7 +13,7 @@ export function gamepads(press) {
   const presses = new Presses();
   const part = (name) => document.querySelector(`[data-pad="${name}"]`);
   const list = document.getElementById("pad-list");
-  let mapping = restored(localStorage.getItem(KEY));
+  let mapping = parseMapping(localStorage.getItem(KEY));
   let changing = ""; // the action that waits for its button
   let shown = "";
   let looked = -Infinity;
@@ -29,7 +29,7 @@ export function gamepads(press) {
     list.append(row);
     return row;
   });
-  part("reset").addEventListener("click", () => keep(delivered()));
+  part("reset").addEventListener("click", () => keep(defaultMapping()));
 
   function keep(next) {
     mapping = next;
@@ -53,7 +53,7 @@ export function gamepads(press) {
 
   function pressed(button) {
     const action = !changing && Object.keys(mapping).find((one) => mapping[one] === button);
-    if (changing) keep(assigned(mapping, changing, button));
+    if (changing) keep(withAssignment(mapping, changing, button));
     else part("said").textContent = t("page.pads.does", "{button}: {does}", { button: buttonName(button, pads()[0]?.mapping), does: action ? ACTIONS[action].name : t("page.pads.nothing", "does nothing") });
     if (action) press(action);
     else window.dispatchEvent(new Event(PRESSED));

@@ -11,25 +11,25 @@ import { Commands } from "./commands/commands.js";
 import { config } from "./live/config.js";
 import { curvePane } from "./curves/curve_controls.js";
 import { figures } from "./debug/debug.js";
-import { draw, panes } from "./live/drawing.js";
+import { drawFrame, panes } from "./live/drawing.js";
 import { EStop } from "./commands/estop.js";
 import { Events } from "./live/events.js";
 import { keyboard } from "./commands/keys.js";
 import { LeaseControls } from "./commands/lease.js";
 import { preflights } from "./trial/preflight.js";
-import { regionLook } from "./trial/region_look.js";
+import { regionView } from "./trial/region_view.js";
 import { resetAid } from "./trial/reset_aid.js";
 import { scenePane } from "./scene/scene_pane.js";
-import { setUp } from "./trial/setup.js";
+import { setupStages } from "./trial/setup.js";
 import { LiveSocket } from "./live/socket.js";
-import { StopWay } from "./commands/stop_way.js";
+import { StopRoute } from "./commands/stop_route.js";
 import { statusBar } from "./live/status.js";
-import { current, mark } from "./trial/steps.js";
+import { currentStep, showStep } from "./trial/steps.js";
 import { Store } from "./live/store.js";
 import { tour } from "./tour.js";
 import { TrialPanel } from "./trial/trial.js";
-import { veil } from "./trial/veil.js";
-import { CLOSED } from "./live/words.js";
+import { applyRedaction } from "./trial/redaction.js";
+import { CLOSE_REASONS } from "./live/labels.js";
 
 /** What hears the messages of the socket; those that are for a part of the page the store tells to it. */
 function listen(store, events) {
@@ -60,13 +60,13 @@ async function start() {
   const store = new Store({ user: config.user, role: config.role, page: await pageId() });
   const events = new Events();
   const cameras = new Cameras(store);
-  const way = new StopWay(config.stops, config.api);
+  const way = new StopRoute(config.stops, config.api);
   const socket = new LiveSocket(`${config.socket}?page=${store.page}`, {
     told: listen(store, events),
-    draw: (frame) => draw(frame, store, cameras),
+    draw: (frame) => drawFrame(frame, store, cameras),
     changed: (open, code) => {
       store.open = open;
-      if (!open) Object.assign(store, { closed: CLOSED[code] ?? null, link: { ok: false, reason: "" } });
+      if (!open) Object.assign(store, { closed: CLOSE_REASONS[code] ?? null, link: { ok: false, reason: "" } });
       store.tell("open");
     },
     greet: ({ again = false } = {}) => {
@@ -83,12 +83,12 @@ async function start() {
   if (config.page === "eval") {
     tour(store);
     new TrialPanel(store, commands);
-    resetAid(regionLook());
+    resetAid(regionView());
   }
   if (config.page === "debug") byHand(store, socket, commands);
-  veil(store);
+  applyRedaction(store);
   if (config.page === "collect") new CollectPanel(store, commands);
-  setUp(store);
+  setupStages(store);
   preflights(store, commands);
   figures(store);
   store.on(["snapshot", "second"], () => steps(store));
@@ -104,7 +104,7 @@ async function start() {
 
 function steps(store) {
   const element = document.getElementById("steps");
-  mark(element, current(element.dataset, store.snapshot));
+  showStep(element, currentStep(element.dataset, store.snapshot));
 }
 
 start();

@@ -1,6 +1,6 @@
 // A line of hints for who has a simulated station for the first time: the next thing to press, until it is hidden.
 
-import { current } from "./trial/steps.js";
+import { currentStep } from "./trial/steps.js";
 import { t } from "../site/sentences.js";
 
 const KEY = "eva-tour"; // of this browser: "off" once the hints were hidden
@@ -16,7 +16,7 @@ const HINTS = {
 function hint(store) {
   if (store.lease === "free") return HINTS.free;
   if (store.lease !== "mine") return "";
-  const step = current(document.getElementById("steps").dataset, store.snapshot);
+  const step = currentStep(document.getElementById("steps").dataset, store.snapshot);
   return HINTS[store.snapshot?.state_is?.run_open ? "running" : step] ?? "";
 }
 

@@ -1,21 +1,21 @@
 // Rectangles on a picture, in shares of its width and height: {x, y, width, height}, always inside.
 
-export const LEAST = 0.02; // of a side: less is a slip of the hand
+export const MIN_SIDE = 0.02; // of a side: less is a slip of the hand
 
 /** The rectangle between two points, in whatever order they were pressed. */
-export function between(a, b) {
+export function fromPoints(a, b) {
   const [x, y] = [clamped(Math.min(a.x, b.x)), clamped(Math.min(a.y, b.y))];
   return rounded({ x, y, width: clamped(Math.max(a.x, b.x)) - x, height: clamped(Math.max(a.y, b.y)) - y });
 }
 
 /** The same rectangle elsewhere, pushed back where it would leave the picture. */
-export function moved(rectangle, dx, dy) {
+export function translate(rectangle, dx, dy) {
   const { width, height } = rectangle;
   return rounded({ ...rectangle, x: within(rectangle.x + dx, 1 - width), y: within(rectangle.y + dy, 1 - height) });
 }
 
 /** One of its numbers changed; the others give way where it would leave the picture. */
-export function changed(rectangle, key, value) {
+export function withValue(rectangle, key, value) {
   const along = { x: ["x", "width"], width: ["x", "width"], y: ["y", "height"], height: ["y", "height"] }[key];
   const given = clamped(Number.isFinite(value) ? value : 0);
   const [place, size] = along;
@@ -24,7 +24,7 @@ export function changed(rectangle, key, value) {
 }
 
 /** A name that none of the others has. */
-export function fresh(names) {
+export function unusedName(names) {
   let k = 1;
   while (names.includes(`object ${k}`)) k += 1;
   return `object ${k}`;

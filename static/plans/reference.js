@@ -2,7 +2,7 @@
 
 import { post } from "../site/api.js";
 import { t } from "../site/sentences.js";
-import { between, changed, fresh, LEAST, moved } from "./rectangles.js";
+import { fromPoints, withValue, unusedName, MIN_SIDE, translate } from "./rectangles.js";
 
 const NUMBERS = ["x", "y", "width", "height"];
 const CROP = 96; // pixels of a preview's longer side
@@ -50,16 +50,16 @@ class Drawing {
     const sized = event.target.matches(".region-corner");
     const drag = (later) => {
       const to = this.#at(later);
-      if (!before) this.#regions[index] = { name: this.#regions[index]?.name ?? this.#fresh(), ...between(from, to) };
-      else if (sized) this.#regions[index] = { ...before, ...between(before, to) };
-      else this.#regions[index] = moved(before, to.x - from.x, to.y - from.y);
+      if (!before) this.#regions[index] = { name: this.#regions[index]?.name ?? this.#fresh(), ...fromPoints(from, to) };
+      else if (sized) this.#regions[index] = { ...before, ...fromPoints(before, to) };
+      else this.#regions[index] = translate(before, to.x - from.x, to.y - from.y);
       this.#show();
     };
     const end = (last) => {
       this.#picture.removeEventListener("pointermove", drag);
       for (const kind of ["pointerup", "pointercancel"]) this.#picture.removeEventListener(kind, end);
       const made = this.#regions[index];
-      if (last.type === "pointercancel" || (made && Math.min(made.width, made.height) < LEAST)) {
+      if (last.type === "pointercancel" || (made && Math.min(made.width, made.height) < MIN_SIDE)) {
         this.#regions.splice(index, 1, ...(before ? [before] : []));
       } else if (made && !before) this.#name(index);
       this.#show();
@@ -70,7 +70,7 @@ class Drawing {
   }
 
   #fresh() {
-    return fresh(this.#regions.map((region) => region.name));
+    return unusedName(this.#regions.map((region) => region.name));
   }
 
   #add(rectangle) {
@@ -90,7 +90,7 @@ class Drawing {
     const index = Number(field.closest("[data-row]").dataset.row);
     const region = this.#regions[index];
     if (field.dataset.of === "name") region.name = field.value;
-    else this.#regions[index] = changed(region, field.dataset.of, Number(field.value) / 100);
+    else this.#regions[index] = withValue(region, field.dataset.of, Number(field.value) / 100);
     this.#draw();
   }
 

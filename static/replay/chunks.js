@@ -1,6 +1,6 @@
 // Which chunk owns each step, which steps several chunks made, and what is known of a chunk.
 
-import { last } from "../site/ascending.js";
+import { lastNotAbove } from "../site/binary_search.js";
 
 const NONE = -1;
 
@@ -51,13 +51,13 @@ export class Chunks {
 
   /** The chunk that owns the step at `time`, -1 where there is none. */
   ownerAt(time) {
-    const tick = last(this.#time, time);
+    const tick = lastNotAbove(this.#time, time);
     return tick < 0 || time >= this.#end(tick) ? NONE : this.#owner[tick];
   }
 
   /** What made the step at `time`: [{id, weight}], the largest share first. */
   makersAt(time) {
-    const tick = last(this.#time, time);
+    const tick = lastNotAbove(this.#time, time);
     if (tick < 0) return [];
     const found = [];
     for (let at = this.#makers[tick]; at < this.#makers[tick + 1]; at += 1) found.push({ id: this.#maker.chunk[at], weight: this.#maker.weight[at] });
@@ -66,7 +66,7 @@ export class Chunks {
 
   /** What is known of chunk `id`; null for the held target and for one that no policy gave. */
   about(id) {
-    const at = last(this.#known.id, id);
+    const at = lastNotAbove(this.#known.id, id);
     if (at < 0 || this.#known.id[at] !== id) return null;
     const told = Object.fromEntries(Object.entries(this.#known).map(([name, values]) => [name, values[at]]));
     return { ...told, strategy: this.#strategies[told.strategy] ?? "", seconds: told.arrived - told.observed };

@@ -2,7 +2,7 @@
 
 import { KINDS, SECOND } from "../console/curves/curve_kinds.js";
 import { jointOptions } from "../console/manual/joint_names.js";
-import { last } from "../site/ascending.js";
+import { lastNotAbove } from "../site/binary_search.js";
 import { t } from "../site/sentences.js";
 import { Plot } from "./plot.js";
 
@@ -130,5 +130,5 @@ function signals(kind, joints) {
 /** What the newest chunk wants at `time`; NaN where it says nothing. */
 function wanted(chunks, time) {
   const chunk = chunks.findLast(({ times }) => times[0] <= time);
-  return chunk ? chunk.values[last(chunk.times, time)] : NaN;
+  return chunk ? chunk.values[lastNotAbove(chunk.times, time)] : NaN;
 }

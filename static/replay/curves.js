@@ -1,13 +1,13 @@
 // The pane of the curves: small multiples of the joints that were chosen, or move most, and what holds for all of them.
 
 import { Legend } from "../console/curves/curve_legend.js";
-import { last } from "../site/ascending.js";
+import { lastNotAbove } from "../site/binary_search.js";
 import { t } from "../site/sentences.js";
 import { Chunks } from "./chunks.js";
 import { CurveCell } from "./curve_cell.js";
 import { joint, message } from "./data.js";
 import { movingMost } from "./moving.js";
-import { tunes } from "./plot.js";
+import { isTuningEvent } from "./plot.js";
 import { readout, write } from "./readout.js";
 
 const KEY = "eva-replay-joints"; // names, as they were chosen; without it those that move most
@@ -156,7 +156,7 @@ class Pane {
     if (safety.includes(1)) mark(element, t("page.marks.changed", "changed"), "--warn", "tick", t("page.marks.changed_means", "safety sent another action than the one requested"));
     if (safety.includes(2)) mark(element, t("page.marks.refused", "refused"), "--danger", "tick", t("page.marks.refused_means", "safety sent nothing"));
     if (header.marks.length) mark(element, t("page.marks.event", "event"), "--text-normal", "tick", t("page.marks.event_means", "an event from the list"));
-    if (header.marks.some(({ kind }) => tunes(kind))) mark(element, t("page.marks.tuned", "tuned"), "--active", "hairline", t("page.marks.tuned_means", "another strategy, or other parameters, from here on"));
+    if (header.marks.some(({ kind }) => isTuningEvent(kind))) mark(element, t("page.marks.tuned", "tuned"), "--active", "hairline", t("page.marks.tuned_means", "another strategy, or other parameters, from here on"));
     const { spaces } = this.#episode;
     if (!spaces.includes("joint")) this.#legend.explain("raw", spaces.length ? t("page.replay.other_space", "The policy acts in {spaces} space: it has no joints to draw.", { spaces: spaces.join(", ") }) : t("page.replay.no_space", "The policy acts in no space: it has no joints to draw."));
   }
@@ -172,7 +172,7 @@ class Pane {
     const time = (this.#hovered ?? this.#clock.time) + 1e-6;
     const { chunks, ticks } = this.#episode;
     const owner = chunks.ownerAt(time);
-    const tick = last(ticks.time, time);
+    const tick = lastNotAbove(ticks.time, time);
     for (const cell of this.#cells) cell.at(this.#clock.time, { tick, time, owner });
     write(this.#said, readout(chunks, time));
   }

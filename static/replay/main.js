@@ -5,7 +5,7 @@ import { cameras, firstPictures } from "./cameras.js";
 import { Clock } from "./clock.js";
 import { enlarged } from "./enlarged.js";
 import { Review } from "./review.js";
-import { travelled } from "./segments.js";
+import { showRecordedSegments } from "./segments.js";
 import { Timeline } from "./timeline.js";
 import { transport } from "./transport.js";
 
@@ -23,7 +23,7 @@ cameras(document, config.videos, clock);
 enlarged(document.getElementById("cameras"));
 transport(clock);
 if (document.getElementById("review")) new Review(clock);
-if (config.segments) travelled(clock, config.segments);
+if (config.segments) showRecordedSegments(clock, config.segments);
 await firstPictures(document);
 import("./curves.js")
   .then(({ curvePane }) => curvePane({ clock, address: config.curves, uplot: config.uplot }))

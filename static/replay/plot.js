@@ -10,7 +10,7 @@ const EVENT_HEIGHT = 7; // px
 const FAINT = 0.6; // of what the chunks wanted that are not under the cursor
 
 /** Whether an event of that kind is another strategy, or other parameters of it. */
-export function tunes(kind) {
+export function isTuningEvent(kind) {
   return kind === "tuned" || kind === "tuned_to";
 }
 
@@ -176,8 +176,8 @@ export class Plot {
       for (const [from, to] of this.#behind.held) ctx.fillRect(x(from), top, Math.max(1, x(to) - x(from)), height);
       this.#lane.behind(ctx, x, place);
       for (const { time, kind } of this.#behind.marks) {
-        const tall = tunes(kind) ? height : EVENT_HEIGHT * devicePixelRatio;
-        ctx.fillStyle = css(tunes(kind) ? "--active" : "--text-normal");
+        const tall = isTuningEvent(kind) ? height : EVENT_HEIGHT * devicePixelRatio;
+        ctx.fillStyle = css(isTuningEvent(kind) ? "--active" : "--text-normal");
         ctx.fillRect(Math.round(x(time)), top, 2 * devicePixelRatio, tall);
       }
       if (this.#shown(RAW.name)) this.#drawRaw(plot, ctx, x);

@@ -4,8 +4,8 @@ import { get, post } from "../site/api.js";
 import { t } from "../site/sentences.js";
 import { when } from "../site/times.js";
 import { Annotation } from "./annotation.js";
-import { sayLost } from "./lost.js";
-import { bands, flagFrom, flagsAt, list, span, verdictWord } from "./review_lanes.js";
+import { showLostFrames } from "./lost_frames.js";
+import { drawBands, nextFlag, flagsAt, fillList, span, verdictWord } from "./review_lanes.js";
 
 const NOTE_S = 2; // a note is shown from its moment on
 const LOOK_AGAIN_MS = 4000; // while the checks are not done
@@ -86,19 +86,19 @@ export class Review {
     state.textContent = verdict ? t("page.review.verdict_by", "{verdict} by {who}", { verdict: verdictWord(verdict.verdict), who: verdict.reviewer }) : t("page.review.unreviewed", "unreviewed");
     state.dataset.verdict = verdict?.verdict ?? "";
     const notes = this.#notes.map(({ frame, note, reviewer }) => ({ first: frame, last: frame, severity: "note", text: `${reviewer}: ${note}` }));
-    bands(element("flags"), [...[...flags].reverse(), ...notes], this.#frames, (band, flag) => {
+    drawBands(element("flags"), [...[...flags].reverse(), ...notes], this.#frames, (band, flag) => {
       band.dataset.severity = flag.severity;
       band.title = flag.text;
       band.addEventListener("click", () => this.#clock.seekRow(flag.first));
     });
     const go = ({ first }) => (first >= 0 ? () => this.#clock.seekRow(first) : null);
-    list(element("flags-list"), this.#flagLines(), quality ? t("page.review.nothing_found", "The checks found nothing.") : t("page.review.not_done", "The checks are not done yet."));
-    list(
+    fillList(element("flags-list"), this.#flagLines(), quality ? t("page.review.nothing_found", "The checks found nothing.") : t("page.review.not_done", "The checks are not done yet."));
+    fillList(
       element("segments-list"),
       segments.map((one) => ({ words: one.label, detail: span(one, one.annotator), go: go(one) })),
       t("page.review.no_segments_yet", "No segment is annotated yet."),
     );
-    list(
+    fillList(
       element("history-list"),
       reviews.map((one) => ({
         words: one.note ? `${verdictWord(one.verdict)}: ${one.note}` : verdictWord(one.verdict),
@@ -149,7 +149,7 @@ export class Review {
     const here = element("flag-here");
     here.textContent = here.title = near ? `${near.reviewer}: ${near.note}` : (flag?.text ?? "");
     here.dataset.severity = near ? "note" : (flag?.severity ?? "");
-    sayLost(this.#said.flags, row);
+    showLostFrames(this.#said.flags, row);
   }
 
   // --- what is done --------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ export class Review {
   }
 
   #toFlag(step) {
-    const row = flagFrom(this.#said.flags, this.#clock.row, step);
+    const row = nextFlag(this.#said.flags, this.#clock.row, step);
     if (row === null) this.#tell(step > 0 ? t("page.review.no_flag_after", "No flag begins after this row.") : t("page.review.no_flag_before", "No flag begins before this row."));
     else this.#clock.seekRow(row);
   }

@@ -5,7 +5,7 @@ import { t } from "../site/sentences.js";
 const RANK = { error: 0, warning: 1, info: 2 };
 
 /** Bands of `items` ({first, last, ...}) in a strip; `dress` gives each its look. One about no frame has none. */
-export function bands(strip, items, frames, dress) {
+export function drawBands(strip, items, frames, dress) {
   strip.replaceChildren(
     ...items
       .filter(({ first }) => first >= 0)
@@ -21,7 +21,7 @@ export function bands(strip, items, frames, dress) {
 }
 
 /** Rows of a segment's lanes: those that overlap lie below each other. */
-export function stacked(segments) {
+export function stackLanes(segments) {
   const ends = [];
   return segments.map((segment) => {
     const free = ends.findIndex((end) => end < segment.first);
@@ -37,14 +37,14 @@ export function flagsAt(flags, row) {
 }
 
 /** Where the next flag begins after `row`, or the one before it; none: null. */
-export function flagFrom(flags, row, step) {
+export function nextFlag(flags, row, step) {
   const starts = [...new Set(flags.map(({ first }) => first))].filter((first) => first >= 0 && (step > 0 ? first > row : first < row));
   if (!starts.length) return null;
   return step > 0 ? Math.min(...starts) : Math.max(...starts);
 }
 
 /** A list in place of what it had; each item is { words, detail, mark, go }, `none` is said where there is none. */
-export function list(element, items, none) {
+export function fillList(element, items, none) {
   const made = items.map(({ words, detail, mark, go }) => {
     const item = document.createElement("li");
     const line = document.createElement(go ? "button" : "p");

@@ -2,7 +2,7 @@
 // On the empty lane a drag draws one; the ends of one's own are moved by a drag, or by arrow keys while they have the focus.
 
 import { t } from "../site/sentences.js";
-import { overlaps, stacked } from "./review_lanes.js";
+import { overlaps, stackLanes } from "./review_lanes.js";
 
 const SETTLED_MS = 700; // after the last arrow key an end is where it was meant to be
 
@@ -54,7 +54,7 @@ export class SegmentLane {
   #render() {
     const { uuid, end } = this.#focused();
     const open = this.#open.isConnected;
-    const placed = stacked(this.#segments);
+    const placed = stackLanes(this.#segments);
     this.#strip.style.setProperty("--lanes", String(1 + Math.max(0, ...placed.map(({ lane }) => lane))));
     this.#strip.replaceChildren(...placed.map((one) => this.#band(one)), ...overlaps(this.#segments).map((one) => this.#overlap(one)));
     if (open) this.#strip.append(this.#open);

@@ -3,11 +3,11 @@
 import { get } from "../site/api.js";
 import { t } from "../site/sentences.js";
 import { when } from "../site/times.js";
-import { list, span, verdictWord } from "./review_lanes.js";
+import { fillList, span, verdictWord } from "./review_lanes.js";
 import { SegmentLane } from "./segment_lane.js";
 
 /** Fetch what lies beside the episode and show it under the time axis and in a list. */
-export async function travelled(clock, address) {
+export async function showRecordedSegments(clock, address) {
   const strip = document.getElementById("segments");
   const count = document.getElementById("segments-count");
   try {
@@ -20,8 +20,8 @@ export async function travelled(clock, address) {
       go: () => clock.seekRow(first),
     }));
     const judged = [...reviews].reverse().map(({ verdict, note, by, at }) => ({ words: note ? `${verdictWord(verdict)}: ${note}` : verdictWord(verdict), detail: `${by}, ${when(at)}`, mark: verdict }));
-    list(document.getElementById("segments-list"), said, t("page.review.no_segments", "No segment is annotated."));
-    list(document.getElementById("history-list"), judged, t("page.review.no_reviews", "No review."));
+    fillList(document.getElementById("segments-list"), said, t("page.review.no_segments", "No segment is annotated."));
+    fillList(document.getElementById("history-list"), judged, t("page.review.no_reviews", "No review."));
     count.textContent = segments.length ? t("page.review.segments_n", "Segments {n}", { n: segments.length }) : t("page.review.segments", "Segments");
     document.getElementById("history-count").textContent = reviews.length ? t("page.review.verdicts_n", "Verdicts {n}", { n: reviews.length }) : t("page.review.verdicts", "Verdicts");
   } catch (error) {

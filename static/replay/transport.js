@@ -1,7 +1,7 @@
 // Buttons and keys of the playback. Space plays here: this page is bound to no station.
 
 import { t } from "../site/sentences.js";
-import { link } from "./link.js";
+import { syncWithUrl } from "./url_state.js";
 
 const SECOND_KEYS = { ArrowLeft: -1, ArrowRight: 1 };
 
@@ -22,7 +22,7 @@ export function transport(clock) {
   clock.addEventListener("pause", say);
   rangeControls(clock);
   document.addEventListener("keydown", (event) => key(event, clock, speed));
-  link(clock, (wanted) => choose(speed, wanted));
+  syncWithUrl(clock, (wanted) => choose(speed, wanted));
 }
 
 /** The nearest of the speeds there are. */

@@ -2,7 +2,7 @@
 
 import { cameras } from "../replay/cameras.js";
 import { Clock, Shifted } from "../replay/clock.js";
-import { link } from "../replay/link.js";
+import { syncWithUrl } from "../replay/url_state.js";
 import { t } from "../site/sentences.js";
 
 const SECOND = { ArrowLeft: -1, ArrowRight: 1 };
@@ -25,7 +25,7 @@ class Player {
     });
     this.#controls();
     bar.hidden = false;
-    if ("link" in bar.dataset) link(this.#clock, (wanted) => this.#choose(wanted));
+    if ("link" in bar.dataset) syncWithUrl(this.#clock, (wanted) => this.#choose(wanted));
   }
 
   #part(name) {

@@ -88,7 +88,7 @@ def test_trials_of_a_blind_plan_are_made_through_the_tab(operator, patient):
     page.locator("[data-confirm-cameras]").click()
     first = started(operator)
     page.locator("body[data-veiled]").wait_for()
-    eventually(lambda: page.locator("[data-tells]").count() == 0, "what tells is gone")
+    eventually(lambda: page.locator("[data-reveals]").count() == 0, "what tells is gone")
     page.keyboard.press("1")
     eventually(lambda: page.locator("#live input[name=milestone]").first.is_checked(), "it is ticked")
     eventually(lambda: "at " in page.locator("#live [data-at]").first.inner_text(), "the tick has its time")

@@ -5,9 +5,9 @@ import { uuid } from "../../site/identity.js";
 import { otherPresses } from "../../site/presses.js";
 import { config } from "../live/config.js";
 import { Asking } from "./asking.js";
-import { refusal } from "./reasons.js";
+import { pageProblem } from "./reasons.js";
 import { answered, STOPPING, Stops } from "./stops.js";
-import { verb } from "../live/words.js";
+import { commandLabel } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const STATUS = { accepted: t("page.commands.accepted", "accepted"), done: t("page.commands.done", "done") };
@@ -48,7 +48,7 @@ export class Commands {
 
   /** Send one command, for a trial, a session, an episode to replay or the checkpoint of that id where one is given; resolves to the answer, or null where it was not accepted (and says why on the page). */
   async give(kind, args = {}, { trial = null, checkpoint = "", session = "", replay = null } = {}) {
-    const name = verb(kind);
+    const name = commandLabel(kind);
     let told = 0; // when this press last said something
     const own = (words) => {
       this.say(t("page.common.why", "{name}: {why}", { name, why: words }), "pressed");
@@ -92,7 +92,7 @@ export class Commands {
   /** Something else was pressed. */
   #askNoMore() {
     const refused = this.#asking?.end();
-    if (refused) this.fail(verb("resume"), refused);
+    if (refused) this.fail(commandLabel("resume"), refused);
   }
 
   /** The acknowledgement of a stop or pause came over the socket. */
@@ -103,7 +103,7 @@ export class Commands {
   /** An answer after the page had given up, or has been answered by post: said only where its own is said to be unknown. */
   #late(ack) {
     if (ack.uuid !== this.#unknown) return;
-    const name = verb(ack.kind);
+    const name = commandLabel(ack.kind);
     try {
       this.say(t("page.commands.late", "{name}: {status}, answered late", { name, status: STATUS[answered(ack).status] ?? answered(ack).status }), "accepted");
     } catch (error) {
@@ -137,7 +137,7 @@ export class Commands {
 
   /** Why `kind` cannot be given now, "" where it can. */
   reason(kind) {
-    return refusal(kind, this.#store);
+    return pageProblem(kind, this.#store);
   }
 
   /** Enable and disable every button that gives a command; a disabled one says why. */
@@ -163,11 +163,11 @@ export class Commands {
     if (!button) return;
     const { command: kind, trial, checkpoint, replay } = button.dataset;
     if (button.getAttribute("aria-disabled") === "true") {
-      this.say(t("page.common.why", "{name}: {why}", { name: verb(kind), why: button.title }), "refused");
+      this.say(t("page.common.why", "{name}: {why}", { name: commandLabel(kind), why: button.title }), "refused");
       return;
     }
     if (this.#pending.has(kind) && !STOPPING.includes(kind)) {
-      this.say(t("page.commands.pressed_already", "{name}: pressed already, and not answered yet", { name: verb(kind) }), "pressed");
+      this.say(t("page.commands.pressed_already", "{name}: pressed already, and not answered yet", { name: commandLabel(kind) }), "pressed");
       return;
     }
     this.#pending.add(kind);

@@ -8,7 +8,7 @@ import { jointOptions } from "../manual/joint_names.js";
 import { GHOSTS } from "../scene/scene_ghosts.js";
 import { MarkLegend } from "./mark_legend.js";
 import { Tags } from "../scene/tags.js";
-import { duration } from "../live/words.js";
+import { formatDuration } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const KEY = `eva-joint-${config.station}`;
@@ -39,7 +39,7 @@ export async function curvePane(store) {
   pauseButton(every);
   const tags = new Tags(document.querySelector(".curves-pane"), "curves-tags");
   store.on("second", () => {
-    tags.show("paused", curves.paused && t("page.curves.paused", "paused {time} ago; data keeps arriving", { time: duration(curves.pausedFor) }));
+    tags.show("paused", curves.paused && t("page.curves.paused", "paused {time} ago; data keeps arriving", { time: formatDuration(curves.pausedFor) }));
     tags.show("simulated", curves.simulated && t("page.curves.simulated", "under the bar: executed by the simulated robot"), GHOSTS.simulated.colour);
   });
   return {

@@ -1,10 +1,10 @@
 // Curves of one joint over the last seconds: where it is, what the policy wants, what was planned, what was sent.
 
-import { last } from "../../site/ascending.js";
+import { lastNotAbove } from "../../site/binary_search.js";
 import { KINDS, axes, series, spread } from "./curve_kinds.js";
 import { marks } from "./curve_marks.js";
 import { Paint } from "./curve_paint.js";
-import { keep } from "./decimate.js";
+import { decimate } from "./decimate.js";
 import { Trace } from "./trace.js";
 
 const SECONDS = 20;
@@ -140,7 +140,7 @@ export class Curves {
 
   /** What is drawn of these columns, NaN as uPlot has it. */
   #fill(times, columns) {
-    const kept = keep(columns, 2 * this.#plot.width);
+    const kept = decimate(columns, 2 * this.#plot.width);
     this.#data.forEach((numbers, index) => {
       const column = index ? columns[index - 1] : times;
       numbers.length = kept.length;
@@ -163,7 +163,7 @@ export class Curves {
   #sample(time) {
     if (!this.#columns || time === undefined) return null;
     const { times, ...columns } = this.#columns;
-    const at = last(times, time + 1e-6);
+    const at = lastNotAbove(times, time + 1e-6);
     return at < 0 ? null : Object.fromEntries(Object.entries(columns).map(([name, numbers]) => [name, numbers[at]]));
   }
 

@@ -5,7 +5,7 @@
  * The indices to draw of columns `curves` (arrays of one length, NaN for no value) so that at most about
  * `limit` points remain; all of them where there are fewer.
  */
-export function keep(curves, limit) {
+export function decimate(curves, limit) {
   const length = curves[0]?.length ?? 0;
   const perBucket = 2 * curves.length;
   const buckets = Math.max(1, Math.floor(limit / perBucket));

@@ -1,9 +1,9 @@
 // The Debug page: figures of the station as the runtime measures them.
 
-import { summary, trouble } from "../live/camera_words.js";
+import { cameraSummary, cameraProblem } from "../live/camera_text.js";
 import { Distribution } from "./distribution.js";
-import { reachWords } from "../scene/reach.js";
-import { age, figure } from "../live/words.js";
+import { ikText } from "../scene/ik_text.js";
+import { formatAge, formatFigure } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const TELL_MS = 500; // figures that flicker cannot be read
@@ -11,19 +11,19 @@ const NO_ANSWER = t("page.figures.no_answer", "no answer yet");
 const CONNECTION = t("page.figures.connection", "Connection");
 
 const TEXTS = [
-  [t("page.figures.control", "Control"), ({ control: c }) => `${figure(c.rate, 0, "Hz")}, ${c.behaviour || "–"}, ${c.scheduling}`],
+  [t("page.figures.control", "Control"), ({ control: c }) => `${formatFigure(c.rate, 0, "Hz")}, ${c.behaviour || "–"}, ${c.scheduling}`],
   [t("page.figures.late", "Late by"), ({ control: c }) => lateness(c)],
   [t("page.figures.missed", "Missed"), ({ control: c }) => t("page.figures.missed_of", "{n} of {all} ticks", { n: c.missed, all: c.ticks })],
   [t("page.figures.policy", "Policy"), ({ policy: p, strategy }) => `${p.name || p.kind}, ${strategy}`],
   [CONNECTION, ({ policy: p }) => (p.lost ? t("page.figures.lost", "lost; next try {soon}", { soon: soon(p.retry_in_s) }) : ""), "warn"],
   [t("page.figures.predicted", "Predicted"), ({ policy: p, strategy }) => (strategy === "rtc" ? predicted(p.rtc ?? {}) : "")],
   ["RTC", ({ policy: p, strategy }) => (strategy === "rtc" ? p.rtc?.warning : ""), "warn"],
-  [t("page.figures.poses", "Poses"), ({ policy: p }) => (p.ik?.over ? "" : reachWords(p.ik))],
-  [t("page.figures.out_of_reach", "Out of reach"), ({ policy: p }) => (p.ik?.over ? reachWords(p.ik) : ""), "warn"],
-  [t("page.figures.joints", "Joints"), ({ link: l }) => t("page.common.old", "{age} old", { age: age(l.ages.joints ?? Infinity) })],
+  [t("page.figures.poses", "Poses"), ({ policy: p }) => (p.ik?.over ? "" : ikText(p.ik))],
+  [t("page.figures.out_of_reach", "Out of reach"), ({ policy: p }) => (p.ik?.over ? ikText(p.ik) : ""), "warn"],
+  [t("page.figures.joints", "Joints"), ({ link: l }) => t("page.common.old", "{age} old", { age: formatAge(l.ages.joints ?? Infinity) })],
   [t("page.figures.received", "Received"), ({ link: l }) => received(l)],
-  [t("page.figures.cameras", "Own cameras"), ({ link: l, clock }) => (troubled(l) ? "" : summary(l.cameras, clock))],
-  [t("page.figures.camera", "Camera"), ({ link: l, clock }) => (troubled(l) ? summary(l.cameras, clock) : ""), "warn"],
+  [t("page.figures.cameras", "Own cameras"), ({ link: l, clock }) => (troubled(l) ? "" : cameraSummary(l.cameras, clock))],
+  [t("page.figures.camera", "Camera"), ({ link: l, clock }) => (troubled(l) ? cameraSummary(l.cameras, clock) : ""), "warn"],
   [t("page.figures.commands", "Commands"), ({ link: l }) => Object.entries(l.unheard ?? {}).map(([topic, why]) => why || t("page.figures.no_listener", "no listener on {topic}", { topic })).join("; "), "warn"],
   [t("page.figures.faults", "Faults seen"), ({ link: l }) => Object.entries(l.faults).filter(([, count]) => count).map(([name, count]) => `${name} ${count}`).join(", ") || t("page.figures.none", "none")],
   [t("page.figures.task", "Task"), (snapshot) => snapshot.task || "–"],
@@ -38,11 +38,11 @@ const DISTRIBUTIONS = [
 ];
 
 function received({ age_ms: ages, scheduling }) {
-  return ages?.p99 === undefined ? "" : t("page.figures.received_ages", "p50 {p50}, p99 {p99} old, {scheduling}", { p50: figure(ages.p50, 1, "ms"), p99: figure(ages.p99, 1, "ms"), scheduling });
+  return ages?.p99 === undefined ? "" : t("page.figures.received_ages", "p50 {p50}, p99 {p99} old, {scheduling}", { p50: formatFigure(ages.p50, 1, "ms"), p99: formatFigure(ages.p99, 1, "ms"), scheduling });
 }
 
 function troubled(link) {
-  return Object.values(link.cameras ?? {}).some((told) => trouble(told, 0));
+  return Object.values(link.cameras ?? {}).some((told) => cameraProblem(told, 0));
 }
 
 /** Fill the list of figures with the newest state, twice a second. */

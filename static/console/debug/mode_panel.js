@@ -1,6 +1,6 @@
 // The step "Run" of the Debug page: which mode, the one big button of the moment, what is going on.
 
-import { distance, labels, MODES, phase, primary, proposed, SEEN, shown } from "./modes.js";
+import { distanceText, buttonLabels, MODES, phaseText, primaryCommand, proposed, SIM_INPUTS, shown } from "./modes.js";
 import { t } from "../../site/sentences.js";
 
 const SETTLE_MS = 600; // a button that took the place of another is not yet pressed by the hand that pressed that one
@@ -51,7 +51,7 @@ export class ModePanel {
     this.#drawChoice(mode, open, offered);
     this.#drawPrimary(snapshot ?? {}, mode);
     write("line", MODES[mode] ?? "");
-    write("phase", snapshot && this.#store.fresh ? phase({ ...snapshot, rate: snapshot.facts?.rate }) : "");
+    write("phase", snapshot && this.#store.fresh ? phaseText({ ...snapshot, rate: snapshot.facts?.rate }) : "");
     this.#drawNote(snapshot, mode, open);
     this.#drawFar(snapshot, mode, open);
   }
@@ -69,7 +69,7 @@ export class ModePanel {
   }
 
   #drawPrimary(snapshot, mode) {
-    const now = primary({ ...snapshot, mode });
+    const now = primaryCommand({ ...snapshot, mode });
     if (now !== this.#primary) {
       this.#primary = now;
       this.#changed = performance.now();
@@ -80,14 +80,14 @@ export class ModePanel {
       button.hidden = button.dataset.primary !== now;
       button.toggleAttribute("data-settling", settling);
     }
-    for (const [name, text] of Object.entries(labels(mode))) write(name, text);
+    for (const [name, text] of Object.entries(buttonLabels(mode))) write(name, text);
     this.#commands.gate();
   }
 
   #drawNote(snapshot, mode, open) {
     const running = open && this.#store.fresh;
     let text = "";
-    if (running && mode === "sim") text = t("page.modes.simulated", "Simulated: the real robot holds still. {seen}", { seen: SEEN[snapshot.sim_state] ?? "" });
+    if (running && mode === "sim") text = t("page.modes.simulated", "Simulated: the real robot holds still. {seen}", { seen: SIM_INPUTS[snapshot.sim_state] ?? "" });
     else if (running && mode === "preview") text = proposed(snapshot.proposal);
     write("note", text);
     part("note").hidden = !text;
@@ -100,7 +100,7 @@ export class ModePanel {
     const before = !open && snapshot?.state_is.ready && POLICY_MODES.includes(mode) && mode !== "sim" ? snapshot.first_action : null;
     const far = [proposal, before].find((one) => one?.far);
     part("far").hidden = !far;
-    if (far) write("far-text", proposal ? t("page.modes.chunk_far", "This chunk begins {distance}.", { distance: distance(far) }) : t("page.modes.action_far", "The policy's first action is {distance}: approach it on a limited path first, or run from here.", { distance: distance(far) }));
+    if (far) write("far-text", proposal ? t("page.modes.chunk_far", "This chunk begins {distance}.", { distance: distanceText(far) }) : t("page.modes.action_far", "The policy's first action is {distance}: approach it on a limited path first, or run from here.", { distance: distanceText(far) }));
   }
 }
 

@@ -1,6 +1,6 @@
 // The modes of a run in words: what each does, what can be pressed in it next, what it is doing just now.
 
-import { words } from "../live/words.js";
+import { stateLabel } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 /** In the order of the keys that choose them. */
@@ -14,13 +14,13 @@ export const MODES = {
 };
 
 /** What the policy sees in the mode sim, to be said while it runs. */
-export const SEEN = {
+export const SIM_INPUTS = {
   simulated: t("page.modes.seen_simulated", "The policy sees the simulated robot's joints and the live cameras."),
   live: t("page.modes.seen_live", "The policy sees the real robot's joints, which do not follow it, and the live cameras."),
 };
 
 /** The command of the one big button at this moment, "" where none is wanted; `key` of its label in LABELS. */
-export function primary({ state_is: is, mode, proposal }) {
+export function primaryCommand({ state_is: is, mode, proposal }) {
   if (is?.held) return "resume";
   if (!is?.going) return "run";
   if (mode === "step") return "step";
@@ -29,7 +29,7 @@ export function primary({ state_is: is, mode, proposal }) {
 }
 
 /** Names of buttons that mean something else in each mode. */
-export function labels(mode) {
+export function buttonLabels(mode) {
   return {
     step: mode === "preview" ? t("page.modes.show_next", "Show next") : t("page.modes.next_chunk", "Next chunk"),
     cancel: mode === "manual" ? t("page.modes.hold_here", "Hold here") : t("page.modes.cancel", "Cancel"),
@@ -46,15 +46,15 @@ const PHASES = {
 };
 
 /** What the run is doing, in words; "" where nothing is open. */
-export function phase({ state_is: is, phase: now, control, rate }) {
+export function phaseText({ state_is: is, phase: now, control, rate }) {
   if (!now || !is.at_work) return "";
-  if (now !== "executing") return PHASES[now] ?? words(now);
+  if (now !== "executing") return PHASES[now] ?? stateLabel(now);
   const left = control?.remaining ?? 0;
   return left > 0 && rate ? t("page.modes.ahead", "executing, {seconds} s ahead", { seconds: (left / rate).toFixed(1) }) : t("page.modes.executing", "executing");
 }
 
 /** How far a chunk's first row, or the policy's first action, is from where the robot is commanded. */
-export function distance({ distance: far, joint }) {
+export function distanceText({ distance: far, joint }) {
   if (!Number.isFinite(far)) return "";
   const at = { distance: far.toFixed(2), joint };
   return joint ? t("page.modes.joint_away", "{distance} rad away ({joint})", at) : t("page.modes.away", "{distance} rad away", at);
@@ -63,7 +63,7 @@ export function distance({ distance: far, joint }) {
 /** The chunk that is shown, in a sentence. */
 export function proposed(proposal) {
   if (!proposal?.chunk) return "";
-  const from = distance(proposal);
+  const from = distanceText(proposal);
   const begins = from && t("page.modes.begins", ", begins {from}", { from });
   const age = Number.isFinite(proposal.age_s) ? t("page.modes.shown_for", ", shown for {seconds} s", { seconds: proposal.age_s.toFixed(0) }) : "";
   return t("page.modes.chunk", "Chunk {chunk}: {rows} steps{begins}{age}.", { chunk: proposal.chunk, rows: proposal.rows, begins, age });

@@ -1,7 +1,7 @@
 // Pictures of the cameras, drawn from one JPEG each; what is old goes grey and says how old it is.
 
-import { origin, trouble } from "./camera_words.js";
-import { age } from "./words.js";
+import { cameraSource, cameraProblem } from "./camera_text.js";
+import { formatAge } from "./labels.js";
 import { t } from "../../site/sentences.js";
 
 const STALE_S = 0.5; // as the runtime's own bound on pictures
@@ -71,7 +71,7 @@ class Camera {
     const seconds = (now - this.capturedAt) / 1000;
     const stale = !(seconds < STALE_S);
     this.figure.toggleAttribute("data-stale", stale);
-    const text = Number.isFinite(seconds) && stale ? t("page.common.old", "{age} old", { age: age(seconds) }) : "";
+    const text = Number.isFinite(seconds) && stale ? t("page.common.old", "{age} old", { age: formatAge(seconds) }) : "";
     if (this.ageText.textContent !== text) this.ageText.textContent = text;
     if (stale) this.freshText.textContent = "";
   }
@@ -84,11 +84,11 @@ class Camera {
 
   /** How a camera of the station's own is, `told` by the runtime at its `clock` [s]; nothing of any other. */
   health(told, clock) {
-    const wrong = trouble(told, clock);
+    const wrong = cameraProblem(told, clock);
     const text = wrong ? t("page.common.why", "{name}: {why}", { name: wrong.word, why: wrong.reason }) : "";
     if (this.troubleText.textContent !== text) this.troubleText.textContent = text;
     this.troubleText.hidden = !text;
-    this.figure.title = told ? origin(told) : "";
+    this.figure.title = told ? cameraSource(told) : "";
   }
 
   rate(measured, captured, fastest, now) {
@@ -97,7 +97,7 @@ class Camera {
     const slow = known && measured < SLOW * fastest;
     const text = known ? `${measured.toFixed(1)} Hz${slow ? " !" : ""}` : this.drawnAny ? t("page.cameras.rate_unknown", "rate unknown") : t("page.cameras.opening", "no picture yet");
     const fresh = known && !this.figure.hasAttribute("data-stale") && Number.isFinite(captured);
-    this.freshText.textContent = fresh ? t("page.common.ago", "{age} ago", { age: age(captured) }) : "";
+    this.freshText.textContent = fresh ? t("page.common.ago", "{age} ago", { age: formatAge(captured) }) : "";
     if (this.rateText.textContent !== text) this.rateText.textContent = text;
     this.rateText.toggleAttribute("data-slow", slow);
     this.rateText.title = known

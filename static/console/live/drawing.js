@@ -9,7 +9,7 @@ const nothing = { poses() {}, bench() {}, chunk() {}, aim() {}, add() {}, joints
 export const panes = { scene: nothing, curves: nothing };
 
 /** Draw it; resolves when it is on the screen, which earns the next one. */
-export async function draw(frame, store, cameras) {
+export async function drawFrame(frame, store, cameras) {
   const { streams } = frame.header;
   const showPictures = await cameras.prepare(frame);
   await onScreen();

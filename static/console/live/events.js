@@ -1,7 +1,7 @@
 // The station's events, newest first: the sentences of its log, without gaps, filtered by words.
 
 import { clockTime } from "../../site/times.js";
-import { kindWords, sentence, weight } from "./event_words.js";
+import { kindLabel, eventText, severity } from "./event_text.js";
 import { t } from "../../site/sentences.js";
 
 const KEPT = 400;
@@ -56,19 +56,19 @@ export class Events {
 
   #row(event) {
     const { number, kind, wall } = event;
-    const text = sentence(event);
+    const text = eventText(event);
     const row = document.createElement("li");
     row.className = "event";
     row.dataset.kind = kind;
-    row.dataset.weight = weight(event);
-    row.dataset.words = `${kind} ${kindWords(kind)} ${event.text} ${text}`.toLowerCase();
+    row.dataset.weight = severity(event);
+    row.dataset.words = `${kind} ${kindLabel(kind)} ${event.text} ${text}`.toLowerCase();
     const time = document.createElement("time");
     time.textContent = clockTime(wall * 1000);
     if (!this.#covered) time.title = t("page.events.number", "event {n}", { n: number });
     const name = document.createElement("span");
     name.className = "event-kind clip";
-    name.textContent = kindWords(kind);
-    name.title = kindWords(kind);
+    name.textContent = kindLabel(kind);
+    name.title = kindLabel(kind);
     const words = document.createElement("span");
     words.textContent = text;
     words.title = event.text;

@@ -1,7 +1,7 @@
 // The status bar and the box that says what a person has to do: state by place, not by pop-up.
 
 import { badge } from "./badge.js";
-import { advice, age, duration, figure, words } from "./words.js";
+import { advice, formatAge, formatDuration, formatFigure, stateLabel } from "./labels.js";
 import { t } from "../../site/sentences.js";
 
 const TITLES = { mine: t("page.status.mine", "This page commands"), elsewhere: t("page.status.elsewhere", "You command on another page"), free: t("page.status.free", "The station is free") };
@@ -33,7 +33,7 @@ function drawState(store) {
     element.title = store.fresh ? snapshot.reason : trouble(store).reason;
   }
   const running = store.fresh && snapshot.run.number > 0;
-  write("clock", running ? duration(snapshot.run.elapsed) : "");
+  write("clock", running ? formatDuration(snapshot.run.elapsed) : "");
 }
 
 /** Why nothing is known, in a word and in a sentence. */
@@ -42,7 +42,7 @@ function trouble(store) {
   if (!store.open) return { word: t("page.status.no_connection", "no connection"), reason: t("page.status.no_connection_why", "The web server does not answer; this page tries again by itself.") };
   if (!store.link.ok) return { word: t("page.status.no_station", "no station"), reason: store.link.reason || t("page.status.no_station_why", "The station's runtime does not answer.") };
   if (!store.snapshot) return { word: t("page.status.waiting", "waiting"), reason: t("page.status.waiting_why", "No state has come yet.") };
-  return { word: t("page.status.silent", "silent {age}", { age: age(store.age) }), reason: t("page.status.silent_why", "The station has said nothing for a while; what is shown is old.") };
+  return { word: t("page.status.silent", "silent {age}", { age: formatAge(store.age) }), reason: t("page.status.silent_why", "The station has said nothing for a while; what is shown is old.") };
 }
 
 function drawSituation(store) {
@@ -72,11 +72,11 @@ function part(box, name) {
 function drawFigures(store, snapshot) {
   const joints = snapshot.link.ages.joints;
   if (!store.fresh) {
-    write("transport", t("page.status.last_news", "last news {age} ago", { age: age(store.age) }));
+    write("transport", t("page.status.last_news", "last news {age} ago", { age: formatAge(store.age) }));
     return;
   }
   const { transport } = snapshot;
-  write("transport", joints !== null && joints < 1 ? t("page.status.transport_ok", "{transport} ok", { transport }) : t("page.status.transport_silent", "{transport} silent {age}", { transport, age: age(joints ?? Infinity) }));
+  write("transport", joints !== null && joints < 1 ? t("page.status.transport_ok", "{transport} ok", { transport }) : t("page.status.transport_silent", "{transport} silent {age}", { transport, age: formatAge(joints ?? Infinity) }));
   drawPolicy(snapshot.policy);
   const held = { mine: t("page.status.held_you", "you"), elsewhere: t("page.status.held_elsewhere", "other page"), free: t("page.status.held_free", "free"), other: store.commander }[store.lease];
   write("lease", t("page.status.lease", "lease: {held}", { held }));
@@ -93,7 +93,7 @@ function drawFigures(store, snapshot) {
 
 /** How far the set-up is, or what an idle station waits for: the reason why a set-up failed among it. */
 function drawStage({ state_is: is, stage, reason }) {
-  const text = is.preparing ? t("page.status.stage", "{stage} …", { stage: words(stage) }) : is.idle ? reason : "";
+  const text = is.preparing ? t("page.status.stage", "{stage} …", { stage: stateLabel(stage) }) : is.idle ? reason : "";
   write("stage", text);
   for (const element of shown("stage")) {
     element.hidden = !text;
@@ -106,7 +106,7 @@ function drawPolicy(policy) {
   for (const element of shown("policy")) element.toggleAttribute("data-lost", Boolean(policy.lost));
   if (policy.lost) {
     write("policy", t("page.status.policy_lost", "policy lost, trying again"));
-    for (const element of shown("policy")) element.title = t("page.status.policy_retry", "The policy's server does not answer; next try in {time}", { time: figure(policy.retry_in_s, 1, "s") });
+    for (const element of shown("policy")) element.title = t("page.status.policy_retry", "The policy's server does not answer; next try in {time}", { time: formatFigure(policy.retry_in_s, 1, "s") });
     return;
   }
   const { latency_p50_ms: p50, latency_p90_ms: p90, answers } = policy;
@@ -114,7 +114,7 @@ function drawPolicy(policy) {
     write("policy", t("page.status.policy_silent", "policy: no answer yet"));
     return;
   }
-  const title = t("page.status.latency", "Inference latency of the last {n} answers: median {p50}, 90 % within {p90}", { n: answers, p50: figure(p50, 0, "ms"), p90: figure(p90, 0, "ms") });
+  const title = t("page.status.latency", "Inference latency of the last {n} answers: median {p50}, 90 % within {p90}", { n: answers, p50: formatFigure(p50, 0, "ms"), p90: formatFigure(p90, 0, "ms") });
   for (const element of shown("policy")) {
     if (!element.querySelector(".latency")) element.innerHTML = '<span class="muted"></span><span class="latency"><i></i></span><span></span>';
     element.firstElementChild.textContent = t("page.status.policy", "policy");

@@ -17,7 +17,7 @@ export class Store {
     this.joints = null; // {step, engaged, measured, commanded, simulated, ...} as they last came
     this.link = { ok: false, reason: t("page.status.connecting", "connecting") }; // between web and runtime
     this.open = false; // the socket to the web
-    this.closed = null; // why the web lets this page in no more, as words.js has it
+    this.closed = null; // why the web lets this page in no more, as labels.js has it
   }
 
   on(names, listener) {

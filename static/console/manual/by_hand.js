@@ -6,7 +6,7 @@ import { ManualPanel } from "./manual_panel.js";
 import { ModePanel } from "../debug/mode_panel.js";
 import { panels } from "../debug/panels.js";
 import { robotPanel } from "../debug/robot_panel.js";
-import { groups } from "./targets.js";
+import { groupJoints } from "./targets.js";
 import { TuningPanel } from "../debug/tuning_panel.js";
 
 export function byHand(store, socket, commands) {
@@ -25,7 +25,7 @@ export function byHand(store, socket, commands) {
 
 /** Unit and range of a group's gripper. */
 function aboutGripper(facts = {}, group) {
-  const own = groups({ units: config.units, ...facts }).find(({ name }) => name === group);
+  const own = groupJoints({ units: config.units, ...facts }).find(({ name }) => name === group);
   return own?.joints.find(({ gripper }) => gripper);
 }
 

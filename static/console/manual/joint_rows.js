@@ -1,6 +1,6 @@
 // A slider and a number for each joint of a group, within its limits.
 
-import { within } from "./targets.js";
+import { clampToLimits } from "./targets.js";
 import { digitsOf, shortUnit, stepOf } from "../curves/units.js";
 import { t } from "../../site/sentences.js";
 
@@ -66,7 +66,7 @@ export class JointRows {
 
   #set(joint, given, number, slider = null) {
     if (!Number.isFinite(given)) return;
-    const { value, said } = within(joint, given);
+    const { value, said } = clampToLimits(joint, given);
     number.value = value.toFixed(digitsOf(joint));
     if (slider) slider.value = value;
     this.#typed(joint.index, value, said);
@@ -75,7 +75,7 @@ export class JointRows {
   /** What is being typed counts at once, and is put in order when the field is left. */
   #type(joint, given, slider) {
     if (!Number.isFinite(given)) return;
-    const { value, said } = within(joint, given);
+    const { value, said } = clampToLimits(joint, given);
     slider.value = value;
     this.#typed(joint.index, value, said);
   }

@@ -3,7 +3,7 @@
 import { config } from "../live/config.js";
 import { groupButtons } from "./group_buttons.js";
 import { JointRows } from "./joint_rows.js";
-import { arrived, groups, handAt, jog, start, verdict } from "./targets.js";
+import { isAtTarget, groupJoints, tipPositionText, jogArguments, initialTarget, aimText } from "./targets.js";
 import { t } from "../../site/sentences.js";
 
 export class ManualPanel {
@@ -89,7 +89,7 @@ export class ManualPanel {
 
   #build(facts) {
     this.#names = facts.joint_names.join();
-    this.#groups = groups({ units: config.units, ...facts });
+    this.#groups = groupJoints({ units: config.units, ...facts });
     this.#target = null;
     this.#edited = false;
     const poses = (facts.poses ?? []).map((name) => new Option(name));
@@ -126,7 +126,7 @@ export class ManualPanel {
     const { joints } = this.#store;
     if (!joints || !this.#groups.length || joints.measured.length !== this.#dim) return;
     this.#rows.now(joints.measured);
-    const now = start(joints);
+    const now = initialTarget(joints);
     if (!this.#edited) this.#target = now;
     else for (const index of this.#grippers) if (!this.#held.has(index)) this.#target[index] = now[index];
     this.#show();
@@ -175,13 +175,13 @@ export class ManualPanel {
 
   /** `sent` is the press that had been made when this was asked: an answer from before it says of no arrival. */
   #heard(answer, sent = null) {
-    if (sent && sent === this.#sent && answer.ok && arrived(answer)) {
+    if (sent && sent === this.#sent && answer.ok && isAtTarget(answer)) {
       this.reset(t("page.manual.arrived", "The robot has arrived."));
       return;
     }
-    const { text, weight } = verdict(answer, Number(this.#speed.value));
+    const { text, weight } = aimText(answer, Number(this.#speed.value));
     this.#say(`${text} ${this.#clipped}`.trim(), this.#clipped ? "warn" : weight);
-    part("at").textContent = handAt(answer.poses, this.#store.snapshot.facts.arms.indexOf(this.#arm));
+    part("at").textContent = tipPositionText(answer.poses, this.#store.snapshot.facts.arms.indexOf(this.#arm));
   }
 
   async #toPose() {
@@ -198,7 +198,7 @@ export class ManualPanel {
     const settings = document.getElementById("jog-settings").elements;
     const [mm, degrees] = [Number(settings.mm.value), Number(settings.degrees.value)];
     if (this.#arm === undefined || !this.#target) return;
-    const step = jog({ arm: this.#arm, frame: settings.frame.value, axis, sign, turned, mm, degrees });
+    const step = jogArguments({ arm: this.#arm, frame: settings.frame.value, axis, sign, turned, mm, degrees });
     this.#steps = this.#steps.then(() => this.#stepped(step));
   }
 

@@ -1,32 +1,32 @@
 // Where a person wants the robot to go: joints by group, within their limits, and what the station said of it.
 
-import { labelled, parted } from "./joint_names.js";
+import { withLabels, splitName } from "./joint_names.js";
 import { digitsOf } from "../curves/units.js";
 import { t } from "../../site/sentences.js";
 
 const ENDLESS = 2 * Math.PI; // a joint without a limit is offered one turn each way
 
 /** Joints of `facts` in groups, in order: [{name, joints: [{index, joint, label, full, lower, upper, unit, gripper}]}]. */
-export function groups({ joint_names: names = [], lower = [], upper = [], units = [], gripper_dims: grippers = [] }) {
+export function groupJoints({ joint_names: names = [], lower = [], upper = [], units = [], gripper_dims: grippers = [] }) {
   const found = new Map();
   names.forEach((full, index) => {
-    const { group, joint: own } = parted(full);
+    const { group, joint: own } = splitName(full);
     if (!found.has(group)) found.set(group, []);
     const joint = { index, joint: own, full, unit: units[index] ?? "", gripper: grippers.includes(index) };
     found.get(group).push({ ...joint, lower: lower[index] ?? -ENDLESS, upper: upper[index] ?? ENDLESS });
   });
-  return [...found].map(([name, joints]) => ({ name, joints: labelled(joints, grippers) }));
+  return [...found].map(([name, joints]) => ({ name, joints: withLabels(joints, grippers) }));
 }
 
 /** A value within the joint's limits: {value, said}, where `said` tells what was clipped. */
-export function within({ lower, upper, full, unit }, value) {
+export function clampToLimits({ lower, upper, full, unit }, value) {
   const clipped = Math.min(upper, Math.max(lower, value));
   if (clipped === value) return { value, said: "" };
   return { value: clipped, said: t("page.manual.ends", "{joint} ends at {at}", { joint: full, at: clipped.toFixed(digitsOf({ lower, upper, unit })) }) };
 }
 
 /** Where the robot is, or is told to be: the target to begin with; null where nothing is known. */
-export function start({ measured, commanded, engaged } = {}) {
+export function initialTarget({ measured, commanded, engaged } = {}) {
   const from = engaged && commanded ? commanded : measured;
   return from ? [...from] : null;
 }
@@ -34,28 +34,28 @@ export function start({ measured, commanded, engaged } = {}) {
 const VERY_NEAR = 0.005; // rad, or m of a gripper
 
 /** Whether the robot is where the target is, as the station counts it. */
-export function arrived({ distance }) {
+export function isAtTarget({ distance }) {
   return distance < VERY_NEAR;
 }
 
 /** What the station said of a target, in a sentence with its weight: {text, weight}. */
-export function verdict({ ok, reason, distance, duration_s: seconds, reached, clipped = [], position_error_mm: mm, rotation_error_deg: deg }, speed) {
+export function aimText({ ok, reason, distance, duration_s: seconds, reached, clipped = [], position_error_mm: mm, rotation_error_deg: deg }, speed) {
   if (!ok) return { text: reason || t("page.manual.unsaid", "the station did not say where that is"), weight: "warn" };
   if (reached === false) return { text: t("page.manual.unreachable", "Out of reach: the nearest is {mm} mm and {deg}° off.", { mm: mm.toFixed(0), deg: deg.toFixed(1) }), weight: "warn" };
   const limited = clipped.length ? t("page.manual.limited", " Limited: {joints}.", { joints: clipped.join(", ") }) : "";
-  if (arrived({ distance })) return { text: t("page.manual.there", "The robot is there, within {near} rad.{limited}", { near: VERY_NEAR, limited }), weight: limited ? "warn" : "" };
+  if (isAtTarget({ distance })) return { text: t("page.manual.there", "The robot is there, within {near} rad.{limited}", { near: VERY_NEAR, limited }), weight: limited ? "warn" : "" };
   return { text: t("page.manual.away", "{distance} rad from the robot, {seconds} s.{limited}", { distance: distance.toFixed(2), seconds: (seconds / speed).toFixed(1), limited }), weight: limited ? "warn" : "" };
 }
 
 /** Position [mm] of the hand of arm number `index` in the poses of an answer, in words; "" where there is none. */
-export function handAt(poses, index) {
+export function tipPositionText(poses, index) {
   const at = poses?.slice(8 * index, 8 * index + 3) ?? [];
   if (at.length < 3) return "";
   return ["x", "y", "z"].map((axis, place) => `${axis} ${(1000 * at[place]).toFixed(0)}`).join("  ") + " mm";
 }
 
 /** The arguments of a jog: `axis` x, y, z with `sign`, by `mm`, or turned by `degrees` where `turned`. */
-export function jog({ arm, frame, axis, sign, turned, mm, degrees }) {
+export function jogArguments({ arm, frame, axis, sign, turned, mm, degrees }) {
   const along = ["x", "y", "z"].map((one) => (one === axis ? sign : 0));
   const part = turned ? "rotation" : "translation";
   const size = turned ? (degrees * Math.PI) / 180 : mm / 1000;

@@ -5,7 +5,7 @@ import { aimGhost } from "./aim_ghost.js";
 import { config } from "../live/config.js";
 import { Scene3D } from "./scene3d.js";
 import { GHOSTS } from "./scene_ghosts.js";
-import { ShownChunk } from "./shown_chunk.js";
+import { DisplayedChunk } from "./displayed_chunk.js";
 import { Tags } from "./tags.js";
 import { t } from "../../site/sentences.js";
 
@@ -21,7 +21,7 @@ export async function scenePane(store) {
     await shapes.fetch((why) => (note.textContent = t("page.scene3d.not_yet", "No 3D scene yet: {why}. It is asked for again.", { why })));
     note.hidden = true;
     aimGhost(scene);
-    const shown = new ShownChunk(scene, () => store.snapshot?.facts?.rate ?? store.facts.rate);
+    const shown = new DisplayedChunk(scene, () => store.snapshot?.facts?.rate ?? store.facts.rate);
     const tags = new Tags(element.parentElement, "scene-tags");
     const name = () => nameGhosts(tags, scene, shown);
     buttons(scene, shown, name);

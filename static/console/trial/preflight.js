@@ -3,7 +3,7 @@
 import { post } from "../../site/api.js";
 import { setReason } from "../commands/commands.js";
 import { config } from "../live/config.js";
-import { whyNoPreflight } from "../commands/reasons.js";
+import { preflightProblem } from "../commands/reasons.js";
 import { t } from "../../site/sentences.js";
 
 const TIMEOUT_MS = 15000; // other stations are asked first which server they use
@@ -13,7 +13,7 @@ export function preflights(store, commands) {
   const draw = () => {
     for (const button of document.querySelectorAll("[data-preflight-ask]")) {
       const checkpoint = chosen(button);
-      setReason(button, whyNoPreflight(store, checkpoint));
+      setReason(button, preflightProblem(store, checkpoint));
       const result = resultOf(button);
       if (result.dataset.of === checkpoint) continue;
       result.dataset.of = checkpoint;

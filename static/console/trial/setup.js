@@ -1,27 +1,27 @@
 // The set-up: its stages while it goes on, and which one failed.
 
-import { duration, words } from "../live/words.js";
+import { formatDuration, stateLabel } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const MARKS = { done: "✓", active: "▸", waiting: "·", failed: "✕", skipped: "–" };
 
 /** Whether the stages are to be shown: while they go on, and after one failed until the next try. */
-export function unfinished({ state_is: is, stages = [] }) {
+export function isUnfinished({ state_is: is, stages = [] }) {
   return is.preparing || (is.idle && stages.some((stage) => stage.state === "failed"));
 }
 
 /** Seconds of a stage in words; nothing for one that has not begun. */
-export function spent({ state, seconds }) {
+export function stageDuration({ state, seconds }) {
   if (!Number.isFinite(seconds) || state === "waiting" || state === "skipped") return "";
-  return seconds < 60 ? `${seconds.toFixed(1)} s` : duration(seconds);
+  return seconds < 60 ? `${seconds.toFixed(1)} s` : formatDuration(seconds);
 }
 
 /** Keeps lists with data-stages and the buttons beside them true. */
-export function setUp(store) {
+export function setupStages(store) {
   const draw = () => {
     const { snapshot } = store;
     if (!snapshot) return;
-    const stages = unfinished(snapshot) ? (snapshot.stages ?? []) : [];
+    const stages = isUnfinished(snapshot) ? (snapshot.stages ?? []) : [];
     for (const list of document.querySelectorAll("[data-stages]")) {
       list.hidden = !stages.length;
       fill(list, stages);
@@ -42,7 +42,7 @@ function fill(list, stages) {
   stages.forEach((stage, index) => {
     const item = list.children[index];
     item.dataset.state = stage.state;
-    const texts = [MARKS[stage.state] ?? "·", words(stage.name), stage.state === "skipped" ? t("page.setup.skipped", "skipped") : spent(stage)];
+    const texts = [MARKS[stage.state] ?? "·", stateLabel(stage.name), stage.state === "skipped" ? t("page.setup.skipped", "skipped") : stageDuration(stage)];
     texts.forEach((text, place) => {
       const cell = item.children[place];
       if (cell.textContent !== text) cell.textContent = text;

@@ -1,14 +1,14 @@
 // Which of the numbered steps is the one to do now; its button alone is the primary one.
 
-import { step } from "../../collect/moments.js";
+import { collectStep } from "../../collect/actions.js";
 
 /** The step that `panel` (data of the fragment) and the live state ask for. */
-export function current({ panel, status, setUp }, snapshot) {
+export function currentStep({ panel, status, setUp }, snapshot) {
   const is = snapshot?.state_is;
   if (panel === "debug") {
     return is?.set_up ? "run" : "setup";
   }
-  if (panel === "collect") return step(snapshot, document.querySelector("[data-session-uuid]"));
+  if (panel === "collect") return collectStep(snapshot, document.querySelector("[data-session-uuid]"));
   if (status === "ended") return "score";
   if (status === "running" || status === "paused") return "run";
   if (status === "prepared") return setUp === "yes" && is?.ready ? "run" : "setup";
@@ -16,7 +16,7 @@ export function current({ panel, status, setUp }, snapshot) {
 }
 
 /** Show it: the steps before it are done, those after it wait. */
-export function mark(steps, now) {
+export function showStep(steps, now) {
   let done = true;
   for (const step of steps.querySelectorAll("[data-step]")) {
     const here = step.dataset.step === now;

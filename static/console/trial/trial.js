@@ -4,7 +4,7 @@ import { post, RequestFailed } from "../../site/api.js";
 import { uuid } from "../../site/identity.js";
 import { config } from "../live/config.js";
 import { PlanControls, times } from "./plan.js";
-import { duration } from "../live/words.js";
+import { formatDuration } from "../live/labels.js";
 import { t } from "../../site/sentences.js";
 
 const OF_TRIALS = ["trial", "episode", "sight"];
@@ -61,7 +61,7 @@ export class TrialPanel {
     const clock = this.#panel.querySelector("[data-run-clock]");
     if (!clock) return;
     clock.hidden = run.number === 0;
-    clock.querySelector('[data-show="run-time"]').textContent = duration(run.elapsed);
+    clock.querySelector('[data-show="run-time"]').textContent = formatDuration(run.elapsed);
     if (limit) clock.querySelector("progress").value = Math.min(run.elapsed, limit);
   }
 

@@ -10,7 +10,7 @@ from tests.evaweb.console.test_modules import pytestmark, run
 from tests.standing import state_flags
 
 __all__ = ["pytestmark"]
-MOMENTS, PADS = "../collect/moments.js", "../collect/pad_buttons.js"
+MOMENTS, PADS = "../collect/actions.js", "../collect/pad_buttons.js"
 COLLECT = {"set_up": True, "armed": True, "why_not": "", "episode": None, "last": None, "leader": None}
 
 
@@ -20,12 +20,12 @@ def call(name: str, *given: Any) -> Any:
 
 @pytest.mark.parametrize("state", ["setting_up", "running", "holding"])
 def test_wherever_the_robot_moves_the_big_button_stops_it(state: str) -> None:
-    assert call("big", state_flags(state))["kind"] == "stop"
+    assert call("primaryAction", state_flags(state))["kind"] == "stop"
 
 
 @pytest.mark.parametrize("state", ["ready", "idle", "faulted", "disconnected"])
 def test_at_rest_it_starts(state: str) -> None:
-    assert call("big", state_flags(state)) == {"kind": "run", "text": "Start"}
+    assert call("primaryAction", state_flags(state)) == {"kind": "run", "text": "Start"}
 
 
 @pytest.mark.parametrize(
@@ -40,35 +40,35 @@ def test_at_rest_it_starts(state: str) -> None:
 def test_nothing_starts_without_session_set_up_and_arm(
     changes: dict[str, Any], session: str, said: str
 ) -> None:
-    assert call("whyNotStart", {"collect": {**COLLECT, **changes}}, session) == said
+    assert call("startProblem", {"collect": {**COLLECT, **changes}}, session) == said
 
 
 def test_a_station_that_collects_nothing_starts_nothing() -> None:
-    assert call("whyNotStart", {"collect": None}, "s") == "this station collects nothing"
+    assert call("startProblem", {"collect": None}, "s") == "this station collects nothing"
 
 
 def test_what_is_said_is_about_the_open_episode_else_the_newest() -> None:
     last = {"uuid": "c", "result": None, "discarded": False}
-    assert call("subject", {**COLLECT, "episode": "a", "last": last}, "b") == "a"
-    assert call("subject", {**COLLECT, "last": last}, "b") == "b"
-    assert call("subject", {**COLLECT, "last": last}, None) == "c"
+    assert call("labelTarget", {**COLLECT, "episode": "a", "last": last}, "b") == "a"
+    assert call("labelTarget", {**COLLECT, "last": last}, "b") == "b"
+    assert call("labelTarget", {**COLLECT, "last": last}, None) == "c"
 
 
 def test_a_discarded_episode_is_not_labelled_and_not_discarded_again() -> None:
     snapshot = {**state_flags("ready"), "collect": {**COLLECT, "last": {"uuid": "a", "discarded": True}}}
-    assert call("whyNotLabel", snapshot, "a") == "the episode is discarded"
-    assert call("whyNotDiscard", snapshot, "a") == "the episode is discarded already"
-    assert call("whyNotLabel", snapshot, "b") == ""
+    assert call("labelProblem", snapshot, "a") == "the episode is discarded"
+    assert call("discardProblem", snapshot, "a") == "the episode is discarded already"
+    assert call("labelProblem", snapshot, "b") == ""
 
 
 def test_the_open_episode_is_not_named_where_it_is_discarded() -> None:
-    assert call("discarding", {**COLLECT, "episode": "a"}, "a") == {}
-    assert call("discarding", COLLECT, "a") == {"episode": "a"}
+    assert call("discardArguments", {**COLLECT, "episode": "a"}, "a") == {}
+    assert call("discardArguments", COLLECT, "a") == {"episode": "a"}
 
 
 def test_an_episode_is_labelled_once_it_is_over() -> None:
     assert (
-        call("whyNotLabel", {**state_flags("running"), "collect": {**COLLECT, "episode": "a"}}, "a")
+        call("labelProblem", {**state_flags("running"), "collect": {**COLLECT, "episode": "a"}}, "a")
         == "stop and save first"
     )
 
@@ -76,15 +76,15 @@ def test_an_episode_is_labelled_once_it_is_over() -> None:
 def test_the_step_to_do_is_the_result_until_somebody_has_said_it() -> None:
     last = {"uuid": "a", "result": None, "discarded": False}
     ready = {**state_flags("ready"), "collect": {**COLLECT, "last": last}}
-    assert call("step", ready, None) == "session"
-    assert call("step", ready, "s") == "result"
+    assert call("collectStep", ready, None) == "session"
+    assert call("collectStep", ready, "s") == "result"
     assert (
         call(
-            "step", {**state_flags("ready"), "collect": {**COLLECT, "last": {**last, "result": "fail"}}}, "s"
+            "collectStep", {**state_flags("ready"), "collect": {**COLLECT, "last": {**last, "result": "fail"}}}, "s"
         )
         == "record"
     )
-    assert call("step", {**state_flags("idle"), "collect": COLLECT}, "s") == "setup"
+    assert call("collectStep", {**state_flags("idle"), "collect": COLLECT}, "s") == "setup"
 
 
 def twice(body: str) -> Any:
@@ -205,12 +205,12 @@ def test_after_a_while_of_not_looking_nothing_counts_as_pressed() -> None:
 
 
 def test_a_button_does_one_thing_and_what_was_kept_badly_is_as_delivered() -> None:
-    changed = run(PADS, "return m.assigned(m.delivered(), 'arm', 0);")
+    changed = run(PADS, "return m.withAssignment(m.defaultMapping(), 'arm', 0);")
     assert (changed["arm"], changed["big"], changed["discard"]) == (0, None, 1)
     kept = '{"arm": 4, "big": null, "discard": [], "fail": -1, "other": 3}'
-    found = run(PADS, "return m.restored(given);", kept)
+    found = run(PADS, "return m.parseMapping(given);", kept)
     assert (found["arm"], found["big"], found["discard"], found["fail"]) == (4, None, 1, 13)
-    assert run(PADS, "return m.restored('{');") == run(PADS, "return m.delivered();")
+    assert run(PADS, "return m.parseMapping('{');") == run(PADS, "return m.defaultMapping();")
     assert run(PADS, "return [m.buttonName(0, 'standard'), m.buttonName(9, ''), m.buttonName(null)];") == [
         "A (0)",
         "button 9",
@@ -234,7 +234,7 @@ def test_the_key_of_a_pedal_is_neither_the_e_stop_nor_one_of_the_pages(key: str,
 
 
 def test_the_key_of_a_pedal_is_kept_as_a_button_is() -> None:
-    found = run(PADS, "return m.restored(JSON.stringify(m.assigned(m.delivered(), 'big', 'b')));")
+    found = run(PADS, "return m.parseMapping(JSON.stringify(m.withAssignment(m.defaultMapping(), 'big', 'b')));")
     assert (found["big"], found["arm"]) == ("b", 9)
     assert run(PADS, "return m.buttonName('b');") == "key B"
-    assert run(PADS, "return m.restored(given).big;", '{"big": " "}') == 0
+    assert run(PADS, "return m.parseMapping(given).big;", '{"big": " "}') == 0

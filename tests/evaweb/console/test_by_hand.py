@@ -47,11 +47,11 @@ def test_there_is_one_big_button_at_each_moment(state: str, mode: str, chunk: in
     proposal = {"chunk": chunk} if chunk else {}
     given = {**state_flags(state), "mode": mode, "proposal": proposal}
 
-    assert run("debug/modes.js", "return m.primary(given)", given) == button
+    assert run("debug/modes.js", "return m.primaryCommand(given)", given) == button
 
 
 def test_before_any_news_the_big_button_is_there() -> None:
-    assert run("debug/modes.js", "return m.primary(given)", {"mode": "preview"}) == "run"
+    assert run("debug/modes.js", "return m.primaryCommand(given)", {"mode": "preview"}) == "run"
 
 
 def test_the_mode_that_is_shown_is_that_of_the_open_run_whatever_was_chosen() -> None:
@@ -72,7 +72,7 @@ def test_the_mode_that_is_shown_is_that_of_the_open_run_whatever_was_chosen() ->
 
 
 def test_what_the_run_does_is_said_in_words() -> None:
-    body = "return given.map((snapshot) => m.phase(snapshot))"
+    body = "return given.map((snapshot) => m.phaseText(snapshot))"
     said = run(
         "debug/modes.js",
         body,
@@ -106,7 +106,7 @@ def test_a_proposed_chunk_is_described_with_how_far_it_begins() -> None:
 def refusals(kind: str, *stores: dict[str, Any]) -> list[str]:
     """What the page says to `kind` in each of these situations."""
     found: list[str] = run(
-        "commands/reasons.js", f"return given.map((store) => m.refusal({kind!r}, store))", list(stores)
+        "commands/reasons.js", f"return given.map((store) => m.pageProblem({kind!r}, store))", list(stores)
     )
     return found
 
@@ -161,7 +161,7 @@ def test_every_command_has_a_reason_wherever_the_station_does_not_allow_it() -> 
     situations = [store(state=state, mode=mode) for state, mode in product(states, (*MODES, None))]
 
     body = (
-        "return given[0].flatMap((kind) => given[1].filter((one) => !m.refusal(kind, one)).map(() => kind))"
+        "return given[0].flatMap((kind) => given[1].filter((one) => !m.pageProblem(kind, one)).map(() => kind))"
     )
 
     assert run("commands/reasons.js", body, [list(COMMANDS), situations]) == []
@@ -248,7 +248,7 @@ FACTS = {
 
 
 def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
-    groups = run("manual/targets.js", "return m.groups(given)", FACTS)
+    groups = run("manual/targets.js", "return m.groupJoints(given)", FACTS)
 
     assert [group["name"] for group in groups] == ["left_arm", "right_arm", "joints"]
     assert groups[0]["joints"][1] == {
@@ -283,11 +283,11 @@ def test_joints_come_in_the_robots_groups_with_their_limits() -> None:
     ],
 )
 def test_a_joints_label_is_as_short_as_tells_it_from_others(joints: list[str], labels: list[str]) -> None:
-    assert run("manual/joint_names.js", "return m.labels(given)", joints) == labels
+    assert run("manual/joint_names.js", "return m.shortLabels(given)", joints) == labels
 
 
 def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
-    body = "const [joint] = m.groups(given)[0].joints; return [m.within(joint, 9), m.within(joint, 1)]"
+    body = "const [joint] = m.groupJoints(given)[0].joints; return [m.clampToLimits(joint, 9), m.clampToLimits(joint, 1)]"
 
     assert run("manual/targets.js", body, FACTS) == [
         {"value": 2.6, "said": "left_arm.joint0 ends at 2.600"},
@@ -352,7 +352,7 @@ def test_how_poses_were_met_is_said_in_words() -> None:
         {"rows": 50, "over": 1, "limit": 0, "velocity": 1, "worst_mm": None, "worst_deg": None},
     ]
 
-    assert run("scene/reach.js", "return given.map((ik) => m.reachWords(ik))", chunks) == [
+    assert run("scene/ik_text.js", "return given.map((ik) => m.ikText(ik))", chunks) == [
         "",
         "50 poses reached, worst 0.012 mm and 0.003°",
         "50 poses reached, worst 0.000 mm and below 0.001°",
@@ -363,7 +363,7 @@ def test_how_poses_were_met_is_said_in_words() -> None:
 
 def test_the_target_begins_where_the_robot_is_told_to_be_else_where_it_is() -> None:
     joints = {"measured": [1, 2], "commanded": [1.1, 2.1]}
-    body = "return [m.start({ ...given, engaged: true }), m.start({ ...given, engaged: false }), m.start()]"
+    body = "return [m.initialTarget({ ...given, engaged: true }), m.initialTarget({ ...given, engaged: false }), m.initialTarget()]"
 
     assert run("manual/targets.js", body, joints) == [[1.1, 2.1], [1, 2], None]
 
@@ -385,7 +385,7 @@ def test_the_verdict_on_a_target_says_distance_time_and_what_is_wrong() -> None:
     ]
 
     assert run(
-        "manual/targets.js", "return given.map((answer) => m.verdict(answer, 0.25).text)", answers
+        "manual/targets.js", "return given.map((answer) => m.aimText(answer, 0.25).text)", answers
     ) == [
         "0.50 rad from the robot, 4.0 s.",
         "0.50 rad from the robot, 4.0 s. Limited: left_arm.joint1.",
@@ -405,8 +405,8 @@ def test_a_step_of_the_hand_is_in_metres_and_radians() -> None:
         "mm": 20,
         "degrees": 90,
     }
-    step = run("manual/targets.js", "return m.jog(given)", asked)
-    turn = run("manual/targets.js", "return m.jog(given)", asked | {"turned": True})
+    step = run("manual/targets.js", "return m.jogArguments(given)", asked)
+    turn = run("manual/targets.js", "return m.jogArguments(given)", asked | {"turned": True})
 
     assert step == {"arm": "left_arm", "frame": "tool", "translation": [0, -0.02, 0]}
     assert turn["rotation"] == pytest.approx([0, -1.5708, 0], abs=1e-4)
@@ -416,7 +416,7 @@ def test_the_hand_is_said_in_millimetres() -> None:
     poses = [0.1, -0.2, 0.3, 1, 0, 0, 0, 0.05, 0.4, 0.5, 0.6, 1, 0, 0, 0, 0.0]
 
     assert run(
-        "manual/targets.js", "return [m.handAt(given, 1), m.handAt(given, 2), m.handAt(null, 0)]", poses
+        "manual/targets.js", "return [m.tipPositionText(given, 1), m.tipPositionText(given, 2), m.tipPositionText(null, 0)]", poses
     ) == [
         "x 400  y 500  z 600 mm",
         "",
@@ -509,7 +509,7 @@ def test_stages_are_shown_while_they_go_on_and_after_one_failed() -> None:
         {**state_flags("idle")},
     ]
 
-    assert run("trial/setup.js", "return given.map((snapshot) => m.unfinished(snapshot))", snapshots) == [
+    assert run("trial/setup.js", "return given.map((snapshot) => m.isUnfinished(snapshot))", snapshots) == [
         True,
         True,
         False,
@@ -526,7 +526,7 @@ def test_a_stage_says_how_long_it_took() -> None:
         {"state": "skipped", "seconds": 0.0},
     ]
 
-    assert run("trial/setup.js", "return given.map((stage) => m.spent(stage))", stages) == [
+    assert run("trial/setup.js", "return given.map((stage) => m.stageDuration(stage))", stages) == [
         "0.2 s",
         "1:15",
         "",

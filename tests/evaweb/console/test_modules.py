@@ -105,7 +105,7 @@ def test_a_spike_survives_decimation() -> None:
     flat = [0.0] * 20_000
     flat[12_345], flat[777] = 9.0, -9.0
     calm = [float(index % 2) for index in range(20_000)]
-    kept = run("curves/decimate.js", "return m.keep(given, 1200)", [flat, calm])
+    kept = run("curves/decimate.js", "return m.decimate(given, 1200)", [flat, calm])
 
     assert len(kept) <= 1200
     assert {777, 12_345} <= set(kept)
@@ -113,13 +113,13 @@ def test_a_spike_survives_decimation() -> None:
 
 
 def test_few_points_are_all_kept() -> None:
-    assert run("curves/decimate.js", "return m.keep(given, 1000)", [[1.0, 2.0, 3.0]]) == [0, 1, 2]
+    assert run("curves/decimate.js", "return m.decimate(given, 1000)", [[1.0, 2.0, 3.0]]) == [0, 1, 2]
 
 
 def test_a_gap_stays_a_gap() -> None:
     kept = run(
         "curves/decimate.js",
-        "return m.keep([Array.from({length: 900}, (_, i) => i > 300 && i < 600 ? NaN : i)], 90)",
+        "return m.decimate([Array.from({length: 900}, (_, i) => i > 300 && i < 600 ? NaN : i)], 90)",
     )
 
     assert any(300 < index < 600 for index in kept)
@@ -198,9 +198,9 @@ def test_every_sample_that_safety_changed_is_marked() -> None:
 
 
 def test_the_sample_at_the_cursor_is_the_last_that_began() -> None:
-    body = "return [-1, 0, 0.5, 1, 7].map((t) => m.last([0, 1, 2], t))"
+    body = "return [-1, 0, 0.5, 1, 7].map((t) => m.lastNotAbove([0, 1, 2], t))"
 
-    assert run("../site/ascending.js", body) == [-1, 0, 0, 1, 2]
+    assert run("../site/binary_search.js", body) == [-1, 0, 0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -352,7 +352,7 @@ def test_of_nothing_there_is_no_quantile() -> None:
     ],
 )
 def test_the_step_to_do_now_follows_trial_and_state(panel: dict[str, str], state: str, step: str) -> None:
-    assert run("trial/steps.js", "return m.current(given[0], given[1])", [panel, state_flags(state)]) == step
+    assert run("trial/steps.js", "return m.currentStep(given[0], given[1])", [panel, state_flags(state)]) == step
 
 
 def test_an_identity_is_a_random_uuid_of_version_four() -> None:
@@ -498,7 +498,7 @@ def test_no_value_is_a_gap_to_the_plot() -> None:
 def test_a_state_asks_for_the_robots_picture_only_where_it_says_that_there_is_none() -> None:
     states = [{"label": "limp"}, {"connected": True}, {"connected": False}]
     body = "return given.map((is) => m.advice(is)?.title ?? null)"
-    assert run("live/words.js", body, states) == [None, None, "No complete picture of the robot"]
+    assert run("live/labels.js", body, states) == [None, None, "No complete picture of the robot"]
 
 
 def test_an_event_is_said_in_words_with_its_weight() -> None:
@@ -523,9 +523,9 @@ def test_an_event_is_said_in_words_with_its_weight() -> None:
         {"kind": "episode_opened", "text": "recording 0a5624d8-64f2-4530-9518-f914c2fefd90"},
         {"kind": "a_new_kind", "text": "said"},
     ]
-    body = "return given.map((event) => [m.kindWords(event.kind), m.sentence(event), m.weight(event)])"
+    body = "return given.map((event) => [m.kindLabel(event.kind), m.eventText(event), m.severity(event)])"
 
-    assert run("live/event_words.js", body, events) == [
+    assert run("live/event_text.js", body, events) == [
         ["state", "setting up → ready: 50 rows", ""],
         ["state", "running → holding: halted", "warn"],
         ["state", "running → faulted: e-stop", "bad"],
@@ -582,7 +582,7 @@ def test_the_e_stop_works_before_and_without_the_modules() -> None:
     listeners.estop();
     return { first, posted, rest: parts["estop-note"].dataset.rest };
     """
-    found = run("live/words.js", EARLY + body, given)
+    found = run("live/labels.js", EARLY + body, given)
 
     assert found["first"] == ["stopped", "E-stop acknowledged: the robot is held."]
     assert found["posted"] == [
@@ -596,7 +596,7 @@ def test_the_e_stop_works_before_and_without_the_modules() -> None:
 @pytest.mark.parametrize(("status", "said"), [(409, "failed"), (200, "unknown"), (403, None)])
 def test_an_early_e_stop_that_failed_says_to_use_the_hardware_stop(status: int, said: str | None) -> None:
     given = {"module": (MODULES / "commands/estop_early.js").as_uri(), "status": status, "said": said}
-    found = run("live/words.js", EARLY + "listeners.estop(); await settled(); return shown();", given)
+    found = run("live/labels.js", EARLY + "listeners.estop(); await settled(); return shown();", given)
 
     assert found == ["failed", "USE THE HARDWARE STOP"]
 
@@ -612,7 +612,7 @@ def test_an_early_e_stop_goes_both_ways_and_one_is_enough(dead: str) -> None:
     body = (
         EARLY + "listeners.estop(); await settled(); return [shown()[0], posted.map(([address]) => address)];"
     )
-    found = run("live/words.js", body, {**given, "stops": "http://lab:8001"})
+    found = run("live/labels.js", body, {**given, "stops": "http://lab:8001"})
     assert found == ["stopped", ["http://lab:8001/estop", "/estop"]]
 
 
@@ -655,7 +655,7 @@ def pressed(body: str, **given: Any) -> Any:
         "dead": [],
         "silent": [],
     }
-    return run("live/words.js", PRESSED + body, known | given)
+    return run("live/labels.js", PRESSED + body, known | given)
 
 
 def test_a_press_goes_both_ways_at_once_under_one_uuid_and_the_first_answer_counts() -> None:
@@ -751,7 +751,7 @@ def test_a_key_whose_control_is_not_on_the_screen_says_so(
 ) -> None:
     module = (MODULES.parent / "site/keys.js").as_uri()
     given = {"module": module, "controls": controls, "key": key, "modal": modal}
-    assert run("live/words.js", KEYS, given) == found
+    assert run("live/labels.js", KEYS, given) == found
 
 
 LEASE = """
@@ -796,14 +796,14 @@ const lost = () => said.filter((text) => text.startsWith("You do not")).map((tex
 def test_a_page_says_that_it_commands_no_more_with_since_when_and_why(body: str, said: str) -> None:
     given = {"module": (MODULES / "commands/lease.js").as_uri(), "answers": True}
     opened = LEASE.replace('lease: "mine"', 'lease: "free"') if "store.lease" in body else LEASE
-    found = run("live/words.js", opened + body + '; becomes("free"); return lost();', given)
+    found = run("live/labels.js", opened + body + '; becomes("free"); return lost();', given)
     assert found == ([f"You do not command any more, since T: {said}."] if said else [])
 
 
 def test_a_page_that_starts_late_takes_back_that_it_has_not() -> None:
     given = {"module": (MODULES / "commands/estop_early.js").as_uri(), "status": 200, "said": "accepted"}
     early = run(
-        "live/words.js", EARLY + "late(); return [parts.outcome.textContent, parts.outcome.dataset];", given
+        "live/labels.js", EARLY + "late(); return [parts.outcome.textContent, parts.outcome.dataset];", given
     )
     assert early == ["This page has not started: reload it. Its e-stop works.", {"late": ""}]
     body = """
@@ -836,9 +836,9 @@ def test_a_camera_of_the_stations_own_is_named_with_what_is_wrong() -> None:
         "transports": None,
     }
     body = (
-        "return Object.fromEntries(Object.entries(given).map(([name, told]) => [name, m.trouble(told, 16)]))"
+        "return Object.fromEntries(Object.entries(given).map(([name, told]) => [name, m.cameraProblem(told, 16)]))"
     )
-    assert run("live/camera_words.js", body, cameras) == {
+    assert run("live/camera_text.js", body, cameras) == {
         "live": None,
         "absent": {"word": "no picture yet", "reason": refused},
         "lost": {"word": "reconnecting, lost 3.5 s ago", "reason": refused},
@@ -850,15 +850,15 @@ def test_a_camera_of_the_stations_own_is_named_with_what_is_wrong() -> None:
 
 def test_all_cameras_of_the_stations_own_are_told_in_a_line() -> None:
     cameras = {"cam_high": camera("live", losses=2), "cam_wrist": camera("opening", "404", age=None)}
-    body = "return [m.summary(given, 16), m.summary(undefined, 16), m.summary({}, 16)]"
-    assert run("live/camera_words.js", body, cameras) == [
+    body = "return [m.cameraSummary(given, 16), m.cameraSummary(undefined, 16), m.cameraSummary({}, 16)]"
+    assert run("live/camera_text.js", body, cameras) == [
         "cam_high: rtsp from rtsp://10.0.0.7:554/one: newest picture 40 ms old, lost 2 times; "
         "cam_wrist: no picture yet (404)",
         "",
         "",
     ]
     once = {"a": camera("live", losses=1, age=None)}
-    assert run("live/camera_words.js", "return m.summary(given, 16)", once) == (
+    assert run("live/camera_text.js", "return m.cameraSummary(given, 16)", once) == (
         "a: rtsp from rtsp://10.0.0.7:554/one: no picture yet, lost once"
     )
 
@@ -933,8 +933,8 @@ def test_a_picture_is_decoded_again_unless_it_is_on_the_screen(
 
 def test_what_happens_to_cameras_is_weighed() -> None:
     kinds = ["camera_absent", "camera_lost", "camera_ended", "camera_is_a_video", "camera_back"]
-    body = "return given.map((kind) => [m.kindWords(kind), m.weight({kind, text: ''})])"
-    assert run("live/event_words.js", body, kinds) == [
+    body = "return given.map((kind) => [m.kindLabel(kind), m.severity({kind, text: ''})])"
+    assert run("live/event_text.js", body, kinds) == [
         ["camera absent", "warn"],
         ["camera lost", "warn"],
         ["video is over", "warn"],
@@ -947,10 +947,10 @@ def test_rectangles_are_drawn_from_any_corner_moved_and_typed_and_stay_inside_th
     found = run(
         "../plans/rectangles.js",
         """
-        const drawn = m.between({ x: 0.6, y: 0.9 }, { x: 0.2, y: -0.1 });
-        const typed = m.changed({ name: "cup", x: 0.5, y: 0.5, width: 0.2, height: 0.2 }, "width", 0.8);
-        const pushed = [m.moved(drawn, 0.9, 0.9), typed, m.changed(typed, "y", 7), m.changed(typed, "x", NaN)];
-        return [drawn, ...pushed, m.fresh(["object 1", "cup"])];
+        const drawn = m.fromPoints({ x: 0.6, y: 0.9 }, { x: 0.2, y: -0.1 });
+        const typed = m.withValue({ name: "cup", x: 0.5, y: 0.5, width: 0.2, height: 0.2 }, "width", 0.8);
+        const pushed = [m.translate(drawn, 0.9, 0.9), typed, m.withValue(typed, "y", 7), m.withValue(typed, "x", NaN)];
+        return [drawn, ...pushed, m.unusedName(["object 1", "cup"])];
         """,
     )
     assert found == [
@@ -965,10 +965,10 @@ def test_rectangles_are_drawn_from_any_corner_moved_and_typed_and_stay_inside_th
 
 def test_a_region_is_said_in_words_and_shown_with_what_lies_around_it_inside_the_picture() -> None:
     found = run(
-        "trial/region_look.js",
+        "trial/region_view.js",
         """
         const low = { name: "block", match: 0.434, words: "18 px to the left", low: true };
-        return [m.inWords(low), m.around([0.4, 0.4, 0.2, 0.2]), m.around([0, 0.9, 0.2, 0.1])];
+        return [m.regionText(low), m.cropAround([0.4, 0.4, 0.2, 0.2]), m.cropAround([0, 0.9, 0.2, 0.1])];
         """,
     )
     assert found[0] == "block: 0.43 !, 18 px to the left"

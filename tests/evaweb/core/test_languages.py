@@ -55,9 +55,9 @@ def shown_by_node(rows):
         pytest.skip("Node is not installed: the page's modules are not run")
     script = (
         f"const s = await import({json.dumps((STATIC / 'site' / 'sentences.js').as_uri())});"
-        f"const e = await import({json.dumps((STATIC / 'console/live/event_words.js').as_uri())});"
+        f"const e = await import({json.dumps((STATIC / 'console/live/event_text.js').as_uri())});"
         "const given = JSON.parse((await import('node:fs')).readFileSync(0, 'utf8'));"
-        "const show = (row) => row.kind ? e.sentence(row) : row.sentences ? s.localized(row) : s.sentence(row);"
+        "const show = (row) => row.kind ? e.eventText(row) : row.sentences ? s.localized(row) : s.sentence(row);"
         "const before = given.rows.map(show); s.speak(given.words);"
         "console.log(JSON.stringify([before, given.rows.map(show)]));"
     )

@@ -11,7 +11,7 @@ from tests.examples import some
 
 run = test_modules.run
 pytestmark = pytest.mark.skipif(test_modules.NODE is None, reason="Node is not installed")
-CLOCK, LINK, ALIGNED = "../replay/clock.js", "../replay/link.js", "../replay/aligned.js"
+CLOCK, LINK, ALIGNED = "../replay/clock.js", "../replay/url_state.js", "../replay/aligned.js"
 BY_HAND = """
 let now = 0;
 let next = null;
@@ -128,8 +128,8 @@ def test_an_address_brings_back_what_it_was_written_for(
     }
     search, back = run(
         LINK,
-        "const search = m.written('?robot=ur5e&t=9', given[0], given[1]);"
-        "return [search, m.read(search, given[1])];",
+        "const search = m.toSearch('?robot=ur5e&t=9', given[0], given[1]);"
+        "return [search, m.parseSearch(search, given[1])];",
         [state, fps],
     )
     assert search.startswith("?robot=ur5e")
@@ -151,7 +151,7 @@ def test_an_address_brings_back_what_it_was_written_for(
 def test_an_address_that_says_nothing_of_use_changes_nothing(
     search: str, expected: dict[str, object]
 ) -> None:
-    assert run(LINK, "return m.read(given, 10);", search) == expected
+    assert run(LINK, "return m.parseSearch(given, 10);", search) == expected
 
 
 def test_what_is_drawn_waits_for_pictures_and_for_none_that_never_come() -> None:
@@ -207,7 +207,7 @@ def test_a_camera_that_shows_another_picture_than_the_rows_says_so(camera: str, 
         {"kind": "video_lost", "stream": "side", "first": 0, "last": 99},
         {"kind": "black", "stream": "black", "first": 0, "last": 99},
     ]
-    assert run("../replay/lost.js", "return m.lostAt(...given);", [flags, camera, row]) == said
+    assert run("../replay/lost_frames.js", "return m.lostFrameText(...given);", [flags, camera, row]) == said
 
 
 def test_episodes_begin_together_or_as_much_later_as_is_said() -> None:
@@ -216,8 +216,8 @@ def test_episodes_begin_together_or_as_much_later_as_is_said() -> None:
         """
         const episodes = [{ fps: 30, frames: 60 }, { fps: 10, frames: 30 }];
         return [null, "0,1.5", "-0.5,x"].map((said) => {
-          const starts = m.begins(said, 2);
-          return [starts.shifts, m.spanned(episodes, starts)];
+          const starts = m.startTimes(said, 2);
+          return [starts.shifts, m.commonClock(episodes, starts)];
         });
         """,
     )
@@ -240,8 +240,8 @@ def test_curves_of_another_rate_and_start_lie_at_their_time_and_nowhere_else() -
         const arrays = { time: "time", measured: "measured", executed: "executed" };
         const header = { joints: ["a", "b"], period: 0.2, streams: { ticks: { arrays } } };
         const episode = { header, shift: 0.1, numbers: (name) => stored[name] };
-        const times = m.grid({ fps: 10, frames: 9 });
-        return [m.sampled(times, episode, "b"), m.sampled(times, episode, "none").state];
+        const times = m.clockTimes({ fps: 10, frames: 9 });
+        return [m.sampleAt(times, episode, "b"), m.sampleAt(times, episode, "none").state];
         """,
     )
     sampled, absent = found
@@ -263,7 +263,7 @@ def test_the_joint_that_is_shown_first_is_the_one_that_differs_most() -> None:
         };
         const one = episode([0, 9], [1, 1], [0, NaN]);
         const other = episode([0, 9], [1, 3], [NaN, 50]);
-        const times = m.grid({ fps: 10, frames: 2 });
+        const times = m.clockTimes({ fps: 10, frames: 2 });
         return [m.differing(times, [one, other], ["a", "b", "c"]), m.differing(times, [one, one], ["a", "b", "c"])];
         """,
     )

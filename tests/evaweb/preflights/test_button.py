@@ -37,7 +37,7 @@ pytestmark = pytest.mark.skipif(NODE is None, reason="Node is not installed: the
 def test_it_says_why_it_cannot_be_pressed(store, checkpoint, says):
     said = run(
         "commands/reasons.js",
-        "return m.whyNoPreflight(given.store, given.checkpoint)",
+        "return m.preflightProblem(given.store, given.checkpoint)",
         {"store": store, "checkpoint": checkpoint},
     )
     assert said.startswith(says)

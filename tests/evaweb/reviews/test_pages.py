@@ -114,7 +114,7 @@ SPANS = st.lists(
 @given(SPANS)
 def test_segments_that_overlap_lie_below_each_other(spans):
     segments = [{"first": first, "last": last} for first, last in sorted(spans)]
-    lanes = run("return m.stacked(given);", segments)
+    lanes = run("return m.stackLanes(given);", segments)
     for number, one in enumerate(lanes):
         for other in lanes[:number]:
             apart = other["last"] < one["first"] or one["last"] < other["first"]
@@ -140,8 +140,8 @@ def test_flags_are_walked_through_and_the_worst_of_a_row_comes_first():
         {"first": 8, "last": 8, "severity": "error"},
     ]
     found = run(
-        "return [m.flagFrom(given, 0, 1), m.flagFrom(given, 5, 1), m.flagFrom(given, 8, 1), m.flagFrom(given, 8, -1),"
-        " m.flagFrom(given, 5, -1), m.flagsAt(given, 8).map((one) => one.severity), m.flagsAt(given, 4)];",
+        "return [m.nextFlag(given, 0, 1), m.nextFlag(given, 5, 1), m.nextFlag(given, 8, 1), m.nextFlag(given, 8, -1),"
+        " m.nextFlag(given, 5, -1), m.flagsAt(given, 8).map((one) => one.severity), m.flagsAt(given, 4)];",
         flags,
     )
     assert found == [5, 8, None, 5, None, ["error", "warning"], []]

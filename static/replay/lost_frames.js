@@ -8,15 +8,15 @@ const WORDS = {
 };
 
 /** What is to be said of a camera at a row by the flags of the checks; "" where its picture is that of the row. */
-export function lostAt(flags, camera, row) {
+export function lostFrameText(flags, camera, row) {
   const flag = flags.find(({ kind, stream, first, last }) => kind in WORDS && stream === camera && first <= row && row <= last);
   return flag ? WORDS[flag.kind](flag) : "";
 }
 
 /** Say it beside the names of the cameras on the page. */
-export function sayLost(flags, row) {
+export function showLostFrames(flags, row) {
   for (const picture of document.querySelectorAll("[data-camera]")) {
-    const words = lostAt(flags, picture.dataset.camera, row);
+    const words = lostFrameText(flags, picture.dataset.camera, row);
     const place = picture.parentElement.querySelector("[data-lost]");
     if (place.textContent !== words) place.textContent = words;
     picture.toggleAttribute("data-stands", Boolean(words));

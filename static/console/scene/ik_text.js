@@ -9,7 +9,7 @@ function small(value, digits) {
 }
 
 /** `ik` as the station tells it: rows, over, limit, velocity, singular, worst_mm, worst_deg; "" where it is about joints. */
-export function reachWords({ rows = 0, over = 0, limit = 0, velocity = 0, singular = 0, worst_mm: mm, worst_deg: deg } = {}) {
+export function ikText({ rows = 0, over = 0, limit = 0, velocity = 0, singular = 0, worst_mm: mm, worst_deg: deg } = {}) {
   if (!rows) return "";
   const known = Number.isFinite(mm) && Number.isFinite(deg);
   const worst = known ? t("page.reach.worst", ", worst {mm} mm and {deg}°", { mm: small(mm, over ? 1 : 3), deg: small(deg, over ? 1 : 3) }) : "";

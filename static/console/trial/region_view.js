@@ -9,7 +9,7 @@ const LEAST = 0.75; // where the plan has none: what lies between an object in i
 const AROUND = 0.5; // of a region's size, to each side of it: an object that lies beside it is seen
 
 /** Keeps the panel's list of regions and their outlines over the cameras; returns the names of the cameras that have any. */
-export function regionLook() {
+export function regionView() {
   const regional = new Set();
   const images = new Map(); // address of a reference -> image
   const look = async () => {
@@ -57,7 +57,7 @@ function said(words) {
 
 /** One region in words, with what the reference and the camera show there. */
 function line(region, images) {
-  const item = said(t("page.regions.line", "{camera}, {words}", { camera: region.camera, words: inWords(region) }));
+  const item = said(t("page.regions.line", "{camera}, {words}", { camera: region.camera, words: regionText(region) }));
   item.classList.toggle("warn", region.low);
   const pictures = document.createElement("span");
   pictures.className = "row line aid-crops";
@@ -69,12 +69,12 @@ function line(region, images) {
 }
 
 /** Its name, its match and where its object lies. */
-export function inWords({ name, match, words, low }) {
+export function regionText({ name, match, words, low }) {
   return t("page.regions.match", "{name}: {match}, {words}", { name, match: `${match.toFixed(2)}${low ? " !" : ""}`, words });
 }
 
 /** What is cut out of a picture around a region: [x, y, width, height] in shares, inside the picture. */
-export function around([x, y, width, height]) {
+export function cropAround([x, y, width, height]) {
   const [left, top] = [Math.max(0, x - AROUND * width), Math.max(0, y - AROUND * height)];
   return [left, top, Math.min(1, x + (1 + AROUND) * width) - left, Math.min(1, y + (1 + AROUND) * height) - top];
 }
@@ -95,7 +95,7 @@ function crop(source, at, label) {
   canvas.setAttribute("aria-label", label);
   canvas.title = label;
   const [full, tall] = [source.naturalWidth ?? source.width, source.naturalHeight ?? source.height];
-  const [x, y, width, height] = around(at);
+  const [x, y, width, height] = cropAround(at);
   const [wide, high] = [width * full, height * tall];
   const scale = CROP / Math.max(wide, high, 1);
   Object.assign(canvas, { width: Math.max(1, Math.round(wide * scale)), height: Math.max(1, Math.round(high * scale)) });

@@ -1,11 +1,11 @@
 // The chunk that the scene shows: drawn when it changes, a film while it is proposed, gone when nothing is heard of it.
 
-import { reachWords } from "./reach.js";
+import { ikText } from "./ik_text.js";
 import { t } from "../../site/sentences.js";
 
 const HEARD_MS = 2500; // the station speaks of a chunk each second while there is one
 
-export class ShownChunk {
+export class DisplayedChunk {
   #scene;
   #rate;
   #chunk = null;
@@ -44,7 +44,7 @@ export class ShownChunk {
   /** What of it could not be reached, in words; "" where all of it was. */
   get reach() {
     const { chunk, ik } = this.#chunk ?? {};
-    return ik?.over ? t("page.scene3d.reach", "chunk {chunk}: {words}", { chunk, words: reachWords(ik) }) : "";
+    return ik?.over ? t("page.scene3d.reach", "chunk {chunk}: {words}", { chunk, words: ikText(ik) }) : "";
   }
 
   #set(chunk) {

@@ -26,12 +26,12 @@ export function advice({ connected, held, latched }) {
 }
 
 /** Why the server closes the socket of a page, by its code. */
-export const CLOSED = {
+export const CLOSE_REASONS = {
   4401: { word: t("page.words.logged_out", "logged out"), reason: t("page.words.logged_out_why", "You are logged out: reload this page and log in again.") },
   4404: { word: t("page.words.no_station", "no such station"), reason: t("page.words.no_station_why", "This station is not in the lab any more: go back to the list of stations.") },
 };
 
-export const VERBS = {
+export const COMMAND_LABELS = {
   setup: t("page.words.setup", "Set up"),
   run: t("page.words.run", "Run"),
   stop: t("page.words.stop", "Stop"),
@@ -57,26 +57,26 @@ export const VERBS = {
   lease_give_up: t("page.words.lease_give_up", "Station given up"),
 };
 
-export function words(state) {
+export function stateLabel(state) {
   return state.replaceAll("_", " ");
 }
 
-export function verb(kind) {
-  return VERBS[kind] ?? words(kind);
+export function commandLabel(kind) {
+  return COMMAND_LABELS[kind] ?? stateLabel(kind);
 }
 
-export function duration(seconds) {
+export function formatDuration(seconds) {
   const whole = Math.max(0, Math.floor(seconds));
   return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
 }
 
-export function age(seconds) {
+export function formatAge(seconds) {
   if (!Number.isFinite(seconds)) return t("page.words.never", "never seen");
   if (seconds < 1) return `${Math.round(seconds * 1000)} ms`;
   return seconds < 100 ? `${seconds.toFixed(1)} s` : `${Math.round(seconds / 60)} min`;
 }
 
 /** A figure with its unit, or a dash where there is none. */
-export function figure(value, digits, unit) {
+export function formatFigure(value, digits, unit) {
   return Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : `– ${unit}`;
 }

@@ -3,7 +3,7 @@
 
 import { get, post, RequestFailed } from "../../site/api.js";
 
-export class StopWay {
+export class StopRoute {
   #origin;
   #paths;
   #alone = false;

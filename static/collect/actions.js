@@ -5,14 +5,14 @@ import { t } from "../site/sentences.js";
 export const ARM_FIRST = t("page.collect.arm_first", "arm first");
 
 /** What the big button does now: {kind, text}. Wherever the robot moves it stops; only at rest does it start. */
-export function big({ state_is: is } = {}) {
+export function primaryAction({ state_is: is } = {}) {
   if (is?.preparing) return { kind: "stop", text: t("page.collect.cancel_set_up", "Cancel the set-up") };
   if (is?.run_open) return { kind: "stop", text: t("page.collect.stop_and_save", "Stop and save") };
   return { kind: "run", text: t("page.collect.start", "Start") };
 }
 
 /** Why no episode can start, "" where the station alone decides. */
-export function whyNotStart(snapshot, session) {
+export function startProblem(snapshot, session) {
   const { collect } = snapshot ?? {};
   if (!collect) return t("page.collect.collects_nothing", "this station collects nothing");
   if (!session) return t("page.collect.open_first", "open or resume a session first");
@@ -21,25 +21,25 @@ export function whyNotStart(snapshot, session) {
 }
 
 /** The episode that a label or a discarding is about: the open one, else the newest that was seen. */
-export function subject(collect, seen) {
+export function labelTarget(collect, seen) {
   return collect?.episode ?? seen ?? collect?.last?.uuid ?? "";
 }
 
 /** Why nothing can be said of an episode now, "" where it can. */
-export function whyNotLabel({ state_is: is, collect } = {}, episode) {
+export function labelProblem({ state_is: is, collect } = {}, episode) {
   if (collect?.episode && is?.run_open) return t("page.collect.stop_first", "stop and save first");
   if (!episode) return t("page.collect.no_episode", "no episode yet");
   return discarded(collect, episode) ? t("page.collect.is_discarded", "the episode is discarded") : "";
 }
 
 /** Why nothing can be discarded now, "" where it can. */
-export function whyNotDiscard({ collect } = {}, episode) {
+export function discardProblem({ collect } = {}, episode) {
   if (!episode) return t("page.collect.no_episode", "no episode yet");
   return discarded(collect, episode) ? t("page.collect.is_discarded_already", "the episode is discarded already") : "";
 }
 
 /** What goes with a discarding: the open episode is not named, for it ends by that; every other one is. */
-export function discarding(collect, episode) {
+export function discardArguments(collect, episode) {
   return collect?.episode === episode ? {} : { episode };
 }
 
@@ -48,7 +48,7 @@ function discarded(collect, episode) {
 }
 
 /** What is known of who leads, in words; weight "bad" where an episode cannot be led. */
-export function leaderWords(collect) {
+export function leaderText(collect) {
   const { leader, source, mode } = collect ?? {};
   if (!leader) return { text: "", weight: "" };
   const over = { kind: leader.kind };
@@ -60,14 +60,14 @@ export function leaderWords(collect) {
 }
 
 /** The arm in words: that the next episode may begin, or why it may not. */
-export function armWords({ state_is: is, collect } = {}) {
+export function armText({ state_is: is, collect } = {}) {
   if (!collect) return "";
   if (collect.episode && is?.going) return t("page.collect.recording", "recording");
   return collect.armed ? t("page.collect.armed_start", "armed: Start begins an episode") : collect.why_not || t("page.collect.not_armed", "not armed");
 }
 
 /** The step to do now. */
-export function step(snapshot, opened) {
+export function collectStep(snapshot, opened) {
   const { state_is: is, collect } = snapshot ?? {};
   if (!opened) return "session";
   if (is?.run_open) return "record";

@@ -1,7 +1,7 @@
 // Events in words: the runtime's kinds and sentences as a person reads them, and how much they weigh.
 
 import { sentence as translated, t } from "../../site/sentences.js";
-import { verb, words } from "./words.js";
+import { commandLabel, stateLabel } from "./labels.js";
 
 const BAD = new Set(["estopped", "family_died", "policy_failed", "policy_lost", "recording_failed", "source_failed", "video_lost", "displaced", "moved_away", "implausible", "corrected", "too_far", "node_silent", "leader_lost"]);
 const WARN = new Set(["camera_absent", "camera_ended", "camera_is_a_video", "camera_lost", "commands_unheard", "refused", "word_refused", "tune_refused", "lock_refused", "refusals", "starved", "starvation", "limited", "near", "far_start", "pictures_stopped", "recording_late", "chunk_dropped", "ik_unreached", "poses_refused", "joints_missing", "not_journalled", "unmeasured", "zero_joints", "unreadable", "rtc_warning", "late_ticks", "scheduling", "episode_short"]);
@@ -82,20 +82,20 @@ const HOLDER = /\bweb:([^\s:]+):([A-Za-z0-9_-]{1,4})[A-Za-z0-9_-]*/g; // a page 
 
 /** Sentences that begin with a word of the runtime's, with the one that the page has for it. */
 const PLAIN = {
-  state: (said) => said.replace(/^\w+ -> \w+/, words),
-  command: (said) => said.replace(/^\w+(?= by )/, verb),
+  state: (said) => said.replace(/^\w+ -> \w+/, stateLabel),
+  command: (said) => said.replace(/^\w+(?= by )/, commandLabel),
   source: (said) => said.replace(/^source: /, ""),
   truth: (said) => said.replace(/^the simulated bench says: /, ""),
   episode_opened: (said) => said.replace(/^recording /, "begun: "),
 };
 
 /** The kind in words. */
-export function kindWords(kind) {
-  return NAMES[kind] ?? (kind.startsWith("source_") ? NAMES.source_failed : words(kind));
+export function kindLabel(kind) {
+  return NAMES[kind] ?? (kind.startsWith("source_") ? NAMES.source_failed : stateLabel(kind));
 }
 
 /** The sentence, with arrows as arrows and people by their names, commands as their buttons say them. */
-export function sentence(event) {
+export function eventText(event) {
   const { kind, text } = event;
   const said = translated(event);
   if (kind === "setup" && text === "idle") return t("page.events.set_up_over", "the set-up is over");
@@ -104,7 +104,7 @@ export function sentence(event) {
 }
 
 /** "bad" for what endangers robot or record, "warn" for what a person should have seen, "good" where that is over, else "". */
-export function weight({ kind, text, data = {} }) {
+export function severity({ kind, text, data = {} }) {
   if (BAD.has(kind) || (kind === "state" && data.state_is?.latched)) return "bad";
   if (WARN.has(kind) || kind.startsWith("source_")) return "warn";
   if (kind === "drives") return data.enabled === false || data.faults?.length ? "bad" : "good";

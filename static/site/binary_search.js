@@ -1,7 +1,7 @@
 // Looking into values that ascend.
 
 /** The last index whose value in the ascending `values` is not above `value`, -1 where there is none. */
-export function last(values, value) {
+export function lastNotAbove(values, value) {
   let low = 0;
   let high = values.length;
   while (low < high) {

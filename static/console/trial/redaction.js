@@ -1,7 +1,7 @@
 // What tells which policy runs is not on the page while the station is veiled for who looks at it.
 
-/** Take every [data-tells] off the page while snapshots say "veiled", and put it back afterwards. */
-export function veil(store) {
+/** Take every [data-reveals] off the page while snapshots say "veiled", and put it back afterwards. */
+export function applyRedaction(store) {
   const taken = []; // [what stands for it, the element]
   const draw = () => {
     const veiled = Boolean(store.snapshot?.veiled);
@@ -10,7 +10,7 @@ export function veil(store) {
       for (const [mark, element] of taken.splice(0)) mark.replaceWith(element);
       return;
     }
-    for (const element of document.querySelectorAll("[data-tells]")) {
+    for (const element of document.querySelectorAll("[data-reveals]")) {
       const mark = document.createComment("");
       element.replaceWith(mark);
       taken.push([mark, element]);

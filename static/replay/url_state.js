@@ -4,7 +4,7 @@ const WAIT_MS = 250; // between two changes of the address: browsers allow only 
 const OWN = ["t", "from", "to", "loop", "speed"];
 
 /** The state in the search part of an address: {row, range: {from, to} or null, loop, speed}; null for what it does not say. */
-export function read(search, fps) {
+export function parseSearch(search, fps) {
   const given = new URLSearchParams(search);
   const number = (name) => (given.get(name) === null || given.get(name).trim() === "" || !Number.isFinite(Number(given.get(name))) ? null : Number(given.get(name)));
   const [time, from, to] = [number("t"), number("from"), number("to")];
@@ -14,7 +14,7 @@ export function read(search, fps) {
 }
 
 /** The search part that says `state` and all else that `search` says. */
-export function written(search, { row, range, loop, speed }, fps) {
+export function toSearch(search, { row, range, loop, speed }, fps) {
   const said = new URLSearchParams(search);
   for (const name of OWN) said.delete(name);
   const seconds = (of) => String(Number((of / fps).toFixed(4)));
@@ -29,8 +29,8 @@ export function written(search, { row, range, loop, speed }, fps) {
 }
 
 /** Do what the address says, and let it say from then on what is done. */
-export function link(clock, choose) {
-  const { row, range, loop, speed } = read(window.location.search, clock.fps);
+export function syncWithUrl(clock, choose) {
+  const { row, range, loop, speed } = parseSearch(window.location.search, clock.fps);
   if (speed !== null) choose(speed);
   if (range) clock.narrow(range);
   if (loop) clock.loop = true;
@@ -39,7 +39,7 @@ export function link(clock, choose) {
   const say = () => {
     waiting = null;
     const state = { row: clock.row, range: clock.narrowed ? clock.range : null, loop: clock.loop, speed: clock.rate };
-    window.history.replaceState(null, "", window.location.pathname + written(window.location.search, state, clock.fps) + window.location.hash);
+    window.history.replaceState(null, "", window.location.pathname + toSearch(window.location.search, state, clock.fps) + window.location.hash);
   };
   clock.addEventListener("change", () => (waiting ??= setTimeout(say, WAIT_MS)));
 }
