@@ -9,7 +9,7 @@ _MINUTE = 60
 
 
 @register.filter
-def left(seconds: float | str | None) -> str:
+def time_left(seconds: float | str | None) -> str:
     """Return the remaining time, rounded, as text; templates pass "" if it is unknown."""
     if not isinstance(seconds, float | int):
         return "time left not known yet"
@@ -21,6 +21,6 @@ def left(seconds: float | str | None) -> str:
 
 
 @register.filter
-def lasting(seconds: float | str | None) -> str:
+def duration(seconds: float | str | None) -> str:
     """Return seconds with one decimal; a dash if unknown."""
     return f"{seconds:.1f} s" if isinstance(seconds, float | int) else "–"

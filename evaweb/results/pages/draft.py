@@ -22,7 +22,7 @@ from evaweb.plans.seeded_draws import KEY_BYTES
 from evaweb.results.analysis.planner import Question
 from evaweb.results.analysis.power import Asked, Figures
 from evaweb.results.presentation.drawings import time_courses
-from evaweb.results.templatetags.results_tags import design_words
+from evaweb.results.templatetags.results_tags import design_text
 from evaweb.stations.models import Station
 from evaweb.statistics.designs import RULES
 from evaweb.statistics.score_courses import LARGEST, Scores
@@ -169,7 +169,7 @@ def _summary(plan: Plan, size: Size, said: Callable[[str], str], cycle_s: float)
     yield "Trials", f"{size.each} of each checkpoint, {size.total} in all: {hours:.1f} robot hours"
     if pairs:
         drops = ", checkpoints found worse are dropped" if plan.drop_arms else ""
-        yield "Design", f"{design_words(plan.stopping)}, alpha {plan.alpha:g}{drops}"
+        yield "Design", f"{design_text(plan.stopping)}, alpha {plan.alpha:g}{drops}"
     yield (
         "Blind",
         "yes: these checkpoints leave everybody's lists and choices, yours too, until the reveal"
@@ -228,7 +228,7 @@ def choices_page(plan: Plan, sight: Visibility, values: Values) -> dict[str, Any
         .union(User.objects.filter(pk=plan.owner_id), User.objects.filter(is_superuser=True, is_active=True))
         .order_by("username"),
         "designs": [
-            (rule, design_words(rule), str(StoppingRule(rule).label).partition(": ")[2]) for rule in RULES
+            (rule, design_text(rule), str(StoppingRule(rule).label).partition(": ")[2]) for rule in RULES
         ],
         "comparings": (
             (Comparing.PAIR, "Two: one checkpoint with the control"),
@@ -318,7 +318,7 @@ def power_page(plan: Plan, asked: Asked, found: Figures) -> dict[str, Any]:
     size, question = Size.of(plan), asked.question
     at = found.planned(asked)
     curves = [
-        (RULES.index(rule), design_words(rule), [(one.pairs, one.power) for one in found.curves[rule]])
+        (RULES.index(rule), design_text(rule), [(one.pairs, one.power) for one in found.curves[rule]])
         for rule in RULES
         if rule in found.curves and (len(found.curves[rule]) > 1 or rule in at)
     ]

@@ -36,19 +36,19 @@ def plan_tone(plan: Plan) -> str:
 
 
 @register.filter
-def design_words(rule: str) -> str:
+def design_text(rule: str) -> str:
     """Return a design in one or two words."""
     return str(StoppingRule(rule).label).partition(":")[0]
 
 
 @register.filter
-def rate_words(found: Proportion) -> str:
+def rate_text(found: Proportion) -> str:
     """Return x/n, percent and interval."""
     return wording.rate_words(found)
 
 
 @register.filter
-def difference_words(found: Difference) -> str:
+def difference_text(found: Difference) -> str:
     """Return percentage points with their interval."""
     return wording.format_points(found)
 
@@ -60,32 +60,32 @@ def probability(p: float) -> str:
 
 
 @register.filter
-def p_words(p: float) -> str:
+def p_value_text(p: float) -> str:
     """Return "p = 0.03" or "p < 0.001"."""
     return wording.p_words(p)
 
 
 @register.filter
-def outcome_words(run: Outcome) -> str:
+def outcome_text(run: Outcome) -> str:
     """Return success or failure, and the score if it is neither 0 nor 1."""
     said = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
     return f"{said}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else said
 
 
 @register.filter
-def twice_over(alpha: float) -> str:
+def evalue_threshold(alpha: float) -> str:
     """Return the e-value at which one of two directions is significant."""
     return f"{2 / alpha:g}"
 
 
 @register.filter
-def chosen_items(only: TrialFilter) -> list[tuple[str, str]]:
+def filter_items(only: TrialFilter) -> list[tuple[str, str]]:
     """Return the selected filters as (name, value)."""
     return [(name, value) for name, value in asdict(only).items() if value]
 
 
 @register.filter
-def of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
+def rows_of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
     """Return the rows of one trial."""
     return rows.get(trial, [])
 
@@ -110,7 +110,7 @@ _FORMATS = (("csv", "Trials as CSV"), ("parquet", "as Parquet"), ("json", "as JS
 
 
 @register.filter
-def listed(found: list[Any], what: str) -> str:
+def count_and_list(found: list[Any], what: str) -> str:
     """Return the number of items, and the names of the first of them."""
     if not found:
         return "none"
@@ -120,7 +120,7 @@ def listed(found: list[Any], what: str) -> str:
 
 
 @register.filter
-def points(share: float) -> str:
+def percent_points(share: float) -> str:
     """Return a difference of shares in whole percentage points."""
     return f"{100 * share:.0f}"
 
@@ -144,7 +144,7 @@ def minus(count: int, shown: list[Any]) -> int:
 
 
 @register.filter
-def field_words(name: str) -> str:
+def field_text(name: str) -> str:
     """Return a draft's field by its name on the page."""
     return _FIELD_WORDS.get(name, name.replace("_", " ").capitalize())
 
@@ -166,7 +166,7 @@ _FIELD_WORDS = {
 
 
 @register.filter
-def same_words(found: dict[str, Any]) -> str:
+def agreement_text(found: dict[str, Any]) -> str:
     """Return how often two raters agreed, with n and interval."""
     low, high = found["wilson"]
     share = 100 * found["same"] / found["n"]
@@ -174,7 +174,7 @@ def same_words(found: dict[str, Any]) -> str:
 
 
 @register.filter
-def contrast_words(found: dict[str, Any]) -> str:
+def contrast_text(found: dict[str, Any]) -> str:
     """Return the probability that the first is preferred to the second."""
     low, high = found["interval"]
     return (

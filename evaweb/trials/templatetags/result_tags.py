@@ -56,7 +56,7 @@ def interval(found: Proportion) -> str:
 
 
 @register.filter
-def averaged(found: Average | None, of: int) -> str:
+def mean_with_interval(found: Average | None, of: int) -> str:
     """Return a mean with its interval and count; a dash if there is none."""
     return rate_bars.average_words(found, of) or "–"
 
@@ -85,13 +85,13 @@ def _short(value: Any) -> str:
 
 
 @register.filter
-def spaced(name: str) -> str:
+def humanize_name(name: str) -> str:
     """Return a code name with spaces: over_plate becomes "over plate"."""
     return name.replace("_", " ")
 
 
 @register.filter
-def words(text: str) -> list[str]:
+def split_words(text: str) -> list[str]:
     """Return the words of a text."""
     return text.split()
 
@@ -103,6 +103,6 @@ def tone(status: str) -> str:
 
 
 @register.filter
-def what_next(status: str) -> str:
+def next_step(status: str) -> str:
     """Return advice to the user on a trial in this status."""
     return advice(status)

@@ -80,7 +80,9 @@ def test_the_step_to_do_is_the_result_until_somebody_has_said_it() -> None:
     assert call("collectStep", ready, "s") == "result"
     assert (
         call(
-            "collectStep", {**state_flags("ready"), "collect": {**COLLECT, "last": {**last, "result": "fail"}}}, "s"
+            "collectStep",
+            {**state_flags("ready"), "collect": {**COLLECT, "last": {**last, "result": "fail"}}},
+            "s",
         )
         == "record"
     )
@@ -234,7 +236,9 @@ def test_the_key_of_a_pedal_is_neither_the_e_stop_nor_one_of_the_pages(key: str,
 
 
 def test_the_key_of_a_pedal_is_kept_as_a_button_is() -> None:
-    found = run(PADS, "return m.parseMapping(JSON.stringify(m.withAssignment(m.defaultMapping(), 'big', 'b')));")
+    found = run(
+        PADS, "return m.parseMapping(JSON.stringify(m.withAssignment(m.defaultMapping(), 'big', 'b')));"
+    )
     assert (found["big"], found["arm"]) == ("b", 9)
     assert run(PADS, "return m.buttonName('b');") == "key B"
     assert run(PADS, "return m.parseMapping(given).big;", '{"big": " "}') == 0

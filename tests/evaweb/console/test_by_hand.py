@@ -160,9 +160,7 @@ def test_every_command_has_a_reason_wherever_the_station_does_not_allow_it() -> 
     states = ("disconnected", "idle", "setting_up", "ready", "running", "holding", "faulted")
     situations = [store(state=state, mode=mode) for state, mode in product(states, (*MODES, None))]
 
-    body = (
-        "return given[0].flatMap((kind) => given[1].filter((one) => !m.pageProblem(kind, one)).map(() => kind))"
-    )
+    body = "return given[0].flatMap((kind) => given[1].filter((one) => !m.pageProblem(kind, one)).map(() => kind))"
 
     assert run("commands/reasons.js", body, [list(COMMANDS), situations]) == []
 
@@ -287,7 +285,10 @@ def test_a_joints_label_is_as_short_as_tells_it_from_others(joints: list[str], l
 
 
 def test_a_value_beyond_a_limit_is_clipped_and_said() -> None:
-    body = "const [joint] = m.groupJoints(given)[0].joints; return [m.clampToLimits(joint, 9), m.clampToLimits(joint, 1)]"
+    body = """
+    const [joint] = m.groupJoints(given)[0].joints;
+    return [m.clampToLimits(joint, 9), m.clampToLimits(joint, 1)];
+    """
 
     assert run("manual/targets.js", body, FACTS) == [
         {"value": 2.6, "said": "left_arm.joint0 ends at 2.600"},
@@ -363,7 +364,10 @@ def test_how_poses_were_met_is_said_in_words() -> None:
 
 def test_the_target_begins_where_the_robot_is_told_to_be_else_where_it_is() -> None:
     joints = {"measured": [1, 2], "commanded": [1.1, 2.1]}
-    body = "return [m.initialTarget({ ...given, engaged: true }), m.initialTarget({ ...given, engaged: false }), m.initialTarget()]"
+    body = """
+    const engaged = [true, false].map((engaged) => m.initialTarget({ ...given, engaged }));
+    return [...engaged, m.initialTarget()];
+    """
 
     assert run("manual/targets.js", body, joints) == [[1.1, 2.1], [1, 2], None]
 
@@ -416,7 +420,9 @@ def test_the_hand_is_said_in_millimetres() -> None:
     poses = [0.1, -0.2, 0.3, 1, 0, 0, 0, 0.05, 0.4, 0.5, 0.6, 1, 0, 0, 0, 0.0]
 
     assert run(
-        "manual/targets.js", "return [m.tipPositionText(given, 1), m.tipPositionText(given, 2), m.tipPositionText(null, 0)]", poses
+        "manual/targets.js",
+        "return [m.tipPositionText(given, 1), m.tipPositionText(given, 2), m.tipPositionText(null, 0)]",
+        poses,
     ) == [
         "x 400  y 500  z 600 mm",
         "",

@@ -352,7 +352,9 @@ def test_of_nothing_there_is_no_quantile() -> None:
     ],
 )
 def test_the_step_to_do_now_follows_trial_and_state(panel: dict[str, str], state: str, step: str) -> None:
-    assert run("trial/steps.js", "return m.currentStep(given[0], given[1])", [panel, state_flags(state)]) == step
+    assert (
+        run("trial/steps.js", "return m.currentStep(given[0], given[1])", [panel, state_flags(state)]) == step
+    )
 
 
 def test_an_identity_is_a_random_uuid_of_version_four() -> None:
@@ -835,9 +837,7 @@ def test_a_camera_of_the_stations_own_is_named_with_what_is_wrong() -> None:
         "other": camera("melting", "it is hot"),
         "transports": None,
     }
-    body = (
-        "return Object.fromEntries(Object.entries(given).map(([name, told]) => [name, m.cameraProblem(told, 16)]))"
-    )
+    body = "return Object.fromEntries(Object.entries(given).map(([name, told]) => [name, m.cameraProblem(told, 16)]))"
     assert run("live/camera_text.js", body, cameras) == {
         "live": None,
         "absent": {"word": "no picture yet", "reason": refused},
