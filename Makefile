@@ -79,6 +79,8 @@ lint: setup-dev ## ruff, mypy, the contracts of .importlinter, and how tests wai
 	$(VENV)/bin/lint-imports --no-logo
 	$(PY) -m tests.lint.waits
 	$(PY) -m tests.lint.texts
+	$(PY) -m tests.lint.subjects
+	$(PY) -m tests.vocabulary --check
 
 format: setup-dev ## let ruff format and mend
 	$(PY) -m ruff check --fix .
