@@ -60,7 +60,7 @@ class Act:
 
 
 @dataclass(slots=True)
-class Found:
+class DataAtEnd:
     """Contents of database and data folders at the end."""
 
     trials: dict[int, str] = field(default_factory=dict)  # status
@@ -76,7 +76,7 @@ class Found:
 _OVER = ("scored", "voided", "abandoned")
 
 
-def counted(acts: Iterable[Act], found: Found) -> dict[str, list[str]]:
+def counted(acts: Iterable[Act], found: DataAtEnd) -> dict[str, list[str]]:
     """Return the faults by figure: everything lost, duplicated or stuck."""
     acts = list(acts)
     runs = {act.episode: act for act in acts if act.kind == "run" and act.uuid not in found.unopened}
@@ -136,14 +136,14 @@ class _Operator(threading.Thread):
         except DemoFailed as fault:
             self.said[f"at rest: {fault}"[:160]] += 1
         try:
-            self._ask("post", f"trials/{number}/void", {"reason": "left behind"})
+            self._request("post", f"trials/{number}/void", {"reason": "left behind"})
             self.voided += 1
             return ""
         except DemoFailed as fault:
             return str(fault)
 
     def _trial(self) -> bool:
-        opened = self._look()["trial"]
+        opened = self._poll()["trial"]
         number = int(opened["id"] if opened else self._prepare()["id"])
         if not opened or opened["status"] == "prepared":
             self._act(Act("prepare", number))  # also if the answer was lost: a page would show the trial
@@ -155,7 +155,7 @@ class _Operator(threading.Thread):
 
     def _prepare(self) -> Mapping[str, Any]:
         wanted = {"scene": "block-on-plate", "position": 1, "checkpoint": "chaos"}
-        return self._ask("post", f"stations/{PRESSED}/trials", wanted, again=False)
+        return self._request("post", f"stations/{PRESSED}/trials", wanted, again=False)
 
     def _begin(self, number: int) -> None:
         answer = self._command("run", number)
@@ -163,42 +163,42 @@ class _Operator(threading.Thread):
 
     def _end(self, number: int) -> bool:
         until = time.monotonic() + _PATIENCE_S
-        while (status := self._ask("get", f"trials/{number}")["status"]) in ("running", "paused"):
+        while (status := self._request("get", f"trials/{number}")["status"]) in ("running", "paused"):
             if time.monotonic() > until:
                 raise DemoFailed(f"trial {number} stays {status}")
-            if "stop" in (self._look()["snapshot"] or {}).get("allowed", ()):
+            if "stop" in (self._poll()["snapshot"] or {}).get("allowed", ()):
                 self._command("stop")
             time.sleep(_AGAIN_S)
         if status in ("ended", "interrupted"):
-            steps = self._ask("get", "scenes/block-on-plate")["milestones"]
+            steps = self._request("get", "scenes/block-on-plate")["milestones"]
             reached = {str(step["id"]): self._chance.random() < 0.5 for step in steps}
             uuid = str(uuid4())
-            self._ask("post", f"trials/{number}/score", {"milestones": reached, "uuid": uuid})
+            self._request("post", f"trials/{number}/score", {"milestones": reached, "uuid": uuid})
             self._act(Act("score", number, uuid))
         return status in ("ended", "interrupted", *_OVER)
 
     def _command(self, kind: str, trial: int | None = None) -> Mapping[str, Any]:
-        epoch = self._ask("post", f"stations/{PRESSED}/lease", {"action": "claim", "page": self._page})[
+        epoch = self._request("post", f"stations/{PRESSED}/lease", {"action": "claim", "page": self._page})[
             "epoch"
         ]
-        state = self._look()["snapshot"] or {}
+        state = self._poll()["snapshot"] or {}
         order = {"uuid": str(uuid4()), "kind": kind, "page": self._page, "epoch": epoch, "trial": trial}
         decided = {"boot": state.get("boot", ""), "sequence": state.get("sequence", 0)}
-        return self._ask("post", f"stations/{PRESSED}/commands", order | decided)
+        return self._request("post", f"stations/{PRESSED}/commands", order | decided)
 
     def _state(self, *wanted: str) -> None:
         until = time.monotonic() + _PATIENCE_S
-        while (self._look()["snapshot"] or {}).get("state") not in wanted and time.monotonic() < until:
+        while (self._poll()["snapshot"] or {}).get("state") not in wanted and time.monotonic() < until:
             time.sleep(_AGAIN_S)
 
-    def _look(self) -> Mapping[str, Any]:
-        return self._ask("get", f"stations/{PRESSED}")
+    def _poll(self) -> Mapping[str, Any]:
+        return self._request("get", f"stations/{PRESSED}")
 
     def _act(self, act: Act) -> None:
         if act not in self.acts:
             self.acts.append(act)
 
-    def _ask(self, verb: str, *given: Any, again: bool = True) -> Mapping[str, Any]:
+    def _request(self, verb: str, *given: Any, again: bool = True) -> Mapping[str, Any]:
         """Return the answer; requests without an answer, or with unknown outcome (504), are repeated."""
         until = time.monotonic() + _PATIENCE_S
         while True:
@@ -328,7 +328,7 @@ def _rows(policy: str) -> None:
     demo_rows.demo_checkpoint(name="chaos", description="", policy={"url": policy})
 
 
-def _at_rest(operator: _Operator, robot: Path, data: Path) -> Found:
+def _at_rest(operator: _Operator, robot: Path, data: Path) -> DataAtEnd:
     """Run one more trial, wait for transfers, finish what was left, reconcile, and return the contents."""
     from evaweb.stations.models import Command
     from evaweb.trials.models import Score, Trial
@@ -348,7 +348,7 @@ def _at_rest(operator: _Operator, robot: Path, data: Path) -> Found:
     trials = Trial.objects.values_list("pk", "status", "episode_id")
     from evaweb.episodes.models import Episode
 
-    return Found(
+    return DataAtEnd(
         trials={pk: status for pk, status, _ in trials},
         scores=[(trial, str(uuid)) for trial, uuid in Score.objects.values_list("trial_id", "uuid")],
         rows={str(uuid) for uuid in Episode.objects.values_list("pk", flat=True)},

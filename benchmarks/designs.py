@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks import coverage
 from benchmarks.report import Figure, Report
 from evaweb.plans.schedule import RANDOM, Condition, Unit, counts_of, schedule
-from evaweb.statistics.boundaries import MOST, Boundary, Look, extremeness_of
+from evaweb.statistics.boundaries import MOST, Boundary, StoppingTable, extremeness_of
 from evaweb.statistics.design_power import design_power
 from evaweb.statistics.designs import (
     ANYTIME,
@@ -71,7 +71,7 @@ class Case(NamedTuple):
     random: bool = False
 
 
-class Found(NamedTuple):
+class SimulatedPower(NamedTuple):
     """Power, median number of pairs, and standard error of a simulated power."""
 
     power: float
@@ -114,7 +114,7 @@ def measure(seconds: float, long: bool = False) -> Report:
     With `long` designs of 250 pairs too; an interrupted measurement is continued.
     """
     rows: Courses = []
-    kept = Kept() if long else None
+    kept = PartStore() if long else None
     figures: list[Figure] = []
     for name, part in _parts((*SIZES, MOST) if long else SIZES):
         for figure in kept.once(name, part, rows) if kept else part(rows):
@@ -137,7 +137,7 @@ def _parts(sizes: Sequence[int]) -> Iterator[tuple[str, Part]]:
     yield from (("estimates", estimates), ("drifts", drifts))
 
 
-class Kept:
+class PartStore:
     """Store of the completed parts of a long measurement, which can then be continued; keyed by a hash of its
     sources.
     """
@@ -259,7 +259,7 @@ def boundary_of(case: Case, pairs: int) -> Boundary | None:
     if case.rule == ANYTIME or case.outcome == SCORE:
         return None
     if case.rule == FIXED and case.margin is None:
-        return Boundary((Look(pairs, pairs, _least(pairs, case.alpha)),), case.alpha)
+        return Boundary((StoppingTable(pairs, pairs, _least(pairs, case.alpha)),), case.alpha)
     looks = range(case.every, pairs, case.every) if case.every > 1 else ()
     counts = counts_of(_in_random_order(pairs), "ab") if case.random else None
     found = design(
@@ -407,18 +407,18 @@ def _runs(case: Case) -> int:
 
 
 @lru_cache(maxsize=256)
-def _found(case: Case, rates: Rates, pairs: int) -> Found:
+def _found(case: Case, rates: Rates, pairs: int) -> SimulatedPower:
     """Return power and median at these rates, exact if possible."""
     if exact := boundary_of(case, pairs):
         ended = exact.operating_characteristics(*rates)
-        return Found(ended.power, ended.median // 2)
+        return SimulatedPower(ended.power, ended.median // 2)
     if case.outcome == SCORE:
         return _simulated(case, rates, pairs)
     of_runs = design_power(case.rule, pairs, *rates, case.alpha)
-    return Found(of_runs.power, of_runs.median, _error(of_runs.power, _RUNS_OF_RATES))
+    return SimulatedPower(of_runs.power, of_runs.median, _error(of_runs.power, _RUNS_OF_RATES))
 
 
-def _simulated(case: Case, rates: Rates, pairs: int) -> Found:
+def _simulated(case: Case, rates: Rates, pairs: int) -> SimulatedPower:
     """Return power and median for scores that are shares of milestones, each reached with these probabilities."""
     chance = np.random.default_rng(pairs)
     planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, outcome=case.outcome)
@@ -427,7 +427,7 @@ def _simulated(case: Case, rates: Rates, pairs: int) -> Found:
         evaluate_design(planned, in_blocks([(one, other) for one, other in run])) for run in scores.tolist()
     ]
     power = sum(found.winner is not None for found in ended) / _RUNS
-    return Found(
+    return SimulatedPower(
         power, float(np.median([found.ended_at_pair or pairs for found in ended])), _error(power, _RUNS)
     )
 

@@ -119,20 +119,20 @@ class RestPresser:
 
     def ready(self) -> None:
         """Request whether this way works, as a page does when it opens."""
-        self.ask("GET", "estop")
+        self.post("GET", "estop")
 
     def press(self, why: str, identity: str = "") -> Press:
         """Press and wait for the answer."""
         begun = time.monotonic()
         try:
-            said = self.ask("POST", "estop", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
+            said = self.post("POST", "estop", json.dumps({"uuid": identity or str(uuid4()), "why": why}))
         except (OSError, http.client.HTTPException, ValueError) as fault:
             return Press("", f"{type(fault).__name__}: {fault}", (time.monotonic() - begun) * 1000.0)
         took = time.monotonic() - begun
         answered = took <= PATIENCE_S
         return Press(said.get("status", "refused") if answered else "", str(said)[:200], took * 1000.0)
 
-    def ask(self, method: str, what: str, body: str = "") -> dict[str, Any]:
+    def post(self, method: str, what: str, body: str = "") -> dict[str, Any]:
         """Return the answer to a request to `estop` or `commands`."""
         with closing(http.client.HTTPConnection(self._address, timeout=PATIENCE_S)) as connection:
             connection.request(method, f"/api/v1/stations/{self._station}/{what}", body, self._headers)

@@ -140,7 +140,7 @@ class StationWatch:
             for work, given in (
                 (self._listen, (station.client,)),
                 (self._claim, (station.another_client(),)),
-                (self._look, ()),
+                (self._poll, ()),
             )
         ]
         for thread in self._threads:
@@ -170,7 +170,7 @@ class StationWatch:
                 with suppress(RuntimeFault):
                     client.claim()
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         while not self._ended.wait(0.1):
             web, family = _memory(self._web), _memory(self._family)
             self._most = max(self._most[0], web), max(self._most[1], family)

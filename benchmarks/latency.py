@@ -101,7 +101,7 @@ def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
     with tempfile.TemporaryDirectory() as folder:
         settings = ["control.rate=30.0", "recording.fps=30.0", *assignments]
         with busy_lab(Path(folder), settings) as lab:
-            transit = _shortest_way(lab.announced["node"])
+            transit = _shortest_delay(lab.announced["node"])
             found, presses, percent = _run(lab, seconds)
             episode = only_episode(lab.data)
         measured = {**found, **_from(episode, presses, transit)}
@@ -152,7 +152,7 @@ def _resume(page: LivePage) -> float:
     return taken
 
 
-def _shortest_way(endpoint: str) -> float:
+def _shortest_delay(endpoint: str) -> float:
     """Return the shortest time from the node's stamp to a subscriber in this process [s]."""
     ways = []
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:

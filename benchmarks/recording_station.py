@@ -71,19 +71,19 @@ class Watch:
     def _run(self) -> None:
         settled = time.monotonic() + _SETTLED_S
         while not self._ending.wait(_SIZES_PERIOD_S) and time.monotonic() < settled:
-            self._look()
+            self._poll()
         self.memory.append(resident_mb(self._media))
         begun, before, received = time.monotonic(), _used(self._media), _used(self._reception)
         next_memory = begun + _MEMORY_PERIOD_S
         while not self._ending.wait(_SIZES_PERIOD_S):
-            self._look()
+            self._poll()
             if time.monotonic() >= next_memory:
                 next_memory += _MEMORY_PERIOD_S
                 self.memory.append(resident_mb(self._media))
         self.processor, self.receiving = _used(self._media) - before, _used(self._reception) - received
         self.seconds = time.monotonic() - begun
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         for video in self._folder.glob("*.mp4"):
             size = video.stat().st_size
             seen = self.sizes.setdefault(video.stem, [])

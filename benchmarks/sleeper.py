@@ -18,12 +18,12 @@ def main() -> None:
     """Print a line of JSON: scheduling class, and time, step and lateness of each wake-up [s]."""
     how, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
     scheduling = realtime.enter_realtime(int(sys.argv[4])) if len(sys.argv) > 4 else "ordinary"
-    loop = {"rest": _rest, "deadlines": _deadlines}[how]
+    loop = {"rest": _sleep, "deadlines": _deadlines}[how]
     woke, steps, late = loop(1.0 / rate, seconds)
     print(json.dumps({"scheduling": scheduling, "woke": woke, "steps": steps, "late": late}))
 
 
-def _rest(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
+def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
     """Sleep for the remaining period since the last wake-up."""
     woke = [time.monotonic()]
     end = woke[0] + seconds

@@ -72,7 +72,7 @@ def main(text: str) -> None:
     shared = SharedState.attach(layout(robot), given.shared)
     with contextlib.closing(source(given, robot, clock)) as opened:
         intake = ObservationReceiver(
-            shared, opened, clock, _say, lambda observation, numbers: player.see(observation)
+            shared, opened, clock, _say, lambda observation, numbers: player.receive(observation)
         )
         opened.connect()
         opened.begin_run()
@@ -92,7 +92,7 @@ class _Player:
     def __init__(self) -> None:
         self.over = False
 
-    def see(self, observation: Observation) -> None:
+    def receive(self, observation: Observation) -> None:
         self.over = self.over or observation.last
 
 

@@ -66,7 +66,7 @@ def live(case: Case, seconds: float) -> Row:
         time.sleep(_SETTLE_S)
         watched = psutil.Process(receiver.pid)
         before, begun = _processor(watched), time.monotonic()
-        looks, arrivals = _look(shared, seconds)
+        looks, arrivals = _control_readings(shared, seconds)
         took = time.monotonic() - begun
         used = (_processor(watched) - before) / took
         faults, sent = _ended(receiver), stage.sent()
@@ -145,7 +145,7 @@ Look = list[
 ]  # per camera: head and foot of the image, capture time, current time
 
 
-def _look(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
+def _control_readings(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
     """Return the readings of a control loop at each of its ticks, and the number of observations meanwhile."""
     clock = MonotonicClock()
     first = int(shared.observation.read()["sequence"])

@@ -76,10 +76,10 @@ def _list(_: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    return _said(inspect_robot(options.name))
+    return _print_findings(inspect_robot(options.name))
 
 
-def _said(found: Inspection) -> int:
+def _print_findings(found: Inspection) -> int:
     print("\n".join(found.lines))
     print("\n".join(f"warning: {sentence}" for sentence in found.warnings) or "no warnings")
     for sentence in found.errors:
@@ -127,7 +127,7 @@ def _new(options: argparse.Namespace) -> int:
     """Draft a robot, then print the findings of `check` on the draft, and the next steps."""
     into = options.into or next(iter(robot_folders()), Path())
     made = draft_robot(options.name, options.urdf, into, options.copies)
-    said = _said(made.inspection)
+    said = _print_findings(made.inspection)
     if missing := made.pictures.missing:
         print(
             f"shapes: {len(missing)} meshes were not found or cannot be read, {missing[0]} the first; put them where"

@@ -86,8 +86,8 @@ class Clearance:
         for ends, (_, capsule) in zip(self._ends, found, strict=True):
             ends[:3, 0], ends[:3, 1] = capsule.start, capsule.end
         self._fingers = np.asarray(body.moving_mask()[self._parts][:, list(robot.gripper_dims)].any(axis=1))
-        self._look_at(*_candidates(robot, body, self._parts))
-        self._look_at(*self._telling(robot))
+        self._select_pairs(*_candidates(robot, body, self._parts))
+        self._select_pairs(*self._telling(robot))
 
     def distances(self, q: Float64) -> Float64:
         """Return the distances of the pairs [m], [..., K], negative for overlap, for the robot's vector [..., D]."""
@@ -119,7 +119,7 @@ class Clearance:
         least[len(self._first) :][self._fingers[self._over]] = -_DIP
         return least
 
-    def _look_at(self, first: _Indices, second: _Indices, over: _Indices) -> None:
+    def _select_pairs(self, first: _Indices, second: _Indices, over: _Indices) -> None:
         """Set the checked pairs: capsules `first` and `second`, and capsules `over` the table."""
         self._first, self._second, self._over = first, second, over
         standing = np.where(self._fingers[over], 0.0, self._radii[over])

@@ -30,7 +30,7 @@ _FILE = "robot.toml"
 
 def robot_names() -> tuple[str, ...]:
     """Return the names of the included robots, and of those in the folders of $EVA_ROBOTS (a search path)."""
-    return tuple(sorted(_known()))
+    return tuple(sorted(_find_folders()))
 
 
 def robot_folders() -> tuple[Path, ...]:
@@ -39,7 +39,7 @@ def robot_folders() -> tuple[Path, ...]:
     return tuple(Path(part).expanduser() for part in parts if part)
 
 
-def _known() -> dict[str, Path]:
+def _find_folders() -> dict[str, Path]:
     """Return the folders by name; an included robot cannot be replaced by another of the same name."""
     found: dict[str, Path] = {}
     for root in (_HERE, *robot_folders()):
@@ -163,7 +163,7 @@ def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
 
 
 def _folder(robot: str | Path) -> Path:
-    known = _known()
+    known = _find_folders()
     if isinstance(robot, str) and robot in known:
         return known[robot]
     folder = Path(robot)

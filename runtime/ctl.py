@@ -70,7 +70,7 @@ def _run_and_wait(
     if not getattr(given, "wait", False):
         _show(client.status(), given.json)
         return DONE
-    settled = wait_until_settled(client, before, _silent if given.json else _tell)
+    settled = wait_until_settled(client, before, _silent if given.json else _print_event)
     _show(settled.status, given.json)
     return _outcome(settled.failure(wants))
 
@@ -85,9 +85,9 @@ def _print(text: str) -> None:
     print(text, flush=True)
 
 
-def _tell(event: dict[str, Any]) -> None:
+def _print_event(event: dict[str, Any]) -> None:
     if event["kind"] != "command":  # the one that was just given
-        watch.tell(event)
+        watch.print_event(event)
 
 
 def _silent(what: object) -> None:

@@ -32,7 +32,7 @@ ATTACKS = {
     "handshakes": crowds.handshakes,
     "pages": crowds.pages,
     "rest_clients": crowds.rest_clients,
-    "made_up_tokens": presses.made_up_tokens,
+    "made_up_tokens": presses.unknown_tokens,
     "halts": presses.halts,
     "database_hangs": databases.hangs,
 }

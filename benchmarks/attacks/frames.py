@@ -36,7 +36,7 @@ class _Page(LivePage):
     def closed(self) -> bool:
         return bool(self._failure)
 
-    def say(self, message: Mapping[str, Any], times: int) -> None:
+    def send(self, message: Mapping[str, Any], times: int) -> None:
         """Send a message `times` times, each with its own uuid."""
         for _ in range(times):
             self._send({**message, "uuid": str(uuid4())})
@@ -103,7 +103,7 @@ def _waves(target: Target, station: str, message: Mapping[str, Any], times: int)
             with closing(_Page(visitor, station)) as page:
                 done["pages"] += 1
                 while not target.ended.is_set() and not page.closed:
-                    page.say(message, times)
+                    page.send(message, times)
                     done["sent"] += times
                     if done["sent"] == times:
                         target.begun()

@@ -14,7 +14,7 @@ from evaweb.accounts.roles import Role
 _TOKENS, _HALTS = 64, 32
 
 
-def made_up_tokens(target: Target) -> Counter[str]:
+def unknown_tokens(target: Target) -> Counter[str]:
     """Press the e-stop from 64 clients, each time with a new unknown token."""
 
     def press(target: Target, number: int) -> str:
@@ -32,6 +32,6 @@ def halts(target: Target) -> Counter[str]:
     def halt(target: Target, number: int) -> str:
         order = {"kind": "halt", "page": "attack", "epoch": 0, "uuid": str(uuid4())}
         program = RestPresser(target.stops, headers | {"Origin": target.url})
-        return f"answered {program.ask('POST', 'commands', json.dumps(order)).get('status', 'an error')}"
+        return f"answered {program.post('POST', 'commands', json.dumps(order)).get('status', 'an error')}"
 
     return again_and_again(target, target.part(_HALTS), halt)

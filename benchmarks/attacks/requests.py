@@ -38,7 +38,7 @@ def half_open(target: Target) -> Counter[str]:
 async def _half_open(target: Target) -> Counter[str]:
     opened: Counter[str] = Counter()
     tried = [asyncio.Event() for _ in range(target.part(_CONNECTIONS))]
-    tries = [asyncio.create_task(_one(target, number, opened, one)) for number, one in enumerate(tried)]
+    tries = [asyncio.create_task(_send_one(target, number, opened, one)) for number, one in enumerate(tried)]
     with suppress(TimeoutError):
         async with asyncio.timeout(_OPENING_S):
             await asyncio.gather(*(one.wait() for one in tried))
@@ -49,7 +49,7 @@ async def _half_open(target: Target) -> Counter[str]:
     return opened
 
 
-async def _one(target: Target, number: int, opened: Counter[str], tried: asyncio.Event) -> None:
+async def _send_one(target: Target, number: int, opened: Counter[str], tried: asyncio.Event) -> None:
     while True:
         try:
             reader, writer = await asyncio.open_connection(*target.address)

@@ -207,10 +207,10 @@ class Scenario(Bench):
             self._compare(told, self.previous, " ".join(record.notes), stopped)
         elif (np.abs(self._apart(told, self._known)) > _NEAR)[self.places].any():
             self._wrong("taken over where it is not")
-        self._look_at_grippers(told, stopped)
+        self._check_grippers(told, stopped)
         self.previous = told
 
-    def _look_at_grippers(self, told: Float64, stopped: bool) -> None:
+    def _check_grippers(self, told: Float64, stopped: bool) -> None:
         """Check that e-stops and the hold after them leave grippers as they are, and that switches are rare."""
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]

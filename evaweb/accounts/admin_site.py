@@ -52,7 +52,7 @@ class LabAdminSite(AdminSite):
             name = str(match.url_name or "") if match else ""
             if name.startswith(_REVEALING_PAGES) and self.has_permission(request):
                 hidden = visibility_for_user(request.user)
-                if not hidden.sees_everything:
+                if not hidden.hides_nothing:
                     raise NotAllowed(f"this page tells which checkpoint a trial is of, and {hidden.plans}")
             return inner(request, *given, **named)
 

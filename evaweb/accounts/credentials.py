@@ -116,7 +116,7 @@ class CredentialCache:
 
         Runs in the caller's thread. Raises: the database's Error.
         """
-        with connection.execute_wrapper(self._heard):
+        with connection.execute_wrapper(self._on_answer):
             user = self._owners[kind](secret)
         if user is None:
             if kind in EXPIRED_ALLOWED and self.recall(kind, secret) is not None:
@@ -132,7 +132,7 @@ class CredentialCache:
         """Record that the database has just responded."""
         self._answered_at = self._clock()
 
-    def _heard(self, execute: Callable[..., Any], *asked: Any) -> Any:
+    def _on_answer(self, execute: Callable[..., Any], *asked: Any) -> Any:
         answer = execute(*asked)
         self.record_answer()
         return answer
@@ -234,10 +234,10 @@ class CredentialCache:
     def _resolve_unknown(self, kind: str, secret: str, share: str) -> Coroutine[Any, Any, _Said]:
         """Start looking up an uncached credential; the coroutine returns its user or why it is unknown."""
         if self._is_known_as_nobodys((kind, digest(secret))):
-            return self._said_of(None)
-        return self._said_of(self._check(kind, secret, share))
+            return self._cached(None)
+        return self._cached(self._check(kind, secret, share))
 
-    async def _said_of(self, asked: Future[Login | None] | None) -> _Said:
+    async def _cached(self, asked: Future[Login | None] | None) -> _Said:
         if asked is None:
             return None
         came = self._clock()
@@ -267,7 +267,7 @@ class CredentialCache:
             asked = self._asked.get(key)
             if asked is not None:
                 return asked
-            work = partial(self._ask, kind, secret)
+            work = partial(self._query, kind, secret)
             lookups = self._remembered if share is None else self._strangers
             asked = self._asked[key] = lookups.submit(share, work)
         asked.add_done_callback(lambda _: self._done(key))
@@ -277,7 +277,7 @@ class CredentialCache:
         with self._lock:
             self._asked.pop(key, None)
 
-    def _ask(self, kind: str, secret: str) -> Login | None:
+    def _query(self, kind: str, secret: str) -> Login | None:
         """Look up a credential; kinds "of any age" try the valid credential first, then the expired one."""
         try:
             with short_lock_wait():

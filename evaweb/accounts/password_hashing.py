@@ -33,11 +33,11 @@ class HashingOverload(EvaError):
     retry_after_s = 5
 
 
-def _give_way() -> None:
+def _lower_priority() -> None:
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # on Linux this affects the thread only
 
 
-_turns: FairLookupPool[str] = FairLookupPool(1, _MOST_WAITING, "passwords", _give_way)
+_turns: FairLookupPool[str] = FairLookupPool(1, _MOST_WAITING, "passwords", _lower_priority)
 
 
 class QueuedHasher(PBKDF2PasswordHasher):

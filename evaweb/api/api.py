@@ -35,7 +35,7 @@ from evaweb.api.request_validation import BoundedParser, reject_unknown_paramete
 from evaweb.api.responses import describe_errors
 from evaweb.core.errors import EvaError, refusal
 from evaweb.core.storage_errors import storage_error_response
-from evaweb.core.write_conflicts import TAKEN, was_taken
+from evaweb.core.write_conflicts import TAKEN, is_duplicate
 from evaweb.serving.error_pages import retrying
 from runtime.core import bounded_documents as bounded
 
@@ -135,7 +135,7 @@ def _storage(request: HttpRequest, fault: Exception) -> HttpResponse:
 
 @api.exception_handler(IntegrityError)
 def _taken(request: HttpRequest, fault: IntegrityError) -> HttpResponse:
-    if not was_taken(fault):
+    if not is_duplicate(fault):
         raise fault
     log.warning("%s %s was refused: %s", request.method, request.path, fault)
     return _failure(request, TAKEN, 409)

@@ -336,7 +336,7 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)
         position = trials.position_get(scene=scene, number=given.position or 0)
-    taken = bench.take_references(user=request.auth, station=station_get(name=name), position=position)
+    taken = bench.record_references(user=request.auth, station=station_get(name=name), position=position)
     return Status(201, [ReferenceOut.of(row) for row in taken])
 
 

@@ -22,7 +22,7 @@ from evaweb.results.analysis.agreement import judge_agreement, preference_rankin
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.filters import TrialFilter, parse_filter
 from evaweb.results.analysis.planner import Question, question_of, table_of
-from evaweb.results.analysis.simulated import set_beside, simulated_plans
+from evaweb.results.analysis.simulated import compare_with_real, simulated_plans
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.citation import citation
@@ -249,7 +249,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
     and differences with what simulation adds (null of fewer than eight matched trials)."""
     plan, _ = _seen(request, name, version, TrialFilters())
     user: Any = request.auth  # type: ignore[attr-defined]
-    found = (set_beside(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
+    found = (compare_with_real(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
     return [
         {
             "plan": one["plan"].name,

@@ -114,7 +114,7 @@ class StopGateway:
         body = await _body(receive)
         if body is None:
             return
-        told = list(self._told_browsers(scope))
+        told = list(self._cors_headers(scope))
         if scope["method"] == "OPTIONS":
             await _send(send, 200, {}, [*told, *_PREFLIGHT])
             return
@@ -146,7 +146,7 @@ class StopGateway:
             user = UNVERIFIED
         return 200, {"user": user, "alone": self._web_port is not None}
 
-    def _told_browsers(self, scope: dict[str, Any]) -> _Headers:
+    def _cors_headers(self, scope: dict[str, Any]) -> _Headers:
         """Return the CORS headers that allow only our own pages to read the answer."""
         origin, host = _header(scope, b"origin"), _header(scope, b"host")
         if not _is_known(host) or not is_own_origin(origin, host, scheme_of(scope), self._web_port):

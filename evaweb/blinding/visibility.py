@@ -67,7 +67,7 @@ class Visibility:
     user: int | None = None
 
     @property
-    def sees_everything(self) -> bool:
+    def hides_nothing(self) -> bool:
         """Whether nothing is hidden."""
         return not self.checkpoints
 
@@ -109,7 +109,7 @@ class Visibility:
 
     def filter_visible(self, rows: Any, checkpoint: str = "checkpoint") -> Any:
         """Exclude rows of hidden checkpoints; `checkpoint` is the query path to the checkpoint."""
-        if self.sees_everything:
+        if self.hides_nothing:
             return rows
         return rows.exclude(**{f"{checkpoint}__in": self.checkpoints})
 
@@ -151,7 +151,7 @@ class Visibility:
 
     def redacts_snapshot(self, station: str, snapshot: Mapping[str, Any] | None) -> bool:
         """Return True if the station's snapshot must be shown without data of the loaded checkpoint."""
-        if self.sees_everything:
+        if self.hides_nothing:
             return False
         loaded = (snapshot or {}).get("checkpoint") or {}
         if (

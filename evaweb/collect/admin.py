@@ -9,7 +9,7 @@ from django.http import HttpRequest
 from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 
 
-class _Kept(admin.ModelAdmin):
+class _ReadOnlyAdmin(admin.ModelAdmin):
     """Base of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
@@ -36,7 +36,7 @@ class _Events(admin.TabularInline):
 
 
 @admin.register(CollectSession)
-class CollectSessionAdmin(_Kept):
+class CollectSessionAdmin(_ReadOnlyAdmin):
     """Collection sessions; opened, closed and resumed on the station's Collect page."""
 
     list_display = ("task", "dataset", "station", "operator", "target", "episodes", "opened_at", "closed_at")
@@ -55,7 +55,7 @@ class CollectSessionAdmin(_Kept):
 
 
 @admin.register(Demonstration)
-class DemonstrationAdmin(_Kept):
+class DemonstrationAdmin(_ReadOnlyAdmin):
     """Demonstrations with their labels."""
 
     list_display = ("episode", "session", "result", "discarded", "labelled_by", "labelled_at")

@@ -68,7 +68,7 @@ def _session(uuid: UUID, episode: Episode, kept: RestorableRun) -> CollectSessio
         name=first.station, robot=str(first.setup.get("robot", "")), simulated=False, source=f"session {uuid}"
     )
     targets = [event.target for event in events if event.kind in ("opened", "target")]
-    session = _made(
+    session = _create(
         uuid,
         station,
         dataset=first.dataset,
@@ -96,7 +96,7 @@ def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
     except (KeyError, TypeError, AttributeError) as error:
         raise EvaError(_MANIFEST_DOES_NOT_SAY_HOW(error=error)) from None
     opened = episode.started_at or timezone.now()
-    return _made(
+    return _create(
         uuid,
         episode.station,
         dataset=dataset,
@@ -109,7 +109,7 @@ def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
     )
 
 
-def _made(uuid: UUID, station: Station, **facts: Any) -> CollectSession:
+def _create(uuid: UUID, station: Station, **facts: Any) -> CollectSession:
     """Create the session; closed if another one is open at the station."""
     if facts["closed_at"] is None and CollectSession.objects.filter(station=station, closed_at=None).exists():
         facts["closed_at"] = timezone.now()

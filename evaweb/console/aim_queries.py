@@ -54,7 +54,7 @@ class AimQueries:
         self._waiting: Aim | None = None
         self._under_way = False
 
-    def ask(self, request: Aim) -> bool:
+    def submit(self, request: Aim) -> bool:
         """Queue a query in place of a waiting one; return True if `answer` has to be started."""
         if self._role is Role.VIEWER:
             self._say({"type": "aimed", "id": request.id, **_refused(_VIEWER(user=self._username))})
@@ -69,12 +69,12 @@ class AimQueries:
             while (request := self._waiting) is not None:
                 self._waiting = None
                 work = partial(query_aim, self._station.name, self._username, request.args, self._looks())
-                found = await self._found(work, request.id)
+                found = await self._query(work, request.id)
                 self._say({"type": "aimed", "id": request.id, **found})
         finally:
             self._under_way = False
 
-    async def _found(self, work: Callable[[], dict[str, Any]], identity: int) -> dict[str, Any]:
+    async def _query(self, work: Callable[[], dict[str, Any]], identity: int) -> dict[str, Any]:
         try:
             asked = _under_way.submit(self._station.name, work, key=id(self), identity=identity)
             return await asyncio.wrap_future(asked)

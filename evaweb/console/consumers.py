@@ -125,8 +125,8 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._stopping = PageStops(
                 self._station, self._page, found, client_key(self.scope), self._send_text, _go_on
             )
-            self._keep(self._write())
-            self._keep(self._admit())
+            self._run_until_closed(self._write())
+            self._run_until_closed(self._admit())
 
     async def _admit(self) -> None:
         """Query the user until the database answers; stops are obeyed meanwhile."""
@@ -148,15 +148,15 @@ class StationConsumer(AsyncWebsocketConsumer):
         hello = {"station": station.name, "user": user.get_username(), "role": role, "page": self._page}
         self._send_text({"type": "hello", **hello, "facts": facts})
         room = self._room = hub().room(station.name, station.robot)
-        self._aims = AimQueries(station, user.get_username(), role, self._send_text, lambda: room.looks)
+        self._aims = AimQueries(station, user.get_username(), role, self._send_text, lambda: room.drawn_robot)
         self._mailbox = room.join(self._outbox.put_nowait, user, sight)
-        self._keep(self._follow_login(role))
+        self._run_until_closed(self._follow_login(role))
         self._admitted = True
         early, self._early = self._early, []
         for text in early:
             await self.receive(text)
 
-    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+    def _run_until_closed(self, work: Coroutine[Any, Any, None]) -> None:
         """Run a task until the page is closed."""
         self._tasks.append(asyncio.create_task(work))
         self._tasks[-1].add_done_callback(_finished)
@@ -189,7 +189,7 @@ class StationConsumer(AsyncWebsocketConsumer):
     async def receive(self, text_data: str | None = None, bytes_data: bytes | None = None) -> None:
         """Handle one message of the page."""
         text = text_data or _decode_binary(bytes_data or b"")
-        if not self._session or (self._over and not requests.looks_like_stop(text)):
+        if not self._session or (self._over and not requests.may_be_stop(text)):
             return
         within, request = self._quota.take(), self._parsed(text)
         if isinstance(request, EStop | Stop):
@@ -200,7 +200,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._mailbox.mark_read()
             await self._handle(request)
         elif isinstance(request, Renew) and not self._admitted and self._counted is not None:
-            self._keep_lease(request)  # the page was reloaded while the database is unavailable
+            self._renew_lease(request)  # the page was reloaded while the database is unavailable
         elif len(self._early) < _MOST_EARLY:
             self._early.append(text)
 
@@ -230,7 +230,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         if isinstance(request, BadRequest):
             await self._send_error(str(request))
         elif isinstance(request, Renew):
-            self._keep_lease(request)
+            self._renew_lease(request)
         elif isinstance(request, Watch):
             self._room.watch(self._mailbox, request.streams)
         elif isinstance(request, Credit):
@@ -242,10 +242,10 @@ class StationConsumer(AsyncWebsocketConsumer):
         elif isinstance(request, Aim) and self._counted is None:
             said = {"ok": False, "reason": _NOT_SAID, "sentence": identity(_NOT_SAID)}
             self._send_text({"type": "aimed", "id": request.id, **said})
-        elif isinstance(request, Aim) and self._aims.ask(request):
+        elif isinstance(request, Aim) and self._aims.submit(request):
             _go_on(self._aims.answer())
 
-    def _keep_lease(self, request: Renew) -> None:
+    def _renew_lease(self, request: Renew) -> None:
         """Renew the lease if the database has confirmed the user within the last minute, even if it is
         unavailable now.
         """

@@ -65,7 +65,7 @@ class StreamEncoder:
         self._robot = robot
         self._veiled = veiled
         self._groups: tuple[str, ...] | None = None  # None: not known yet
-        self.looks = _looks(robot, None)
+        self.looks = _drawn_robot(robot, None)
         self._recent = RecentSamples()
 
     def encode(self, stream: str, content: Any) -> list[EncodedPart]:
@@ -91,7 +91,7 @@ class StreamEncoder:
         groups = facts.get("groups") if isinstance(facts, Mapping) else None
         if groups and tuple(groups) != self._groups:
             self._groups = tuple(groups)
-            self.looks = _looks(self._robot, self._groups)
+            self.looks = _drawn_robot(self._robot, self._groups)
 
     def _joints(self, content: Mapping[str, Any], now: float) -> list[EncodedPart]:
         vectors = {name: np.asarray(content[name], np.float32) for name in _VECTORS if name in content}
@@ -124,7 +124,7 @@ def _drawable(joints: NDArray[Any], looks: DrawnRobot) -> bool:
     return joints.shape == (looks.robot.dim,) and bool(np.isfinite(joints).all())
 
 
-def _looks(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot | None:
+def _drawn_robot(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot | None:
     """Return the robot to draw; None, with a log line, if it cannot be drawn."""
     try:
         return drawn_robot(robot, groups)

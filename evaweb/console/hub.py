@@ -52,7 +52,7 @@ class StationRoom:
         self._look_again = False
 
     @property
-    def looks(self) -> DrawnRobot | None:
+    def drawn_robot(self) -> DrawnRobot | None:
         """Robot with the groups that the station reports; None if it is not drawn."""
         return self._encoder.looks
 

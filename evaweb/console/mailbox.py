@@ -83,9 +83,9 @@ class Mailbox:
     def flush(self, history: History, make_frame: MakeFrame) -> None:
         """Send everything that may be sent now."""
         link = self._link
-        if link is not None and self._say({"type": "link", "ok": link.ok, **reasoned(link.reason)}):
+        if link is not None and self._send({"type": "link", "ok": link.ok, **reasoned(link.reason)}):
             self._link = None
-        if self._changed and self._say({"type": "changed", "what": sorted(self._changed)}):
+        if self._changed and self._send({"type": "changed", "what": sorted(self._changed)}):
             self._changed.clear()
         self._flush_events(history)
         if self._pending and self._credits:
@@ -111,13 +111,13 @@ class Mailbox:
         for start in range(0, len(rows), EVENTS_AT_ONCE):
             some = rows[start : start + EVENTS_AT_ONCE]
             covered = {"covered": True} if self.redacts_events else {}
-            if not self._say({"type": "events", "boot": history.boot, "events": some, **covered}):
+            if not self._send({"type": "events", "boot": history.boot, "events": some, **covered}):
                 return
             self._events_after = some[-1]["number"]
         last = covered[-1]["number"] if covered else self._covered_up_to[1]
         self._covered_up_to = (history.newest, last) if self.redacts_events else (0, 0)
 
-    def _say(self, message: dict[str, object]) -> bool:
+    def _send(self, message: dict[str, object]) -> bool:
         """Send a text, unless the page has not responded to many; return whether it was sent."""
         if self._unheard >= _TEXTS_UNHEARD:
             return False

@@ -95,7 +95,7 @@ class Aim:
 Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
-def looks_like_stop(text: str) -> bool:
+def may_be_stop(text: str) -> bool:
     """Return True if a message that is not parsed completely may stop a robot."""
     if pressing.parse_json_press(text, "type") is not None:
         return True

@@ -36,14 +36,14 @@ def still_of(station: Station) -> bytes:
     with _turns[station.name]:
         at, jpeg = _stills.get(station.name, (0.0, b""))
         if not at or time.monotonic() - at > KEPT_S:
-            jpeg = _asked(station, cameras)
+            jpeg = _fetch(station, cameras)
             _stills[station.name] = (time.monotonic(), jpeg)
     if not jpeg:  # a missing image is cached too, so that other viewers need not wait for it
         raise NotFound(_SENDS_NO_PICTURE(name=station.name, cameras=cameras[0]))
     return jpeg
 
 
-def _asked(station: Station, cameras: list[str]) -> bytes:
+def _fetch(station: Station, cameras: list[str]) -> bytes:
     """Return the image, b"" if none came in time."""
     try:
         return image_store.current_images(station, cameras, _PATIENCE_S)[cameras[0]]

@@ -23,13 +23,13 @@ async def current_visibilities(users: Mapping[int, Any]) -> dict[int, Visibility
     trial, which the database does not accept either.
     """
     try:
-        return await database_sync_to_async(_found, thread_sensitive=False)(users)
+        return await database_sync_to_async(_load_visibilities, thread_sensitive=False)(users)
     except Error as error:
         log.warning("the database does not say what is hidden from whom: %s", error)
         return {}
 
 
-def _found(users: Mapping[int, Any]) -> dict[int, Visibility]:
+def _load_visibilities(users: Mapping[int, Any]) -> dict[int, Visibility]:
     return {key: visibility_for_user(user) for key, user in users.items()}
 
 

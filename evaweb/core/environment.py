@@ -221,7 +221,7 @@ def private_file(path: Path) -> Path:
     """
     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
     for file in database_files(path):
-        _take_from_others(file)
+        _make_private(file)
     return path
 
 
@@ -236,7 +236,7 @@ def readable_by_others(path: Path) -> bool:
     return bool(path.stat().st_mode & 0o077)
 
 
-def _take_from_others(path: Path) -> None:
+def _make_private(path: Path) -> None:
     """Make the file private; a file of another account stays and evaweb.core.file_checks warns at every start."""
     if readable_by_others(path):
         with suppress(PermissionError):
@@ -246,7 +246,7 @@ def _take_from_others(path: Path) -> None:
 def secret_key(folder: Path) -> str:
     """Return EVA_SECRET_KEY, else a key of the lab that is generated once and stored privately."""
     given = os.environ.get("EVA_SECRET_KEY")
-    return given or _made_once(folder / "secret_key", partial(secrets.token_urlsafe, 50))
+    return given or _load_or_create(folder / "secret_key", partial(secrets.token_urlsafe, 50))
 
 
 def lab_id(folder: Path) -> str:
@@ -255,7 +255,7 @@ def lab_id(folder: Path) -> str:
     Cookie names contain it, because cookies ignore ports: two labs on one host would overwrite each other's.
     """
     path = folder / "lab_id"
-    found = _made_once(path, partial(secrets.token_hex, 4))
+    found = _load_or_create(path, partial(secrets.token_hex, 4))
     if not re.fullmatch("[0-9A-Za-z]{1,32}", found):
         raise ImproperlyConfigured(
             f"{path}: {found!r:.60}; allowed: 1 to 32 letters and digits, or remove it, and everybody logs in anew"
@@ -263,12 +263,12 @@ def lab_id(folder: Path) -> str:
     return found
 
 
-def _made_once(path: Path, make: Callable[[], str]) -> str:
+def _load_or_create(path: Path, make: Callable[[], str]) -> str:
     """Return the content of a private file; create it from `make` if it is absent."""
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
-        _take_from_others(path)
+        _make_private(path)
         found = path.read_text("utf-8").strip()
         if not found:
             raise ImproperlyConfigured(f"{path} is empty: remove it, and everybody logs in anew") from None

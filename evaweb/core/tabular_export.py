@@ -73,8 +73,8 @@ def iter_parquet(columns: Mapping[str, Any], pages: Pages) -> Iterator[bytes]:
             rows = [{**row, **{name: _text(row[name]) for name in textual}} for row in page]
             if rows:
                 writer.write_table(pa.Table.from_pylist(rows, schema))
-                yield sink.taken()
-    yield sink.taken()
+                yield sink.drain()
+    yield sink.drain()
 
 
 def _arrow(hint: Any) -> Any:
@@ -115,7 +115,7 @@ class _Sink(io.RawIOBase):
         self._at += len(piece)
         return len(piece)
 
-    def taken(self) -> bytes:
+    def drain(self) -> bytes:
         """Return everything written since the last call."""
         whole, self._pieces = b"".join(self._pieces), []
         return whole

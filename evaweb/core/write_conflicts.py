@@ -23,7 +23,7 @@ _Given = ParamSpec("_Given")
 _Found = TypeVar("_Found")
 
 
-def was_taken(error: BaseException) -> bool:
+def is_duplicate(error: BaseException) -> bool:
     """Return True if a row was refused because its name, number or key exists already."""
     if not isinstance(error, IntegrityError):
         return False
@@ -38,7 +38,7 @@ def once_more(write: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
         try:
             return write(*args, **kwargs)
         except IntegrityError as error:
-            if connection.in_atomic_block or not was_taken(error):
+            if connection.in_atomic_block or not is_duplicate(error):
                 raise
         return write(*args, **kwargs)
 

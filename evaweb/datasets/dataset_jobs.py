@@ -10,7 +10,7 @@ from typing import Any
 from django.db.models import Q
 
 from evaweb.datasets.dataset_orders import KIND, key_of
-from evaweb.datasets.overview import dataset_found
+from evaweb.datasets.overview import get_dataset_folder
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.workers import waiting_for
 from runtime.datasets import layout
@@ -121,7 +121,7 @@ def latest_check(name: str) -> LatestCheck | None:
     job = Job.objects.filter(key__in=(key, repaired), status=JobStatus.DONE, result__done=True).first()
     if job is None or job.claimed_at is None or job.finished_at is None:
         return None
-    changed = datetime.fromtimestamp((dataset_found(name) / layout.INFO).stat().st_mtime, UTC)
+    changed = datetime.fromtimestamp((get_dataset_folder(name) / layout.INFO).stat().st_mtime, UTC)
     since = job.finished_at if job.args["what"] == "repair" else job.claimed_at
     said = (tuple(job.result.get(name, ())) for name in ("problems", "remarks"))
     return LatestCheck(job.finished_at, *said, fresh=changed <= since)

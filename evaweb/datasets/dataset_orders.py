@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, TypeAdapter, Vali
 import robots
 from evaweb.accounts.roles import Role, require_role
 from evaweb.core.errors import Conflict, EvaError
-from evaweb.datasets.overview import dataset_found, dataset_names, folder_named
+from evaweb.datasets.overview import dataset_names, folder_named, get_dataset_folder
 from evaweb.jobs.models import Job, JobStatus
 from evaweb.jobs.services import enqueue
 from runtime.core.sentences import Pattern
@@ -159,7 +159,7 @@ def submit_order(*, user: Any, given: Mapping[str, Any]) -> Job:
     sources = list(order.datasets) if isinstance(order, Merge) else [order.dataset]
     names = [full_name(name) for name in sources]
     for name in names:
-        dataset_found(name)
+        get_dataset_folder(name)
     args = order.model_dump()
     if isinstance(order, Merge):
         args["datasets"] = names
@@ -202,7 +202,7 @@ def _new(to: str, parts: Sequence[str] | Mapping[str, Any]) -> str:
 
 def _known(name: str) -> str:
     try:
-        return fingerprint(dataset_found(name))
+        return fingerprint(get_dataset_folder(name))
     except RecordingError as fault:
         raise Conflict(str(fault)) from None
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from evaweb.core.errors import EvaError
 from evaweb.datasets.dataset_orders import KIND, least_for
-from evaweb.datasets.overview import dataset_found, folder_named
+from evaweb.datasets.overview import folder_named, get_dataset_folder
 from evaweb.episodes.dataset_membership import sync_memberships
 from evaweb.jobs.kinds import Cancelled, JobContext, job_kind
 from runtime.recording.files import RecordingError
@@ -76,7 +76,7 @@ def _convert(work: JobContext) -> Found:
         reencode=args["reencode"],
         tell=work.report_progress,
     )
-    return _made(args["to"], made)
+    return _result(args["to"], made)
 
 
 def _import(work: JobContext) -> Found:
@@ -91,10 +91,10 @@ def _merge(work: JobContext) -> Found:
     from runtime.datasets.operations import merge
 
     args = work.args
-    sources = [dataset_found(name) for name in args["datasets"]]
+    sources = [get_dataset_folder(name) for name in args["datasets"]]
     target = folder_named(args["to"])
     made = merge(sources, target, args["version"], reencode=args["reencode"], tell=work.report_progress)
-    return _made(args["to"], made)
+    return _result(args["to"], made)
 
 
 def _split(work: JobContext) -> Found:
@@ -105,7 +105,7 @@ def _split(work: JobContext) -> Found:
     done = split(
         _source(work), targets, args["version"], reencode=args["reencode"], tell=work.report_progress
     )
-    parts = [_made(f"{args['to']}/{one.dataset.name}", one) for one in done]
+    parts = [_result(f"{args['to']}/{one.dataset.name}", one) for one in done]
     return {"datasets": [part["dataset"] for part in parts], "parts": parts}
 
 
@@ -120,7 +120,7 @@ def _delete(work: JobContext) -> Found:
         known=args["known"],
         tell=work.report_progress,
     )
-    return _made(args["dataset"], made)
+    return _result(args["dataset"], made)
 
 
 def _push(work: JobContext) -> Found:
@@ -145,10 +145,10 @@ _KINDS: Mapping[str, Callable[[JobContext], Found]] = {
 
 
 def _source(work: JobContext) -> Path:
-    return dataset_found(work.args["dataset"])
+    return get_dataset_folder(work.args["dataset"])
 
 
-def _made(name: str, made: Any) -> Found:
+def _result(name: str, made: Any) -> Found:
     """Return the job's result for an operation that wrote a dataset."""
     return {
         "dataset": name,

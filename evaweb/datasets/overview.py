@@ -128,7 +128,7 @@ def _is_part(name: str) -> bool:
     return is_name(name) and name != "-" and not name.startswith(".")
 
 
-def dataset_found(name: str) -> Path:
+def get_dataset_folder(name: str) -> Path:
     """Return the folder of an existing dataset. Raises: NotFound, which lists the existing ones."""
     folder = folder_named(name)
     if not (folder / layout.INFO).is_file():
@@ -140,7 +140,7 @@ def dataset_found(name: str) -> Path:
 
 def overview(name: str) -> Overview:
     """Return the overview of the dataset of that name."""
-    folder = dataset_found(name)
+    folder = get_dataset_folder(name)
     try:
         info = layout.read_info(folder)
         if problem := _contradiction(folder, _stamp(folder)):
@@ -175,7 +175,7 @@ def camera_keys(features: dict[str, Any]) -> dict[str, str]:
 
 def open_cached(name: str) -> Dataset:
     """Return the dataset with its list of episodes; re-read only after a change. Raises: RecordingError."""
-    folder = dataset_found(name)
+    folder = get_dataset_folder(name)
     return _opened(folder, _stamp(folder))
 
 

@@ -15,7 +15,7 @@ from evaweb.core.errors import NotFound
 from evaweb.datasets.playback import PlayedEpisode
 from runtime.core.picture_bounds import DAMAGED, TooLargeError, require_scans, require_size
 from runtime.core.sentences import Pattern
-from runtime.datasets.video_frames import shown, stored_row
+from runtime.datasets.video_frames import stored_row, to_rgb
 from runtime.recording.files import RecordingError
 
 _PICTURES_VIDEO = Pattern("datasets.stills.pictures_video", "the pictures of {camera} are in a video")
@@ -40,7 +40,7 @@ def still_image(episode: PlayedEpisode, camera: str, row: int) -> tuple[bytes, s
             kind = _SHOWN.get(picture.format or "")
             if kind and not picture.mode.startswith("I"):  # depth images, which browsers show as black
                 return content, kind
-            pixels = np.ascontiguousarray(shown(picture))
+            pixels = np.ascontiguousarray(to_rgb(picture))
     except TooLargeError as error:
         raise RecordingError(str(error)) from None
     except (*DAMAGED, Image.DecompressionBombError) as error:

@@ -10,7 +10,7 @@ from django.db import Error, close_old_connections
 from evaweb.episodes import services
 from evaweb.episodes.folders import data_dir, journal_folder
 from evaweb.episodes.models import Episode
-from evaweb.episodes.reconcile import taken_in
+from evaweb.episodes.reconcile import ingest_one
 from evaweb.jobs.selectors import job_newest
 from runtime.core.sentences import Pattern
 from runtime.link.incoming import arrivals, progress_of
@@ -48,13 +48,13 @@ def whereabouts(episode: Episode) -> str:
     return _PARTLY_HERE(station=name, here=_megabytes(found.here), size=_megabytes(found.size))
 
 
-def take_in_arrived() -> int:
+def ingest_arrived() -> int:
     """Create rows of newly arrived episodes and labels; return the number of episodes."""
     marks = {UUID(uuid): mark for uuid, mark in arrivals(data_dir())}
     waited_for = Episode.objects.filter(away_since__isnull=False).values_list("uuid", flat=True)
     here = {uuid for uuid in waited_for if journal_folder(uuid).is_dir()}
     for uuid in here.union(marks):
-        for problem in taken_in(uuid):
+        for problem in ingest_one(uuid):
             log.warning("episode %s has arrived: %s", uuid, problem)
         episode = Episode.objects.filter(uuid=uuid, away_since=None).first()
         if episode is not None and job_newest(key=f"publish:{uuid}") is not None:

@@ -41,7 +41,7 @@ class Unsatisfiable(Exception):
     """A well-formed range that starts beyond the end of the file."""
 
 
-def span_asked(header: str | None, size: int) -> Span | None:
+def requested_range(header: str | None, size: int) -> Span | None:
     """Return the single range that `header` requests; None for no, several or malformed ranges.
 
     Those are answered with the whole file, which section 14.2 permits. Raises: Unsatisfiable.

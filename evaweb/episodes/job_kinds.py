@@ -13,7 +13,7 @@ from django.utils import timezone
 
 from evaweb.core.object_stores import the_store
 from evaweb.episodes import services, verification
-from evaweb.episodes.arriving import take_in_arrived, whereabouts
+from evaweb.episodes.arriving import ingest_arrived, whereabouts
 from evaweb.episodes.dataset_sidecars import write_sidecars
 from evaweb.episodes.folders import data_dir, datasets_dir, journal_folder, preview_folder, scores_file
 from evaweb.episodes.manifest import read_recorded_episode
@@ -42,7 +42,7 @@ def preview(work: JobContext) -> Mapping[str, Any]:
     frames = make_preview(journal_folder(episode.uuid), preview_folder(episode.uuid), work.report_progress)
     Episode.objects.filter(uuid=episode.uuid).update(previewed_at=timezone.now())
     if the_store() is not None:
-        services.storing_asked(uuid=episode.uuid)
+        services.request_storing(uuid=episode.uuid)
     return {"frames": frames}
 
 
@@ -56,7 +56,7 @@ def store_videos(work: JobContext) -> Mapping[str, Any]:
 def store_at_start() -> None:
     """Queue videos that were made while there was no store or it was unavailable."""
     for uuid in unstored():
-        services.storing_asked(uuid=uuid)
+        services.request_storing(uuid=uuid)
 
 
 @job_kind("export")
@@ -185,7 +185,7 @@ def find_closed_episodes() -> int:
 @periodic_task("arrived recordings")
 def look_for_arrived() -> int:
     """Add rows of episodes that arrived from stations on other computers."""
-    return take_in_arrived()
+    return ingest_arrived()
 
 
 @periodic_task("recordings to be verified")

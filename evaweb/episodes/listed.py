@@ -27,7 +27,7 @@ def filters(sight: Visibility) -> list[Filter]:
 
 def columns(sight: Visibility) -> list[Column]:
     """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
-    checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.sees_everything else ()
+    checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.hides_nothing else ()
     return [
         Column("picture", "Picture", quiet=True),
         Column("recorded", "Recorded", ("started_at",), lambda row: row.started_at, down=True),

@@ -67,16 +67,16 @@ def _remove_drafts(target: Path) -> None:
 def _fill(episode: Episode, draft: Path, tell: Callable[[str], None]) -> None:
     for number, (camera, source) in enumerate(episode.videos.items(), 1):
         tell(f"camera {number} of {len(episode.videos)}")
-        if not episode.shown(camera):
+        if not episode.frame_count(camera):
             continue  # the camera was lost before its first image
         video = draft / f"{camera}.mp4"
-        remux(source, video, episode.shown(camera), episode.layout.fps)
+        remux(source, video, episode.frame_count(camera), episode.layout.fps)
         _sync(video)
-        small = sheet(source, episode.frames, episode.shown(camera))
+        small = sheet(source, episode.frames, episode.frame_count(camera))
         write_atomic(draft / sheet_name(camera), small)
-    shown = [camera for camera in episode.videos if episode.shown(camera)]
+    shown = [camera for camera in episode.videos if episode.frame_count(camera)]
     if shown:
-        middle = min(episode.frames // 2, episode.shown(shown[0]) - 1)
+        middle = min(episode.frames // 2, episode.frame_count(shown[0]) - 1)
         write_atomic(draft / THUMBNAIL, thumbnail(episode.videos[shown[0]], middle))
     sync_folder(draft)
 

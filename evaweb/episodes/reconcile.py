@@ -110,7 +110,7 @@ def reconcile() -> Report:
     )
 
 
-def taken_in(uuid: UUID | str) -> list[str]:
+def ingest_one(uuid: UUID | str) -> list[str]:
     """Read one newly arrived episode or label into the database; return the problems."""
     uuid, problems = UUID(str(uuid)), list[str]()
     if problem := services.sync_problem(uuid):

@@ -114,7 +114,7 @@ def episode_list(
             Q(task__icontains=word)
             | (
                 Q(checkpoint__icontains=word) & seen
-                if not sight.sees_everything
+                if not sight.hides_nothing
                 else Q(checkpoint__icontains=word)
             )
             | Q(trial__handout__code__iexact=word)
@@ -134,7 +134,7 @@ def tag_counts(*, sight: Visibility = FULL_VISIBILITY) -> dict[str, int]:
 
 def _by_someone(seen: Q, author: str, sight: Visibility) -> Q:
     """Return the condition for opinions that this user may see: on visible episodes, or their own."""
-    return Q() if sight.sees_everything else seen | Q(**{author: sight.user})
+    return Q() if sight.hides_nothing else seen | Q(**{author: sight.user})
 
 
 def playback_stage(*, episode: Episode) -> PlaybackStage:

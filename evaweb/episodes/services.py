@@ -178,7 +178,7 @@ def request_preview(*, episode: Episode) -> Job:
     return enqueue(kind="preview", key=f"preview:{episode.uuid}", args={"uuid": str(episode.uuid)})
 
 
-def storing_asked(*, uuid: UUID) -> Job:
+def request_storing(*, uuid: UUID) -> Job:
     """Queue the transfer of an episode's preview videos to the lab's store."""
     return enqueue(kind="store", key=f"store:{uuid}", args={"uuid": str(uuid)})
 

@@ -21,7 +21,7 @@ from evaweb.episodes.http_ranges import (
     Validators,
     not_modified,
     range_holds,
-    span_asked,
+    requested_range,
 )
 from runtime.core.sentences import Pattern
 
@@ -77,7 +77,7 @@ def _answer(
     # Section 14.2: ranges are defined only for GET.
     if request.method == "GET" and range_holds(headers.get("If-Range"), validators):
         try:
-            span = span_asked(headers.get("Range"), stat.st_size)
+            span = requested_range(headers.get("Range"), stat.st_size)
         except Unsatisfiable:
             return HttpResponse(status=416, headers={**common, "Content-Range": f"bytes */{stat.st_size}"})
     if span is None:

@@ -43,7 +43,7 @@ _UUID = re.compile(r"[0-9a-f]{4,32}")
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundItem:
     """Item: name, details and address."""
 
     title: str
@@ -56,11 +56,11 @@ class Group:
     """Items of one kind, best first; `more` if there are others."""
 
     name: str
-    items: tuple[Found, ...]
+    items: tuple[FoundItem, ...]
     more: bool
 
 
-Candidate = tuple[Found, str]  # item with its further searchable words
+Candidate = tuple[FoundItem, str]  # item with its further searchable words
 
 
 def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
@@ -73,7 +73,7 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
     if not 0 < len(query) <= LONGEST:
         raise EvaError(_Q_HAS_CHARACTERS_ALLOWED_1(count=len(query), longest=LONGEST))
     role = role_of(user)
-    kinds: dict[str, Callable[[], Iterable[Found]]] = {
+    kinds: dict[str, Callable[[], Iterable[FoundItem]]] = {
         "Stations": lambda: _ranked(query, _stations(query)),
         "Trials": lambda: _trials(query),
         "Episodes": lambda: _episodes(query),
@@ -92,7 +92,7 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
     return groups
 
 
-def _ranked(query: str, candidates: Iterable[Candidate]) -> list[Found]:
+def _ranked(query: str, candidates: Iterable[Candidate]) -> list[FoundItem]:
     """Return the matching items, best first, equal ranks in the given order."""
     fits = [(rank(query, found.title, more), found) for found, more in candidates]
     known = [(fit, found) for fit, found in fits if fit is not None]
@@ -129,12 +129,12 @@ def _stations(query: str) -> Iterator[Candidate]:
         detail = " · ".join((station.name, station.robot, *(() if station.active else ("switched off",))))
         pages = {"Debug": "station-debug", **({"Collect": "station-collect"} if station.collects else {})}
         yield (
-            Found(str(station), detail, reverse("station-eval", args=[station.name])),
+            FoundItem(str(station), detail, reverse("station-eval", args=[station.name])),
             f"{detail} station eval",
         )
         for page, route in pages.items():
             if any(len(word) > 1 and page.casefold().startswith(word) for word in words):
-                found = Found(f"{station} · {page}", detail, reverse(route, args=[station.name]))
+                found = FoundItem(f"{station} · {page}", detail, reverse(route, args=[station.name]))
                 yield found, f"{detail} station"
 
 
@@ -148,7 +148,7 @@ def _plans(query: str, user: Any) -> Iterator[Candidate]:
     for plan in _narrowed(rows, _without(query, "plan"), "title", "name"):
         detail = f"{plan.name} v{plan.version} · {plan.get_state_display()}"
         yield (
-            Found(plan.title, detail, reverse("result-plan", args=[plan.name, plan.version])),
+            FoundItem(plan.title, detail, reverse("result-plan", args=[plan.name, plan.version])),
             f"{detail} plan",
         )
 
@@ -157,14 +157,14 @@ def _checkpoints(query: str, role: Role, sight: Visibility) -> Iterator[Candidat
     rows = checkpoint_list(all_of_them=True, sight=sight).prefetch_related(None).only("name", "active")
     for row in _narrowed(rows, _without(query, "checkpoint"), "name"):
         detail = "" if row.active else "not offered"
-        yield Found(row.name, detail, _administered("checkpoint", row.pk, row.name, role)), "checkpoint"
+        yield FoundItem(row.name, detail, _administered("checkpoint", row.pk, row.name, role)), "checkpoint"
 
 
 def _scenes(query: str, role: Role) -> Iterator[Candidate]:
     rows = scene_list(all_of_them=True).prefetch_related(None)
     for row in _narrowed(rows, _without(query, "scene"), "title", "name"):
         detail = row.name if row.active else f"{row.name} · not offered"
-        yield Found(row.title, detail, _administered("scene", row.pk, row.title, role)), f"{detail} scene"
+        yield FoundItem(row.title, detail, _administered("scene", row.pk, row.title, role)), f"{detail} scene"
 
 
 def _administered(kind: str, key: int, name: str, role: Role) -> str:
@@ -178,18 +178,18 @@ def _tags(sight: Visibility) -> Iterator[Candidate]:
     """Yield the tags, each with the address of its episodes."""
     for words, n in tag_counts(sight=sight).items():
         detail = f"{n} episode{'' if n == 1 else 's'}"
-        yield Found(words, detail, f"{reverse('replay-list')}?{urlencode({'tag': words})}"), "tag tagged"
+        yield FoundItem(words, detail, f"{reverse('replay-list')}?{urlencode({'tag': words})}"), "tag tagged"
 
 
 def _datasets() -> Iterator[Candidate]:
     for name in dataset_names():
         short = name.removeprefix("datasets/")
-        yield Found(short, "", reverse("dataset", args=[short])), "dataset"
+        yield FoundItem(short, "", reverse("dataset", args=[short])), "dataset"
 
 
 def _pages(role: Role) -> Iterator[Candidate]:
     for page, address in pages_of(role):
-        yield Found(page.title, "", address), page.more
+        yield FoundItem(page.title, "", address), page.more
 
 
 def _without(query: str, kind: str) -> str:
@@ -201,7 +201,7 @@ def _without(query: str, kind: str) -> str:
 # --- kinds with many rows, each by an index ------------------------------------------------------------------
 
 
-def _trials(query: str) -> list[Found]:
+def _trials(query: str) -> list[FoundItem]:
     """Return the trials by number, then by code, each exact matches first, then prefixes."""
     asked = _without(query, "trial").removeprefix("#")
     rows = Trial.objects.select_related("scene", "position", "station", "handout")
@@ -226,14 +226,14 @@ def _numbers(digits: str) -> Iterator[tuple[int, int]]:
         yield int(digits) * 10**more, (int(digits) + 1) * 10**more - 1
 
 
-def _trial(trial: Trial) -> Found:
+def _trial(trial: Trial) -> FoundItem:
     handout = getattr(trial, "handout", None)
     title = f"Trial {trial.pk}" + (f" · {handout.code}" if handout else "")
     where = f"{trial.scene.title}, position {trial.position.number} · {trial.station.name}"
-    return Found(title, where, reverse("result-trial", args=[trial.pk]))
+    return FoundItem(title, where, reverse("result-trial", args=[trial.pk]))
 
 
-def _episodes(query: str) -> list[Found]:
+def _episodes(query: str) -> list[FoundItem]:
     """Return the episodes by a prefix of their uuid, of at least four characters."""
     asked = _without(query, "episode").casefold().replace("-", "")
     if not _UUID.fullmatch(asked):
@@ -243,7 +243,7 @@ def _episodes(query: str) -> list[Found]:
     return [_episode(episode) for episode in rows[: MOST + 1]]
 
 
-def _episode(episode: Episode) -> Found:
+def _episode(episode: Episode) -> FoundItem:
     began = f"{localtime(episode.started_at):%Y-%m-%d %H:%M}" if episode.started_at else "unknown time"
     detail = " · ".join(filter(None, (began, episode.station.name, episode.task[:80])))
-    return Found(str(episode.uuid), detail, reverse("replay", args=[episode.uuid]))
+    return FoundItem(str(episode.uuid), detail, reverse("replay", args=[episode.uuid]))

@@ -59,7 +59,7 @@ _chores: dict[str, Chore] = {}
 _starts: dict[str, Chore] = {}
 
 
-class TakenOver(Exception):
+class JobTakenOver(Exception):
     """Another worker has the job now: stop, and write nothing more."""
 
 

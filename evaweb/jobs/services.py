@@ -27,7 +27,7 @@ from evaweb.core.errors import Conflict
 from evaweb.core.lock_wait import retry_while_locked
 from evaweb.jobs import doorbell
 from evaweb.jobs.heartbeat import Heartbeat, Lapse
-from evaweb.jobs.kinds import Args, Cancelled, JobContext, TakenOver, declared, kind_named, least_role
+from evaweb.jobs.kinds import Args, Cancelled, JobContext, JobTakenOver, declared, kind_named, least_role
 from evaweb.jobs.locks import ClaimantState, claimant_state, exclusive_job
 from evaweb.jobs.models import Hold, Job, JobStatus
 from evaweb.jobs.selectors import jobs_ready
@@ -159,7 +159,7 @@ def _perform(job: Job) -> None:
                 ended = partial(job_done, job=job, result=_result_of(job))
             else:
                 ended = partial(job_postponed, job=job)
-        except TakenOver as taken:
+        except JobTakenOver as taken:
             log.warning("%s", taken)
             return
         except Cancelled:
@@ -191,12 +191,12 @@ def hold(job: Job, names: Collection[str]) -> None:
 
     They replace its earlier holds, so that two jobs cannot deadlock. Raises: TakenOver, Cancelled.
     """
-    while (by := retry_while_locked(partial(_held_by_another, job, sorted(set(names))))) is not None:
+    while (by := retry_while_locked(partial(_acquire_names, job, sorted(set(names))))) is not None:
         _tell(job, f"waits for another job at work on the same: {by}")
         time.sleep(_HOLD_AGAIN_S)
 
 
-def _held_by_another(job: Job, names: Sequence[str]) -> str | None:
+def _acquire_names(job: Job, names: Sequence[str]) -> str | None:
     """Hold the names if they are free and return None; else return the key of the job that holds one."""
     at_work = Hold.objects.filter(job__status=JobStatus.RUNNING, job__owner=F("owner"))
     Hold.objects.filter(job=job).delete()  # released even if it has to wait, so that jobs cannot deadlock
@@ -218,7 +218,7 @@ def _tell(job: Job, progress: str) -> None:
         return
     if retry_while_locked(ours.exists):
         raise Cancelled
-    raise TakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
+    raise JobTakenOver(f"job {job.key} was taken from {job.owner}, which goes no further with it")
 
 
 def heartbeat(*, job: Job) -> bool:

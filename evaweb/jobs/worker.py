@@ -38,7 +38,7 @@ def run_worker(queues: Sequence[str], *, lifeline: bool) -> None:
     looking = threading.Thread(target=_poll, args=(queues, ending), name="looking")
     looking.start()
     there = Heartbeat(
-        partial(workers.worker_seen, owner=services.OWNER, queues=queues), settings.EVA_JOB_STALE_S / 6
+        partial(workers.record_heartbeat, owner=services.OWNER, queues=queues), settings.EVA_JOB_STALE_S / 6
     )
     log.info("worker %s works on %s in %s", services.OWNER, ", ".join(queues), settings.DATA_DIR)
     with there:
@@ -104,7 +104,7 @@ def _poll(queues: Sequence[str], ending: threading.Event) -> None:
     """Reclaim stale jobs, run periodic tasks, and execute ready jobs, without waiting for the doorbell."""
     _attempt(
         "list of workers",
-        partial(retry_while_locked, partial(workers.worker_seen, owner=services.OWNER, queues=queues)),
+        partial(retry_while_locked, partial(workers.record_heartbeat, owner=services.OWNER, queues=queues)),
     )
     begun = False
     while not ending.is_set():

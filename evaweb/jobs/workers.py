@@ -78,7 +78,7 @@ def lab_folder_named() -> None:
 # --- workers -------------------------------------------------------------------------------------------------
 
 
-def worker_seen(*, owner: UUID, queues: Sequence[str]) -> bool:
+def record_heartbeat(*, owner: UUID, queues: Sequence[str]) -> bool:
     """Record a heartbeat of the worker, which registers it; return True."""
     told = {
         "host": socket.gethostname(),

@@ -58,7 +58,7 @@ BY_HAND = {
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StoredDeployment:
     """Deployment file of the data folder, named after its station."""
 
     name: str
@@ -111,21 +111,21 @@ def is_simulated(resolved: Resolved) -> bool:
     return transport.kind == "zmq" and bool(getattr(transport, "simulated", False))
 
 
-def kept() -> list[Kept]:
+def stored_deployments() -> list[StoredDeployment]:
     """Return all deployment files, oldest first."""
-    found = [Kept(path.stem, path) for path in _folder().glob("*.toml")]
+    found = [StoredDeployment(path.stem, path) for path in _folder().glob("*.toml")]
     return sorted(
         (one for one in found if re.fullmatch(STATION_NAME, one.name)), key=lambda one: one.changed_ns
     )
 
 
-def kept_of(name: str) -> Kept | None:
+def stored_deployment(name: str) -> StoredDeployment | None:
     """Return the deployment file of a station, or None."""
     path = _folder() / f"{name}.toml"
-    return Kept(name, path) if re.fullmatch(STATION_NAME, name) and path.is_file() else None
+    return StoredDeployment(name, path) if re.fullmatch(STATION_NAME, name) and path.is_file() else None
 
 
-def write_simulated(*, name: str, robot: str) -> Kept:
+def write_simulated(*, name: str, robot: str) -> StoredDeployment:
     """Write the deployment of a simulated bench with that robot; the lab then starts it.
 
     Raises:
@@ -137,7 +137,9 @@ def write_simulated(*, name: str, robot: str) -> Kept:
     return _write(name, tree, _CHOSEN)
 
 
-def write_draft(*, name: str, robot: str, task: str, parts: Mapping[str, Mapping[str, str]]) -> Kept:
+def write_draft(
+    *, name: str, robot: str, task: str, parts: Mapping[str, Mapping[str, str]]
+) -> StoredDeployment:
     """Write a draft for a real robot that the runtime can load.
 
     Args:
@@ -172,7 +174,7 @@ def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
     Raises:
         EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.
     """
-    found = kept_of(name)
+    found = stored_deployment(name)
     tree = tree_of(found.path) if found else {}
     own: dict[str, Any] = tree.get("cameras", {})
     if sorted(shown.values()) != sorted(shown):
@@ -240,7 +242,7 @@ def standing_of(name: str) -> Standing:
         return Standing()
 
 
-def tell(name: str, standing: Standing) -> None:
+def write_status(name: str, standing: Standing) -> None:
     """Write the status of a deployment; called by the lab.
 
     Raises:
@@ -257,7 +259,7 @@ def try_again(*, name: str) -> None:
     Raises:
         NotFound: If there is none.
     """
-    found = kept_of(name)
+    found = stored_deployment(name)
     if found is None:
         raise NotFound(f"{name!r:.80} has no deployment in the data folder")
     found.path.touch()
@@ -272,7 +274,7 @@ def remove(*, name: str) -> None:
         NotFound: If there is none.
         Conflict: If the station is in use.
     """
-    found = kept_of(name)
+    found = stored_deployment(name)
     if found is None:
         raise NotFound(f"{name!r:.80} has no deployment in the data folder")
     station = Station.objects.filter(name=name).first()
@@ -335,7 +337,7 @@ def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
             raise EvaError(f"{part}.{entry.key} = {given!r:.80}; allowed here: {entry.default}; {who}")
 
 
-def _write(name: str, tree: dict[str, Any], about: str) -> Kept:
+def _write(name: str, tree: dict[str, Any], about: str) -> StoredDeployment:
     if not re.fullmatch(STATION_NAME, name):
         raise EvaError(
             f"station = {name!r:.80}; allowed: letters, digits, '.', '_' and '-', the first a letter or digit"
@@ -354,7 +356,7 @@ def _write(name: str, tree: dict[str, Any], about: str) -> Kept:
         )  # link() never replaces a file: another page may write the same name at this moment
     except FileExistsError:
         raise _taken(name) from None
-    return Kept(name, path)
+    return StoredDeployment(name, path)
 
 
 def _taken(name: str) -> Conflict:

@@ -13,7 +13,7 @@ from django.urls import NoReverseMatch, reverse
 from evaweb.core.errors import StationGone
 from evaweb.lab import deployments
 from evaweb.lab.demo_rows import demo_scene
-from evaweb.lab.deployments import Kept, Standing, is_simulated, kept_of, standing_of
+from evaweb.lab.deployments import Standing, StoredDeployment, is_simulated, standing_of, stored_deployment
 from evaweb.lab.processes import LabError
 from evaweb.plans.bench_checks import cameras_of
 from evaweb.plans.models import CameraCheck
@@ -60,7 +60,7 @@ class Walk:
     """
 
     station: Station | None
-    kept: Kept | None
+    kept: StoredDeployment | None
     standing: Standing
     simulated: bool
     snapshot: dict[str, Any]
@@ -105,12 +105,12 @@ _TITLES = {
 def walk(*, name: str = "") -> Walk:
     """Return the steps of the named station, else of the newest; it need not have a database row yet."""
     stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
-    kept = kept_of(name) if name else None
+    kept = stored_deployment(name) if name else None
     station = next((one for one in stations if one.name == name), None)
     if station is None and kept is None:
         station, kept = _newest(stations)
     elif station is not None:
-        kept = kept_of(station.name)
+        kept = stored_deployment(station.name)
     snapshot = _snapshot(station)
     cameras = tuple(cameras_of(station)) if station else ()
     scored = _scored(station)
@@ -153,13 +153,13 @@ def scenes_address() -> str:
         return reverse("admin:trials_scene_changelist")
 
 
-def _newest(stations: tuple[Station, ...]) -> tuple[Station | None, Kept | None]:
+def _newest(stations: tuple[Station, ...]) -> tuple[Station | None, StoredDeployment | None]:
     """Return the newest deployment if it has no station yet, else the newest station with its deployment."""
-    written = deployments.kept()
+    written = deployments.stored_deployments()
     if written and written[-1].name not in set(Station.objects.values_list("name", flat=True)):
         return None, written[-1]
     station = stations[0] if stations else None
-    return station, kept_of(station.name) if station else None
+    return station, stored_deployment(station.name) if station else None
 
 
 def _steps(done: dict[str, bool]) -> tuple[Step, ...]:
@@ -183,7 +183,7 @@ def _snapshot(station: Station | None) -> dict[str, Any]:
         return {}
 
 
-def _simulated(station: Station | None, kept: Kept | None) -> bool:
+def _simulated(station: Station | None, kept: StoredDeployment | None) -> bool:
     if station is not None:
         return station.simulated
     try:

@@ -22,7 +22,9 @@ def diagnose(work: JobContext) -> Mapping[str, Any]:
 
     user = User.objects.get(pk=work.args["user"])
     path = bundle.folder(user) / work.args["name"]
-    notes = bundle.write(path, bundle.sight_for(user), lambda part: work.report_progress(f"gathering {part}"))
+    notes = bundle.write(
+        path, bundle.visibility_for(user), lambda part: work.report_progress(f"gathering {part}")
+    )
     for old in sorted(path.parent.glob("*.zip"))[:-_KEPT]:
         old.unlink(missing_ok=True)
     return {"bytes": path.stat().st_size, "left_out": len(notes)}

@@ -68,7 +68,7 @@ class Lab:
         pickup = Pickup(self.processes, how or Benches())
         while True:
             self.processes.watch()
-            pickup.look()
+            pickup.poll()
             time.sleep(_WATCH_S)
 
 

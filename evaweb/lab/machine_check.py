@@ -76,7 +76,7 @@ def lines() -> list[Line]:
 def realtime() -> Line:
     """Check whether a station started by this account gets SCHED_FIFO and locked memory, by trying in a process."""
     means = "Control ticks on time however busy the machine is, where it has the class SCHED_FIFO and locked memory."
-    said = _told([sys.executable, "-c", _TRY.format(_PRIORITY)])
+    said = _output([sys.executable, "-c", _TRY.format(_PRIORITY)])
     try:
         got, advice = json.loads(said or "")
     except ValueError:
@@ -176,13 +176,13 @@ def clock() -> Line:
     advice = (
         "install chrony (apt-get install chrony), and give it a time server that the robot's computer has too"
     )
-    tracking = _told(["chronyc", "-n", "tracking"])
+    tracking = _output(["chronyc", "-n", "tracking"])
     if tracking and "Leap status" in tracking:
         facts = dict(map(str.strip, line.split(":", 1)) for line in tracking.splitlines() if ":" in line)
         good = facts["Leap status"] == "Normal"
         found = f"chrony: {facts['Leap status'].lower()}, {facts.get('System time', 'offset not told')}"
         return Line("Clock", State.GOOD if good else State.LACKING, found, means, "" if good else advice)
-    word = (_told(["timedatectl", "show", "--property", "NTPSynchronized", "--value"]) or "").strip()
+    word = (_output(["timedatectl", "show", "--property", "NTPSynchronized", "--value"]) or "").strip()
     if word in ("yes", "no"):
         found = "systemd: synchronised" if word == "yes" else "systemd: not synchronised"
         return Line(
@@ -200,7 +200,7 @@ def gpu() -> Line:
     """Check for GPUs for policy servers, according to nvidia-smi."""
     means = "Policy servers want one; a lab whose servers are elsewhere, or scripted, needs none."
     asked = ["nvidia-smi", "--query-gpu=name,memory.used,memory.total", "--format=csv,noheader"]
-    rows = (_told(asked) or "").strip()
+    rows = (_output(asked) or "").strip()
     if not rows:
         return Line("GPU of policy servers", State.UNKNOWN, "none seen", means)
     return Line("GPU of policy servers", State.GOOD, "; ".join(rows.splitlines()), means)
@@ -277,7 +277,7 @@ def _room(name: str, folder: Path, least_gb: float, good_gb: float, means: str, 
     return Line(name, State.GOOD, found, means)
 
 
-def _told(arguments: Sequence[str]) -> str | None:
+def _output(arguments: Sequence[str]) -> str | None:
     """Return the output of a program; None if it is missing, fails, or takes too long."""
     try:
         done = subprocess.run(

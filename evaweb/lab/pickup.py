@@ -10,7 +10,7 @@ from django.db import Error, close_old_connections
 from evaweb.core.errors import EvaError
 from evaweb.lab import deployments, simulated
 from evaweb.lab.benches import Bench, program_of, registered
-from evaweb.lab.deployments import Kept, Standing, is_simulated
+from evaweb.lab.deployments import Standing, StoredDeployment, is_simulated
 from evaweb.lab.processes import ChildProcesses, LabError
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ class Pickup:
         self._coming: tuple[str, Coming] | None = None
         self._told: dict[str, Standing] = {}
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Continue the current start, else begin that of the next file that is new or was touched.
 
         Errors never end the lab or its other stations.
@@ -53,12 +53,12 @@ class Pickup:
             return
         name, coming = self._coming
         try:
-            self._tell(name, Standing(doing=next(coming)))
+            self._write_status(name, Standing(doing=next(coming)))
         except StopIteration as done:
             self._coming = None
             self._up.add(name)
             if done.value:
-                self._tell(name, Standing(up=True))
+                self._write_status(name, Standing(up=True))
         except (EvaError, Error, OSError) as fault:
             self._give_up(name, str(fault))
         except Exception as fault:  # the file, and the rows to which it refers, may contain anything
@@ -68,7 +68,7 @@ class Pickup:
     def _give_up(self, name: str, why: str) -> None:
         self._coming = None
         self._end(name)
-        self._tell(name, Standing(failed=why))
+        self._write_status(name, Standing(failed=why))
 
     def _end(self, name: str) -> None:
         """End the programs that were started for a station."""
@@ -79,7 +79,7 @@ class Pickup:
             log.info("what was started for %s is ended", name)
 
     def _end_removed(self) -> None:
-        for name in [name for name in self._up if deployments.kept_of(name) is None]:
+        for name in [name for name in self._up if deployments.stored_deployment(name) is None]:
             self._up.discard(name)
             self._tried.pop(name, None)
             self._told.pop(name, None)
@@ -88,7 +88,7 @@ class Pickup:
 
     def _next(self) -> tuple[str, Coming] | None:
         ending = self._processes.ending()
-        for one in deployments.kept():
+        for one in deployments.stored_deployments():
             if ending.intersection(_programs_of(one.name)):
                 continue  # programs of an earlier file with this name
             if one.name not in self._up and self._tried.get(one.name) != one.changed_ns:
@@ -96,7 +96,7 @@ class Pickup:
                 return one.name, self._starting(one)
         return None
 
-    def _starting(self, one: Kept) -> Coming:
+    def _starting(self, one: StoredDeployment) -> Coming:
         resolved = one.resolved()
         if not (one.chosen and is_simulated(resolved)):
             return False  # a draft, or written by hand: a person starts it
@@ -122,7 +122,7 @@ class Pickup:
         self._processes.start(program_of(bench))
         return True
 
-    def _tell(self, name: str, standing: Standing) -> None:
+    def _write_status(self, name: str, standing: Standing) -> None:
         if self._told.get(name) == standing:
             return
         self._told[name] = standing
@@ -130,10 +130,10 @@ class Pickup:
             log.error("%s is not started: %s", name, standing.failed)
         elif standing.up:
             log.info("%s is started from the folder of deployments", name)
-        if deployments.kept_of(name) is None:
+        if deployments.stored_deployment(name) is None:
             return
         try:
-            deployments.tell(name, standing)
+            deployments.write_status(name, standing)
         except OSError as error:  # the page shows an old status; the lab continues
             log.error("what becomes of %s cannot be written down: %s", name, error)
 

@@ -14,10 +14,10 @@ from typing import Any
 from evaweb.lab.progress import Progress
 from evaweb.lab.rest_client import LivePage, RestClient
 from evaweb.lab.single_trial import (
+    claim_station,
     run_to_its_end,
     score_by_truth,
     set_up_and_run,
-    take_station,
     wait_for_recorded,
 )
 from evaweb.lab.stall_detection import DemoFailed, wait_until
@@ -53,7 +53,7 @@ def run_plan(
     """
     made = []
     with closing(LivePage(operator, station)) as page:
-        take_station(page)
+        claim_station(page)
         operator.post(f"stations/{station}/cameras", {"first": True})
         for number in range(1, count + 1):
             try:

@@ -25,7 +25,7 @@ class Progress:
     @contextmanager
     def during(self, what: str) -> Iterator[None]:
         """Report an unnumbered activity for the duration of the block."""
-        self._say(f"{what}\n")
+        self._print(f"{what}\n")
         done = threading.Event()
         ticking = threading.Thread(target=self._tick, args=(done,), daemon=True)
         ticking.start()
@@ -39,9 +39,9 @@ class Progress:
         took = 0.0
         while not done.wait(_EVERY_S):
             took += _EVERY_S
-            self._say(f"  ... still at it, {took:.0f} s\n")
+            self._print(f"  ... still at it, {took:.0f} s\n")
 
-    def _say(self, line: str) -> None:
+    def _print(self, line: str) -> None:
         with suppress(OSError):  # the terminal is gone: continue, and end in order
             self._write(line)
 

@@ -21,7 +21,7 @@ from evaweb.accounts.roles import Role
 from evaweb.core.languages import label_id
 from evaweb.datasets.episode_list import RESULTS, VERDICTS
 from evaweb.episodes.selectors import QUALITY, REVIEW
-from runtime.core.sentences import Pattern, known, names_of
+from runtime.core.sentences import Pattern, declared_patterns, names_of
 
 _ROOT = Path(__file__).parents[2]
 _IMPORT = "from runtime.core.sentences import"
@@ -51,7 +51,7 @@ def of_python() -> list[Entry]:
     """Return every pattern of Python, ordered by id."""
     for module in modules():
         import_module(module)
-    return [_entry(pattern) for pattern in known()]
+    return [_entry(pattern) for pattern in declared_patterns()]
 
 
 def of_scripts() -> list[Entry]:

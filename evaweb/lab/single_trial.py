@@ -72,14 +72,14 @@ def run_one_trial(visitor: RestClient, choice: TrialChoice) -> TrialReport:
 
 def start(visitor: RestClient, page: LivePage, choice: TrialChoice) -> int:
     """Take the station, prepare a trial, set up and run; return the trial's id."""
-    take_station(page)
+    claim_station(page)
     named = {name: value for name, value in asdict(choice).items() if name != "station"}
     trial: int = visitor.post(f"stations/{choice.station}/trials", named)["id"]
     set_up_and_run(page, trial)
     return trial
 
 
-def take_station(page: LivePage) -> None:
+def claim_station(page: LivePage) -> None:
     """Take the station as soon as it is connected."""
     page.wait_with_progress(
         lambda state: state["state_is"]["connected"], "waiting for the station", progress_marker

@@ -222,10 +222,10 @@ def _to(name: str) -> HttpResponse:
     return redirect(reverse("first-steps", query={"station": name} if name else None))
 
 
-def _kept(name: str) -> deployments.Kept:
-    found = deployments.kept_of(name)
+def _kept(name: str) -> deployments.StoredDeployment:
+    found = deployments.stored_deployment(name)
     if found is None:
-        known = ", ".join(one.name for one in deployments.kept()) or "none yet"
+        known = ", ".join(one.name for one in deployments.stored_deployments()) or "none yet"
         raise NotFound(f"{name!r:.80} has no deployment in the data folder; there are: {known}")
     return found
 

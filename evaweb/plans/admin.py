@@ -16,7 +16,7 @@ from django.utils.html import format_html_join
 from django.utils.safestring import SafeString, mark_safe
 
 from evaweb.core.errors import EvaError
-from evaweb.plans.design import looks_of
+from evaweb.plans.design import look_schedule
 from evaweb.plans.models import Plan, PlanEvent, PlanState
 from evaweb.plans.references import LARGEST, unpacked
 from evaweb.plans.toml_exchange import export_archive, export_toml, import_file
@@ -70,7 +70,7 @@ class PlanForm(forms.ModelForm):
         """Return [] for an empty field: a look after every pair."""
         try:
             given = self.cleaned_data["look_after"]
-            return [] if given in self.fields["look_after"].empty_values else looks_of(given)
+            return [] if given in self.fields["look_after"].empty_values else look_schedule(given)
         except EvaError as error:
             raise forms.ValidationError(str(error)) from None
 

@@ -20,8 +20,8 @@ from evaweb.plans.counting import require_scored_first
 from evaweb.plans.design import (
     crossed_while_waiting,
     dropped_of,
+    end_at_request,
     end_reason,
-    ended_at_an_ask,
     findings_of,
     visible_close_reason,
 )
@@ -161,7 +161,7 @@ def _check(plan: Plan, user: User, station: Station) -> None:
 
 def _check_goes_on(plan: Plan) -> None:
     waits = open_void_requests(Trial.objects.filter(handout__plan=plan)).order_by("pk").first()
-    ended = ended_at_an_ask(plan) or (crossed_while_waiting(plan, waits.at) if waits else "")
+    ended = end_at_request(plan) or (crossed_while_waiting(plan, waits.at) if waits else "")
     if not ended and (found := findings_of(plan)) is not None and found.ended == "boundary":
         ended = end_reason(plan, found)  # crossed since this request began
     if ended:

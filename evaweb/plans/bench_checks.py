@@ -17,7 +17,7 @@ from evaweb.plans import image_store, region_matching
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import has_looked_at_the_same
 from evaweb.plans.counting import fails_by
-from evaweb.plans.design import ended_at_an_ask
+from evaweb.plans.design import end_at_request
 from evaweb.plans.frozen_document import require_checkpoints, require_scene
 from evaweb.plans.models import Achieved, CameraCheck, Handout, Plan, PlanState, Reference
 from evaweb.records.journal import clean_text
@@ -135,7 +135,7 @@ def references(*, station: Station, position: Position | None) -> dict[str, Refe
 
 
 @transaction.atomic
-def take_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
+def record_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
     """Make the current images the references of a position, or of the cameras; older ones stay in the record.
 
     Regions keep their place in the picture. Raises: Conflict if a running plan uses one of the references as a gate.
@@ -314,7 +314,7 @@ def _check_before(what: str, trial: Trial, user: Any) -> None:
     if what == "voided" and handout.trial.status == TrialStatus.SCORED:
         if handout.plan.state == PlanState.CLOSED:
             raise Conflict(_CLOSED_TRIAL_COULD_NOT_REPEATED(plan=handout.plan, trial=trial.pk))
-        if ended_at_an_ask(handout.plan):
+        if end_at_request(handout.plan):
             raise Conflict(_ENDED_TRIAL_COUNTS(plan=handout.plan, trial=trial.pk))
     if what == "void agreed" and handout.plan.state == PlanState.CLOSED and not _repeated(handout):
         raise Conflict(_CLOSED_TRIAL_NOT_REPEATED_SO(plan=handout.plan, trial=trial.pk))

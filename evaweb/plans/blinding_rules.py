@@ -25,7 +25,7 @@ from evaweb.blinding.visibility import (
 from evaweb.core.errors import NotAllowed
 from evaweb.episodes.reconcile import register_conclusion
 from evaweb.plans.models import Handout, Look, Plan, PlanEvent, PlanState
-from evaweb.plans.selectors import plans_beside
+from evaweb.plans.selectors import overlapping_plans
 from evaweb.trials.models import Checkpoint, Evaluation, Trial
 from evaweb.trials.selectors import UNFINISHED
 
@@ -61,7 +61,7 @@ def has_looked_at_the_same(plan: Plan, user: Any) -> bool:
     looks = Look.objects.filter(user=user)
     if not looks.exists():  # true for most users, and checked at every score
         return False
-    beside = plans_beside(plan).values("pk")
+    beside = overlapping_plans(plan).values("pk")
     return looks.filter(Q(plan__name=plan.name) | Q(plan__in=beside)).exists()
 
 

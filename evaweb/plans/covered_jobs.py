@@ -24,7 +24,7 @@ def cover_of(job: Job, sight: Visibility) -> Cover:
     All for a blind trial or plan; nothing for a visible recording, unless its texts name a hidden checkpoint; the texts
     for everything else.
     """
-    if sight.sees_everything:
+    if sight.hides_nothing:
         return Cover.NOTHING
     if "uuid" in job.args:
         found = _episode(job.args["uuid"])

@@ -82,7 +82,7 @@ def draft_design(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) ->
 
     `counts`: for random order, the numbers of trials of both checkpoints after each block.
     """
-    said = _said(plan)
+    said = _design_arguments(plan)
     if said is None:
         return None
     try:
@@ -93,7 +93,7 @@ def draft_design(plan: Plan, counts: Sequence[tuple[int, int]] | None = None) ->
 
 def check_drafted(plan: Plan) -> None:
     """Raise EvaError if the draft's design is invalid; cheap, as it computes no boundary."""
-    said = _said(plan)
+    said = _design_arguments(plan)
     try:
         if said is not None:
             check_design(**said, paired=plan.allocation == Allocation.PAIRED)
@@ -101,7 +101,7 @@ def check_drafted(plan: Plan) -> None:
         raise EvaError(str(error)) from None
 
 
-def _said(plan: Plan) -> dict[str, Any] | None:
+def _design_arguments(plan: Plan) -> dict[str, Any] | None:
     """Return the arguments of `design` for a draft; None without a comparison."""
     comparisons = planned(plan)
     if not comparisons:
@@ -112,7 +112,7 @@ def _said(plan: Plan) -> dict[str, Any] | None:
         "alpha": plan.alpha,
         "margin": plan.margin,
         "outcome": plan.outcome,
-        "looks": looks_of(plan.look_after),
+        "looks": look_schedule(plan.look_after),
         "comparisons": _by_number(comparisons),
         "drops": plan.drop_arms,
     }
@@ -198,8 +198,8 @@ def attempts_of(plan: Plan) -> list[Attempt]:
         return []
     value = "success" if found.outcome == SUCCESS else "score"
     given = Score.objects.filter(trial=OuterRef("trial"))
-    if plan.kept_at:  # later scores do not belong to the evaluation
-        given = given.filter(scored_at__lte=plan.kept_at)
+    if plan.stored_at:  # later scores do not belong to the evaluation
+        given = given.filter(scored_at__lte=plan.stored_at)
     first = given.order_by("pk").values(value)[:1]
     rows = plan.handouts.filter(
         trial__status__in=(*SCORED_STATES, TrialStatus.INTERRUPTED),
@@ -261,12 +261,12 @@ def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -
     return Tried(now, used(at_first), again)
 
 
-def kept_blocks(plan: Plan) -> list[Block] | None:
+def stored_blocks(plan: Plan) -> list[Block] | None:
     """Return the blocks stored by the reveal; None before it."""
-    return blocks_kept(plan.at_reveal) if plan.at_reveal else None
+    return blocks_of_record(plan.at_reveal) if plan.at_reveal else None
 
 
-def blocks_kept(kept: Mapping[str, Any]) -> list[Block]:
+def blocks_of_record(kept: Mapping[str, Any]) -> list[Block]:
     """Return the blocks of a `reveal_record`, including old ones that stored pairs."""
     if "blocks" not in kept:
         return in_blocks([(one, other) for one, other in kept["pairs"]])
@@ -280,7 +280,7 @@ def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
 
 def blocks_that_count(plan: Plan) -> list[Block]:
     """Return the blocks of the reveal if there was one, else the current ones."""
-    kept = kept_blocks(plan)
+    kept = stored_blocks(plan)
     return current_pairs(plan).counted if kept is None else kept
 
 
@@ -317,7 +317,7 @@ def end_reason(plan: Plan, found: Findings) -> str:
     return f"{ENDED[found.ended]}, after {found.at} {planned.unit if planned else 'pairs'}"
 
 
-def ended_at_an_ask(plan: Plan) -> str:
+def end_at_request(plan: Plan) -> str:
     """Return why the plan ended, as found at a request for a trial or at its last one; "" if it has not."""
     told = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
     return told or ""
@@ -338,14 +338,14 @@ def visible_close_reason(plan: Plan, sealed: bool) -> str:
     if (plan.document or {}).get("format", 1) < _ENDS_NOTED:
         own = any(plan.closed_because.startswith(f"{words}, after ") for words in ENDED.values())
     else:
-        own = plan.closed_because == ended_at_an_ask(plan)
+        own = plan.closed_because == end_at_request(plan)
     return plan.closed_because if own or not sealed else ""
 
 
 _told_of: list[Callable[[Plan], dict[str, Any]]] = []
 
 
-def declare_kept(told: Callable[[Plan], dict[str, Any]]) -> None:
+def register_reveal_data(told: Callable[[Plan], dict[str, Any]]) -> None:
     """Register a function that returns further data to store at a reveal."""
     _told_of.append(told)
 
@@ -401,7 +401,7 @@ def _sums(plan: Plan) -> list[dict[str, Any]]:
     ]
 
 
-def looks_of(given: Any) -> list[int]:
+def look_schedule(given: Any) -> list[int]:
     """Return the numbers of pairs after which looks take place. Raises: EvaError unless they are increasing."""
     numbers = isinstance(given, list) and all(
         isinstance(at, int) and not isinstance(at, bool) for at in given

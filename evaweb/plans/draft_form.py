@@ -10,7 +10,7 @@ from django.contrib.auth.models import User
 from django.http import QueryDict
 
 from evaweb.core.errors import EvaError
-from evaweb.plans.design import looks_of
+from evaweb.plans.design import look_schedule
 from evaweb.plans.drafting import HIDDEN, Values
 from evaweb.plans.models import Comparing, Plan, Position
 from evaweb.stations.models import Station
@@ -109,7 +109,7 @@ class _Draft(forms.Form):
         """Return comma-separated integers; [] for a look after every pair."""
         words = self.cleaned_data["look_after"].replace(",", " ").split()
         try:
-            return looks_of([int(word) if _is_number(word) else word for word in words])
+            return look_schedule([int(word) if _is_number(word) else word for word in words])
         except EvaError:
             raise forms.ValidationError("Allowed: rising numbers of pairs, such as 20, 40, 60.") from None
 

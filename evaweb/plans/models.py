@@ -270,7 +270,7 @@ class Plan(models.Model):
         return f"{self.title} v{self.version}"
 
     @property
-    def kept_at(self) -> datetime | None:
+    def stored_at(self) -> datetime | None:
         """When the result was stored: at the reveal, or at the close of an open plan; None before."""
         return datetime.fromisoformat(self.at_reveal["at"]) if self.at_reveal else self.revealed_at
 

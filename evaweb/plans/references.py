@@ -176,7 +176,7 @@ def _text(content: bytes, name: str) -> str:
         raise EvaError(_NOT_TEXT(name=name, error=error)) from None
 
 
-def take_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
+def import_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
     """Store the pictures, and make them references if this lab has none; return a message per scene."""
     told: dict[str, Counter[str]] = {}
     for row in rows:

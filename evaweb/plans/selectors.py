@@ -45,7 +45,7 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
     return found
 
 
-def plans_beside(plan: Plan) -> QuerySet[Plan]:
+def overlapping_plans(plan: Plan) -> QuerySet[Plan]:
     """Return frozen plans by another name that share at least two checkpoints: their results reveal the same.
 
     A copy of a checkpoint counts as the same: equal weights (or, without digest, the same server) and strategy.

@@ -28,8 +28,8 @@ from evaweb.plans.design import (
     CROSSED_EVENT,
     ENDED_EVENT,
     dropped_of,
+    end_at_request,
     end_reason,
-    ended_at_an_ask,
     findings_of,
     recorded_so_far,
     reveal_record,
@@ -380,7 +380,7 @@ def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
     found = findings_of(held) if held.state == PlanState.FROZEN else None
     if found is None:
         return
-    ended, waits = ended_at_an_ask(held), open_void_requests(_trials(held)).exists()
+    ended, waits = end_at_request(held), open_void_requests(_trials(held)).exists()
     if asked and not ended and found.ended == "boundary":
         # A refused void restores its trial; until it is answered, the result must not change.
         ended = "" if waits else end_reason(held, found)
@@ -436,10 +436,10 @@ def _close(plan: Plan, user: User, why: str) -> None:
     plan.save()
     _note(plan, user, "closed", why)
     if not plan.blind:  # an open plan may never be revealed, so its result is stored now
-        transaction.on_commit(partial(_keep_at_close, plan, user), robust=True)
+        transaction.on_commit(partial(_store_at_close, plan, user), robust=True)
 
 
-def _keep_at_close(plan: Plan, user: User) -> None:
+def _store_at_close(plan: Plan, user: User) -> None:
     """Store the result of an open plan at its close; computed before locking, as that may take seconds."""
     while True:
         fresh = Plan.objects.get(pk=plan.pk)

@@ -27,7 +27,7 @@ from evaweb.core.canonical_json import difference
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.plans.frozen_document import checkpoint_of, scene_of
 from evaweb.plans.models import Comparing, Plan, PlanState, Reference
-from evaweb.plans.references import packed, reference_tables, take_references
+from evaweb.plans.references import import_references, packed, reference_tables
 from evaweb.plans.toml_schema import (
     CheckpointTable,
     File,
@@ -37,7 +37,7 @@ from evaweb.plans.toml_schema import (
 )
 from evaweb.stations.models import Station
 from evaweb.trials.models import Checkpoint, Milestone, Position, Scene
-from evaweb.trials.scene_reading import kept_positions
+from evaweb.trials.scene_reading import protected_positions
 from evaweb.trials.selectors import checkpoint_used
 from evaweb.trials.tables import check_milestones
 from runtime.core import bounded_documents as bounded
@@ -194,7 +194,7 @@ def import_file(*, user: User, text: str, pictures: Mapping[str, bytes] | None =
             *(_take_scene(table) for table in given.scene),
             *(_take_checkpoint(table) for table in given.checkpoint),
             *(_take_plan(table, user) for table in given.plan),
-            *take_references([row.model_dump() for row in given.reference], pictures or {}, user),
+            *import_references([row.model_dump() for row in given.reference], pictures or {}, user),
         ]
 
 
@@ -218,7 +218,7 @@ def _take_scene(table: SceneTable) -> str:
         changes = difference(now, {**wanted, "position": positions, "milestone": milestones})
         if not changes:
             return f"scene {made.name}: the same"
-        if kept_positions(made) or Reference.objects.filter(position__scene=made).exists():
+        if protected_positions(made) or Reference.objects.filter(position__scene=made).exists():
             raise _refused(f"scene {made.name}", changes)
         made.positions.all().delete()
         made.milestones.all().delete()

@@ -13,7 +13,7 @@ from django.db.models import Case, Count, Exists, IntegerField, Max, Min, OuterR
 from evaweb.core.errors import EvaError, NotFound
 from evaweb.plans.models import Plan, PlanState, Slot
 from evaweb.stations.models import Station
-from evaweb.trials.failure_text import is_not_said
+from evaweb.trials.failure_text import is_unspecified
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import MilestoneOutcome, Trial, TrialStatus
 from evaweb.trials.selectors import UNFINISHED
@@ -194,7 +194,7 @@ def trials_of_plan(plan: Plan, question: TrialQuery) -> QuerySet[Trial]:
             rows = rows.filter(**{field: value})
     for name in FIELDS:
         if value := getattr(question, name):
-            rows = rows.filter(**{f"verdict__{name}": "" if is_not_said(value) else value})
+            rows = rows.filter(**{f"verdict__{name}": "" if is_unspecified(value) else value})
     if question.position:
         rows = rows.filter(position__number=_whole("position", question.position))
     if question.status:

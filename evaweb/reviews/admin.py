@@ -9,7 +9,7 @@ from evaweb.accounts.admin_site import LabelledRows
 from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 
 
-class _Kept(admin.ModelAdmin):
+class _ReadOnlyAdmin(admin.ModelAdmin):
     """Base of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
@@ -23,7 +23,7 @@ class _Kept(admin.ModelAdmin):
 
 
 @admin.register(Review)
-class ReviewAdmin(_Kept):
+class ReviewAdmin(_ReadOnlyAdmin):
     """Verdicts and notes on episodes."""
 
     list_display = ("episode", "verdict", "note", "reviewer", "at")
@@ -33,7 +33,7 @@ class ReviewAdmin(_Kept):
 
 
 @admin.register(Segment)
-class SegmentAdmin(_Kept):
+class SegmentAdmin(_ReadOnlyAdmin):
     """Annotated segments."""
 
     list_display = ("episode", "first", "last", "label", "milestone", "annotator", "at")
@@ -43,7 +43,7 @@ class SegmentAdmin(_Kept):
 
 
 @admin.register(Standing)
-class StandingAdmin(_Kept):
+class StandingAdmin(_ReadOnlyAdmin):
     """Results of the checks, and the verdict that counts."""
 
     list_display = ("episode", "worst", "flags", "checked_at", "review")

@@ -66,11 +66,11 @@ class Busy(EvaError):
         self.retry_after_s = retry_after_s
 
 
-class UnderWay(Busy):
+class StillRunning(Busy):
     """The computation is running."""
 
 
-class Beside:
+class ComputeProcess:
     """Child process that computes; started by the first call and after it has ended. For one thread."""
 
     def __init__(self) -> None:
@@ -136,7 +136,7 @@ class Questions:
         ] = {}  # by user: CPU time spent [s], and when it was valid
         self._waiting = 0
 
-    def ask(self, person: Hashable, work: Callable[..., Any], *given: Any, soon: bool = False) -> Any:
+    def result(self, person: Hashable, work: Callable[..., Any], *given: Any, soon: bool = False) -> Any:
         """Return the result of `work(*given)`, cached or computed.
 
         Args:
@@ -158,7 +158,7 @@ class Questions:
         try:
             return coming.result(self._soon_s if soon else self._patience_s)
         except TimeoutError:
-            raise UnderWay(_UNDER_WAY) from None
+            raise StillRunning(_UNDER_WAY) from None
         except LookupQueueFull:
             raise Busy(_CROWDED) from None
         finally:
@@ -201,7 +201,7 @@ class Questions:
         return max(0.0, seconds - REFILLED * (self._clock() - at))
 
 
-questions = Questions(Beside().run)
+questions = Questions(ComputeProcess().run)
 
 
 def _main() -> None:

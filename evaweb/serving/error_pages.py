@@ -20,7 +20,7 @@ from django.views import defaults
 
 from evaweb.core.errors import EvaError, refusal
 from evaweb.core.storage_errors import storage_error_response
-from evaweb.core.write_conflicts import TAKEN, was_taken
+from evaweb.core.write_conflicts import TAKEN, is_duplicate
 from runtime.core.sentences import Pattern, fixed
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class RefusalMiddleware(MiddlewareMixin):
         if _is_no_number(exception):
             log.warning("%a was refused", request.path, exc_info=exception)
             return error_response(request, f"{exception!s:.120}", 400, "refused.html")
-        if was_taken(exception):
+        if is_duplicate(exception):
             log.warning("%a was refused: %s", request.path, exception)
             return error_response(request, TAKEN, 409, "refused.html")
         if not isinstance(exception, EvaError):

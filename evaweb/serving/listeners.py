@@ -9,7 +9,7 @@ from evaweb.core.errors import EvaError
 _BACKLOG = 4096  # beyond it a client's connection attempt is repeated after a second
 
 
-class PortTaken(EvaError):
+class PortInUseError(EvaError):
     """The address cannot be listened on, usually because the port is in use."""
 
 
@@ -23,7 +23,7 @@ def open_listener(host: str, port: int) -> socket.socket:
         listener.listen(_BACKLOG)
     except OSError as error:
         listener.close()
-        raise PortTaken(
+        raise PortInUseError(
             f"cannot listen on {host}:{port}: {error.strerror}; name another address or port with --host, --port"
         ) from None
     listener.setblocking(False)

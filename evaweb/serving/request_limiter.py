@@ -51,7 +51,7 @@ class RequestLimiter:
         ):
             await _refuse(send)
         else:
-            shares = self._people.asked(who), self._addresses.asked(address)
+            shares = self._people.acquire_share(who), self._addresses.acquire_share(address)
             task = asyncio.create_task(self._in_turn(scope, _Client(receive, send), *shares))
             task.add_done_callback(lambda _: (self._people.answered(who), self._addresses.answered(address)))
             self._tasks.add(task)  # strong reference: the event loop has only weak ones
@@ -87,7 +87,7 @@ class _Shares:
         self._of: dict[Hashable, asyncio.Semaphore] = {}
         self.asking: Counter[Hashable] = Counter()
 
-    def asked(self, name: Hashable) -> asyncio.Semaphore:
+    def acquire_share(self, name: Hashable) -> asyncio.Semaphore:
         """Return the semaphore of `name` and count one request for it; call `answered` when the request ends."""
         self.asking[name] += 1
         return self._of.setdefault(name, asyncio.Semaphore(self._most))

@@ -20,10 +20,10 @@ from evaweb.trials.scene_reading import (
     MilestoneTable,
     PositionTable,
     SceneTable,
-    kept_positions,
+    protected_positions,
     running_plans,
+    scene_digest,
     scene_table,
-    seen_of,
 )
 from evaweb.trials.scene_writing import APART_M, table_of
 
@@ -60,7 +60,7 @@ def shown(scene: Scene) -> dict[str, Any]:
 
 def state_of(scene: Scene) -> dict[str, Any]:
     """Return the saved scene, its version, and the positions that cannot be changed, by id, with the reason."""
-    return {"scene": scene_table(scene), "seen": seen_of(scene), "kept": kept_positions(scene)}
+    return {"scene": scene_table(scene), "seen": scene_digest(scene), "kept": protected_positions(scene)}
 
 
 def existing(scene: Scene) -> dict[str, Any]:

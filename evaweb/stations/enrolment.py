@@ -57,7 +57,7 @@ def code_make(*, user: Any, station: Station) -> Shown:
     log.warning("%a has a code shown to enrol a computer as %s", user.get_username(), station.name)
     host, port = settings.EVA_GATE
     shown = f"{settings.EVA_GATE_NAME or _named(host)}:{port}"
-    return Shown(code.shown(), shown, port + 1, codes.fingerprint(code.lab), row.expires_at)
+    return Shown(code.text(), shown, port + 1, codes.fingerprint(code.lab), row.expires_at)
 
 
 @transaction.atomic

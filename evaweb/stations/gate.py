@@ -50,9 +50,9 @@ class Keys:
         self._path = key_files.folder(data) / "allowed.json"
         self._failing = False
         self.list = AllowList(self._kept())
-        self.look()
+        self.poll()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Read the keys once; thread-safe."""
         try:
             found = keys_allowed()
@@ -72,7 +72,7 @@ class Keys:
         """Read the keys periodically until `ended` is set."""
         while not ended.wait(_LOOK_S):
             try:
-                self.look()
+                self.poll()
             except Exception:  # otherwise this thread would end, and withdrawn keys would stay admitted
                 log.exception("who may connect is as it was")
 
@@ -96,14 +96,14 @@ def serve(where: tuple[str, int, int], lifeline: bool, owner: Owner) -> None:
     `owner` returns the name of the station that owns an offered episode. Raises: GateError.
     """
     try:
-        with _only_one(key_files.folder(settings.DATA_DIR) / "gate.lock"):
+        with _lock_gate(key_files.folder(settings.DATA_DIR) / "gate.lock"):
             _serve(where, lifeline, owner)
     except (TransportError, ConfigurationError) as fault:
         raise GateError(str(fault)) from None
 
 
 @contextmanager
-def _only_one(path: Path) -> Iterator[None]:
+def _lock_gate(path: Path) -> Iterator[None]:
     """Lock the lab's folders of remote stations: two gates would both store the stations' data."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as lock:
@@ -155,7 +155,7 @@ def _enroller(keys: Keys, tokens: bytes) -> Callable[[str, str, str], Enrolled |
             return str(fault)
         finally:
             close_old_connections()
-        keys.look()  # admit the new key before the computer connects with it
+        keys.poll()  # admit the new key before the computer connects with it
         return Enrolled(station.name, socket.gethostname(), public, 0)
 
     return enrol

@@ -78,7 +78,7 @@ def claim(*, user: Any, station: Station, page: str) -> Lease:
     require_role(user, Role.OPERATOR)
     _require_active(station)
     holder = holder_of(user.get_username(), page)
-    held = _held(station)
+    held = _current_lease(station)
     if held["holder"] not in ("", holder):
         raise Conflict(_HELD_BY(who=holder_display_name(held["holder"]), station=station))
     epoch = held["epoch"] if held["holder"] else _next_epoch(station, held)
@@ -108,7 +108,7 @@ def request_handover(*, user: Any, station: Station, page: str) -> LeaseRequest:
     """Ask the holder to hand the station over; a repeated request moves to the page that repeats it."""
     require_role(user, Role.OPERATOR)
     _require_active(station)
-    holder, held = holder_of(user.get_username(), page), _held(station)["holder"]
+    holder, held = holder_of(user.get_username(), page), _current_lease(station)["holder"]
     if not held:
         raise Conflict(_NOBODY_HAS(station=station))
     if held == holder:
@@ -138,7 +138,7 @@ def hand_over(*, user: Any, station: Station, page: str, request: int) -> Lease:
     own = _own(user, station, page)
     asked = _open_request(station, request)
     _require_commander(asked.user)
-    held = _held(station)
+    held = _current_lease(station)
     if (held["holder"], held["epoch"]) != (own.holder, own.epoch):
         raise Conflict(_ENDED_MEANWHILE(who=holder_display_name(held["holder"]) or "nobody", station=station))
     epoch = _next_epoch(station, held)
@@ -152,7 +152,7 @@ def move(*, user: Any, station: Station, page: str) -> Lease:
     """
     require_role(user, Role.OPERATOR)
     _require_active(station)
-    holder, held = holder_of(user.get_username(), page), _held(station)
+    holder, held = holder_of(user.get_username(), page), _current_lease(station)
     if held["holder"] == holder:
         return _grant(user, station, holder, held["epoch"], end_reason="expired")
     if not held["holder"].startswith(holder_of(user.get_username(), "")):
@@ -168,7 +168,7 @@ def take_over(*, user: Any, station: Station, page: str, reason: str) -> Lease:
     if not reason.strip():
         raise EvaError(_TAKE_WITHOUT_REASON)
     holder = holder_of(user.get_username(), page)
-    epoch = _next_epoch(station, _held(station))
+    epoch = _next_epoch(station, _current_lease(station))
     return _grant(user, station, holder, epoch, f"taken by {user.get_username()}: {reason.strip()}"[:240])
 
 
@@ -205,7 +205,7 @@ def _require_active(station: Station) -> None:
         raise NotAllowed(_SWITCHED_OFF(station=station, message=station.message or "ask an administrator"))
 
 
-def _held(station: Station) -> dict[str, Any]:
+def _current_lease(station: Station) -> dict[str, Any]:
     """Return the lease as the runtime reports it now: holder, epoch."""
     held: dict[str, Any] = connection_to(station.name).status()["lease"]
     return held

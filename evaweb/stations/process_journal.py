@@ -73,7 +73,7 @@ def recover_journals(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> b
     waits = False
     for path in sorted(folder.glob(f"*{_SUFFIX}")):
         try:
-            _take_up(path, take)
+            _resume(path, take)
         except (FileNotFoundError, BlockingIOError):
             continue  # another process has recovered it, or its owner lives
         except OSError as error:
@@ -84,7 +84,7 @@ def recover_journals(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> b
     return waits
 
 
-def _take_up(path: Path, take: Callable[[Sequence[bytes]], bool]) -> None:
+def _resume(path: Path, take: Callable[[Sequence[bytes]], bool]) -> None:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW)
     except OSError as error:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from evaweb.blinding.visibility import COVERED, COVERED_AT_REST, Visibility
-from runtime.core.sentences import Sentence, heard, identity, shows, texts
+from runtime.core.sentences import Sentence, from_wire, identity, shows, texts
 from runtime.ipc.session_state import SessionState
 
 # Visible keys of a snapshot: robot, bench, lease; nothing about the policy, its timing and its chunks.
@@ -101,7 +101,7 @@ def _sentence(said: object) -> str:
     found = said if isinstance(said, Mapping) else {"text": str(said or "")}
     text = str(found.get("text") or "")
     try:
-        return heard(text, found.get("id") or "", found.get("arguments") or {})
+        return from_wire(text, found.get("id") or "", found.get("arguments") or {})
     except ValueError:
         return text
 

@@ -107,11 +107,11 @@ def drawn_robot(robot: str, groups: Sequence[str] | None = None) -> DrawnRobot:
 
     Raises: NotFound, which lists the robots or states the error in the description.
     """
-    return _looks(robot, None if groups is None else tuple(groups))
+    return _drawn_robot(robot, None if groups is None else tuple(groups))
 
 
 @lru_cache(_KEPT)
-def _looks(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot:
+def _drawn_robot(robot: str, groups: tuple[str, ...] | None) -> DrawnRobot:
     if robot not in robots.robot_names():  # the name may come from a URL: never use it as a path
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(robot=robot, names=", ".join(robots.robot_names())))
     try:

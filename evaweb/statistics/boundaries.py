@@ -37,7 +37,7 @@ _TIE = 1e-9  # relative; closer values are compared exactly, as integers
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class StoppingTable:
     """Number of trials of each arm at a look, and the least extreme table that stops there.
 
     `least` is (successes of the first arm, successes of the second arm), None if no table stops at this look.
@@ -77,7 +77,7 @@ class Boundary:
     the second arm's rate is not lower than the first's by `margin` or more, one-sided at `alpha`.
     """
 
-    looks: tuple[Look, ...]
+    looks: tuple[StoppingTable, ...]
     alpha: float
     margin: float | None = None
 
@@ -179,7 +179,9 @@ class Boundary:
             )
         return [((np.arange(trials + 1), np.zeros(trials + 1)), gone, (trials, 0))]
 
-    def _stopping_mass(self, rates: tuple[float, float]) -> Iterator[tuple[Look, NDArray[np.float64]]]:
+    def _stopping_mass(
+        self, rates: tuple[float, float]
+    ) -> Iterator[tuple[StoppingTable, NDArray[np.float64]]]:
         """Yield each look with the probability of stopping there at each table: float64 [first + 1, second + 1]."""
         import numpy as np
 
@@ -233,7 +235,7 @@ def _boundary(
         before = (first, second)
         most = _SAFETY * alpha * ((first + second) / total) ** SHAPES[shape]
         least, spent = _least_extreme(alive, (first, second), null, spent, most)
-        look = Look(first, second, least)
+        look = StoppingTable(first, second, least)
         alive = np.where(_region(look, margin), 0.0, alive)
         found.append(look)
     return Boundary(tuple(found), alpha, margin)
@@ -440,14 +442,14 @@ def _least(
     return first, second
 
 
-def _at_least(first: int, second: int, look: Look, margin: float | None) -> bool:
+def _at_least(first: int, second: int, look: StoppingTable, margin: float | None) -> bool:
     assert look.least is not None
     over, under = extremeness_of(first, look.first, second, look.second, margin)
     least_over, least_under = extremeness_of(look.least[0], look.first, look.least[1], look.second, margin)
     return over * least_under >= least_over * under
 
 
-def _region(look: Look, margin: float | None) -> NDArray[np.bool_]:
+def _region(look: StoppingTable, margin: float | None) -> NDArray[np.bool_]:
     """Return the stopping region of a look: bool [first + 1, second + 1].
 
     Tables that rounding could misclassify are compared exactly, as integers.

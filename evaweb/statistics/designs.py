@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from evaweb.statistics.base import StatisticsError, check_alpha
-from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, Look, boundary, pair_counts
+from evaweb.statistics.boundaries import MOST, SHAPES, Boundary, StoppingTable, boundary, pair_counts
 from evaweb.statistics.difference import Difference, barnard
 from evaweb.statistics.permutation import sign_flip_test
 from evaweb.statistics.sequential import score_evidence, success_evidence
@@ -314,7 +314,7 @@ def evaluate_design(found: Design, blocks: Sequence[Block], pair: tuple[int, int
 
     Blocks beyond those of the design are ignored.
     """
-    given = list(_made(found, blocks[: found.blocks], pair))
+    given = list(_complete_blocks(found, blocks[: found.blocks], pair))
     full = len(given) if len(given) == found.blocks else None
     if found.boundary is not None:
         at, winner = _first_crossing(found.boundary, given)
@@ -339,7 +339,7 @@ def estimated(
     """
     if found.boundary is None or found.margin is not None or one.ended_at_pair is None or one.dropped:
         return None
-    given = list(_made(found, blocks[: one.ended_at_pair], pair))
+    given = list(_complete_blocks(found, blocks[: one.ended_at_pair], pair))
     (first, n), (second, m) = (_sum(given, side) for side in (0, 1))
     if (n, m) not in [(look.first, look.second) for look in found.boundary.looks]:
         return None
@@ -349,7 +349,7 @@ def estimated(
 Sides = tuple[list[float], list[float]]  # outcomes of the first and of the second arm in one block
 
 
-def _made(found: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
+def _complete_blocks(found: Design, blocks: Sequence[Block], pair: tuple[int, int]) -> Iterator[Sides]:
     """Yield the outcomes by side of the blocks before the first incomplete one."""
     before = (0, 0)
     for number, block in enumerate(blocks):
@@ -417,7 +417,7 @@ def alone(found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> tupl
 
 def of_so_many(found: Design, blocks: int) -> Design:
     """Return the design of one comparison for `blocks` pairs instead; looks beyond them are omitted."""
-    looks = looks_at(found) if found.rule in SHAPES else []
+    looks = look_schedule(found) if found.rule in SHAPES else []
     made = design(
         rule=found.rule,
         blocks=blocks,
@@ -434,7 +434,7 @@ def in_blocks(values: Sequence[Values]) -> list[Block]:
     return [((0, one), (1, other)) for one, other in values]
 
 
-def looks_at(found: Design) -> list[int]:
+def look_schedule(found: Design) -> list[int]:
     """Return the numbers of blocks at which the boundary has looks; [] without a boundary."""
     looks = found.boundary.looks if found.boundary else ()
     return [(look.first + look.second) // 2 for look in looks]  # a block of a comparison has two trials
@@ -447,5 +447,5 @@ def boundary_table(found: Boundary) -> list[list[int]]:
 
 def boundary_from_table(rows: Sequence[Sequence[int]], alpha: float, margin: float | None) -> Boundary:
     """Return the boundary from rows of `boundary_table`."""
-    looks = (Look(n, m, (least[0], least[1]) if least else None) for n, m, *least in rows)
+    looks = (StoppingTable(n, m, (least[0], least[1]) if least else None) for n, m, *least in rows)
     return Boundary(tuple(looks), alpha, margin)

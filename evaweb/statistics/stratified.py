@@ -29,7 +29,7 @@ class StratumTable:
         check_counts(self.x2, self.n2)
 
     @property
-    def tells(self) -> bool:
+    def is_informative(self) -> bool:
         """Whether the stratum is informative: its margins allow more than one table."""
         return self.n1 > 0 and self.n2 > 0 and 0 < self.x1 + self.x2 < self.n1 + self.n2
 
@@ -96,7 +96,7 @@ def exact_within(tables: Sequence[StratumTable], least: int = 2) -> float | None
 
     None if fewer than `least` strata are informative.
     """
-    telling = [table for table in tables if table.tells]
+    telling = [table for table in tables if table.is_informative]
     if len(telling) < least:
         return None
     total = {0: 1}
@@ -115,7 +115,7 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
 
     None if fewer than two strata are informative, or the combinations are too many to enumerate.
     """
-    telling = sorted((table for table in tables if table.tells), key=lambda table: len(table.ways))
+    telling = sorted((table for table in tables if table.is_informative), key=lambda table: len(table.ways))
     if len(telling) < 2 or math.prod(len(table.ways) for table in telling[:-1]) > _MOST:
         return None
     seen = math.prod(table.ways[table.x1] for table in telling)

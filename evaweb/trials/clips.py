@@ -28,7 +28,7 @@ class Clip:
     after: str
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Description of the part."""
         return f"after “{self.after}”" if self.after else f"the last {self.end - self.begin:.0f} s"
 

@@ -6,7 +6,7 @@ UNSPECIFIED = "not specified"
 _BEFORE = "not said"  # earlier name, still in bookmarked URLs
 
 
-def is_not_said(words: str) -> bool:
+def is_unspecified(words: str) -> bool:
     """Return True if the text stands for an unspecified failure."""
     return words.strip().casefold() in (UNSPECIFIED, _BEFORE)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from evaweb.core.errors import EvaError
 from evaweb.records.journal import clean_text
-from evaweb.trials.failure_text import is_not_said
+from evaweb.trials.failure_text import is_unspecified
 from evaweb.trials.models import FailureTerm, Scene, Score
 from evaweb.trials.scoring import LONGEST_FAILURE
 from runtime.core.sentences import Pattern
@@ -86,7 +86,7 @@ def clean_failure(*, failure_phase: str, failure: str) -> dict[str, str]:
         "failure_phase": clean_text("failure_phase", failure_phase, LONGEST_FAILURE),
     }
     for field, words in found.items():
-        if is_not_said(words):
+        if is_unspecified(words):
             raise EvaError(_ALLOWED_OTHER_WORDS_NONE_WHERE(field=field, words=words))
     return found
 

@@ -22,7 +22,7 @@ from django.db.models import (
 from evaweb.blinding.visibility import HIDDEN, Visibility, code_of
 from evaweb.core.errors import EvaError
 from evaweb.trials.clips import clip_of
-from evaweb.trials.failure_text import UNSPECIFIED, is_not_said
+from evaweb.trials.failure_text import UNSPECIFIED, is_unspecified
 from evaweb.trials.models import Trial, TrialStatus
 from evaweb.trials.selectors import TrialFilters, trial_list
 from runtime.core.sentences import Pattern
@@ -94,7 +94,7 @@ def failed_list(filters: FailureFilters, sight: Visibility) -> QuerySet[Trial]:
     rows = trial_list(filters.trials, sight).filter(status=TrialStatus.SCORED, verdict__success=False)
     for name in _WORDS:
         if value := getattr(filters, name):
-            rows = rows.filter(**{f"verdict__{name}": "" if is_not_said(value) else value})
+            rows = rows.filter(**{f"verdict__{name}": "" if is_unspecified(value) else value})
     if filters.position:
         scene, _, number = filters.position.rpartition("/")
         if not (number.isascii() and number.isdecimal() and len(number) < 7):

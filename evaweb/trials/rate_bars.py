@@ -73,7 +73,7 @@ def format_interval(found: Proportion) -> str:
     return f"{100 * found.interval.low:.0f} to {100 * found.interval.high:.0f}"
 
 
-def average_words(found: Average | None, of: int) -> str:
+def average_text(found: Average | None, of: int) -> str:
     """Return a mean such as "−5.21 [−5.60, −4.82], 14 of 16 trials"; "" if no trial has a value."""
     if found is None:
         return ""

@@ -128,7 +128,7 @@ def _trial(facts: TrialRecord, kept: RestorableRun, episode: Episode | None) -> 
     """Return the trial's row, locked, and whether it was created."""
     trial = Trial.objects.select_for_update().filter(uuid=facts.uuid).first()
     if trial is None:
-        return _made(facts, _episode(facts, kept, episode)), True
+        return _create(facts, _episode(facts, kept, episode)), True
     if kept.uuid not in (trial.uuid, trial.episode_id or kept.uuid):
         raise EvaError(_TRIAL_HAS_EPISODE_CANNOT_HAVE(trial=trial.pk, episode_id=trial.episode_id))
     if trial.status in _BEHIND:
@@ -157,7 +157,7 @@ def _episode(facts: TrialRecord, kept: RestorableRun, found: Episode | None) -> 
     )
 
 
-def _made(facts: TrialRecord, episode: Episode | None) -> Trial:
+def _create(facts: TrialRecord, episode: Episode | None) -> Trial:
     """Create the trial with its original id if that is free, so that URLs of trials stay valid."""
     station, scene = placeholders.station(facts), placeholders.scene(facts)
     key = {

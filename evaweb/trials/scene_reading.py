@@ -83,13 +83,13 @@ def scene_table(scene: Scene) -> dict[str, Any]:
     }
 
 
-def seen_of(scene: Scene) -> str:
+def scene_digest(scene: Scene) -> str:
     """Return a digest of the scene as stored, which changes with any part of it."""
     kept = scene_table(Scene.objects.get(pk=scene.pk))
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def kept_positions(scene: Scene) -> dict[int, str]:
+def protected_positions(scene: Scene) -> dict[int, str]:
     """Return by id the positions used by trials or frozen plans, with the reason as text."""
     referred = Q(trials__isnull=False) | Q(plan__state__in=_FROZEN)
     rows = scene.positions.filter(referred).annotate(n=Count("trials", distinct=True)).distinct()

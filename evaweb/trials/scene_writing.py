@@ -30,10 +30,10 @@ from evaweb.trials.scene_reading import (
     MilestoneTable,
     PositionTable,
     SceneTable,
-    kept_positions,
+    protected_positions,
     running_plans,
+    scene_digest,
     scene_table,
-    seen_of,
     values_of,
 )
 from evaweb.trials.tables import check_milestones
@@ -100,12 +100,12 @@ def scene_write(
     if scene is None:
         raise Conflict(_SCENE_DOES_NOT_EXIST_ANY(name=name))
     there = scene if name is not None else Scene.objects.filter(name=wanted.name).first()
-    if there is not None and _says(there, wanted):
+    if there is not None and _equals(there, wanted):
         return there, []
     if name is None:
         scene.name = wanted.name
-    elif seen_of(scene) != seen:
-        raise ChangedMeanwhile(scene, seen_of(scene))
+    elif scene_digest(scene) != seen:
+        raise ChangedMeanwhile(scene, scene_digest(scene))
     before = scene_table(scene) if scene.pk else None
     faults = _assigned(scene, wanted)
     if faults:
@@ -121,7 +121,7 @@ def scene_write(
     return scene, _remarks(scene, before, after)
 
 
-def _says(scene: Scene, wanted: SceneTable) -> bool:
+def _equals(scene: Scene, wanted: SceneTable) -> bool:
     """Return True if the scene already equals `wanted`; new rows have no id there."""
     there = SceneTable.model_validate(scene_table(scene))
     pairs = (
@@ -158,7 +158,7 @@ def _assigned(scene: Scene, wanted: SceneTable) -> list[Fault]:
 
 def _write_positions(scene: Scene, wanted: Sequence[PositionTable]) -> list[Fault]:
     rows = {row.pk: row for row in scene.positions.all()}
-    kept = kept_positions(scene)
+    kept = protected_positions(scene)
     faults = [*_strangers(wanted, rows, "positions"), *_twice(wanted)]
     faults += [
         Fault("positions", f"position {row.number} is not removed, because of {why}")

@@ -377,7 +377,7 @@ def score_trial(
         found = judged()
         run_checks(f"judged {'success' if found.success else 'failure'}", held, user)
         if uuid is None:
-            _require_said_anew(held, said, found)
+            _reject_repeat(held, said, found)
         if source == Score.Source.TRUTH:
             _require_truth(held, found)
         failures.check_failure(
@@ -434,7 +434,7 @@ def lock_trial(trial: Trial) -> Trial:
     return Trial.objects.select_for_update().get(pk=trial.pk)
 
 
-def _require_said_anew(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
+def _reject_repeat(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
     """Raise Conflict if this equals an earlier score of the rater, as it may be a late copy of a corrected one."""
     before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
     if any(_is_same_score(score, said, found) for score in before):

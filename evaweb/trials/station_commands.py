@@ -171,7 +171,9 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
     args = setup_args(trial, given["uuid"])
     if first is not None:
         _require_same(
-            first, trial, trial.setup == first.pk or _asked(first.args) == _asked(to_json_value(args))
+            first,
+            trial,
+            trial.setup == first.pk or _setup_identity(first.args) == _setup_identity(to_json_value(args)),
         )
         args = first.args
     row = issue_command(**given, args=args, vouched=TABLES)
@@ -185,7 +187,7 @@ def _set_up(trial: Trial, given: Mapping[str, Any]) -> Command:
     return row
 
 
-def _asked(args: Mapping[str, Any]) -> dict[str, Any]:
+def _setup_identity(args: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments that identify a set-up, without the least durations, which are drawn anew each time."""
     return {key: value for key, value in args.items() if key != "least"}
 

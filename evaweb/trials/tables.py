@@ -12,7 +12,7 @@ from typing import Any, get_args
 import pydantic
 from django.core.exceptions import ValidationError
 
-from evaweb.trials.failure_text import is_not_said
+from evaweb.trials.failure_text import is_unspecified
 from runtime.config.schema import policy_tables, strategy_tables
 
 _TAG = re.compile(r"[A-Za-z0-9_.:/+-]{1,40}")
@@ -60,7 +60,7 @@ def check_term(given: str) -> None:
     """Raise ValidationError if a failure phase or cause could be confused with another or with "not specified"."""
     if given != given.strip():
         raise ValidationError(_sentence(given, "words without blanks around them"))
-    if is_not_said(given):
+    if is_unspecified(given):
         raise ValidationError(
             _sentence(given, "other words: these stand for failures of which nothing was said")
         )

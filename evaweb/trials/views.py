@@ -136,7 +136,7 @@ def _trial_page(
         "implied": any(milestone.required for milestone in milestones),
         "fails": services.failing(found),
         "may_score": operator and lifecycle.allows(found, Transition.SCORE),
-        "words_alone": _words_alone(found, request.user) if found.verdict_id else "",
+        "words_alone": _text_only_reason(found, request.user) if found.verdict_id else "",
         "may_void": operator
         and lifecycle.allows(found, Transition.VOID)
         and found.status != TrialStatus.VOID_ASKED,
@@ -157,7 +157,7 @@ def _trial_page(
     return render(request, "trials/trial.html", context, status=fault.status if fault else 200)
 
 
-def _words_alone(trial: Trial, user: Any) -> str:
+def _text_only_reason(trial: Trial, user: Any) -> str:
     """Return why this user may correct only texts of the score; "" if they may also change its outcome."""
     try:
         services.require_own(trial, user)
@@ -218,8 +218,8 @@ def _columns(sight: Visibility) -> list[Column]:
         Column("prepared", "Prepared", ("prepared_at",), down=True),
         Column("scene", "Scene", ("scene__title", "position__number")),
         Column("position", "Position", ("position__number",), number=True),
-        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if sight.sees_everything else ()),
-        Column("number", "No.", ("number", "attempt") if sight.sees_everything else (), number=True),
+        Column("checkpoint", "Checkpoint", ("checkpoint__name",) if sight.hides_nothing else ()),
+        Column("number", "No.", ("number", "attempt") if sight.hides_nothing else (), number=True),
         Column("status", "Status", ("status",)),
         Column("success", "Success", ("verdict__success",), down=True),
         Column("score", "Score", ("verdict__score",), number=True),

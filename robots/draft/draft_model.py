@@ -93,7 +93,7 @@ def build_draft(tree: Urdf, shown: Path, drawn: Collection[str], title: str, cop
         urdf=shown.name,
         groups=tuple(groups),
         cameras=_cameras([group.name for group in groups if group.kind == "arm"]),
-        stand=None if copies > 1 else _stand(tree, limbs),
+        stand=None if copies > 1 else _root_pose(tree, limbs),
         unassigned_joints=tuple(name for name in tree.joints if name in names - moved),
         held=tree.held,
     )
@@ -108,7 +108,7 @@ def _group(
     gripper = None
     if limb.fingers and eef_link is not None:
         gripper = guess_gripper(tree, limb, eef_link, real)
-    values = _rest(tree, limb.joints)
+    values = _rest_joints(tree, limb.joints)
     return GroupDraft(
         name=limb.name,
         kind=limb.kind,
@@ -125,7 +125,7 @@ def _group(
     )
 
 
-def _rest(tree: Urdf, joints: Sequence[str]) -> tuple[float, ...]:
+def _rest_joints(tree: Urdf, joints: Sequence[str]) -> tuple[float, ...]:
     ends = [_ends(tree, name) for name in joints]
     return tuple(
         rest_posture(np.array([low for low, _ in ends]), np.array([high for _, high in ends]))
@@ -155,7 +155,7 @@ def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[s
     values = {
         name: value
         for other in others
-        for name, value in zip(other.joints, _rest(tree, other.joints), strict=True)
+        for name, value in zip(other.joints, _rest_joints(tree, other.joints), strict=True)
     }
     return {name: value for name, value in values.items() if value}
 
@@ -200,7 +200,7 @@ def _cameras(arms: Sequence[str]) -> dict[str, str]:
     return {"front": "cam_high"} | {side: f"cam_{side}" for side in sides}
 
 
-def _stand(tree: Urdf, limbs: Sequence[GroupGuess]) -> PoseDraft:
+def _root_pose(tree: Urdf, limbs: Sequence[GroupGuess]) -> PoseDraft:
     """Return the pose of the root such that the arms reach over the table: on it, or on the floor in front of it."""
     at = places(tree, {})
     shoulders: list[Float64] = [

@@ -83,7 +83,7 @@ def guess_gripper(
     doubts: list[str] = []
     lower, upper = _range(driver, doubts)
     jaws = _Jaws(tree, limb, eef_link, corners)
-    fingers = jaws.closing_values(driver.name, (lower, upper), _ways(tree, limb, driver.name))
+    fingers = jaws.closing_values(driver.name, (lower, upper), _independent_fingers(tree, limb, driver.name))
     opening, closed, open_at = jaws.opening(fingers, lower, upper)
     if opening is None:
         doubts.append("which end is open cannot be read off the URDF")
@@ -118,7 +118,7 @@ def _velocity(joint: Joint, way: float, doubts: list[str]) -> float:
     return round(way / _SECONDS, 4)
 
 
-def _ways(tree: Urdf, limb: GroupGuess, driver: str) -> dict[str, tuple[float, float]]:
+def _independent_fingers(tree: Urdf, limb: GroupGuess, driver: str) -> dict[str, tuple[float, float]]:
     """Return the limits of the fingers that move independently of the driver and have limits."""
     joints = [tree.joint(name) for name in limb.fingers if name != driver]
     return {joint.name: _range(joint, []) for joint in joints if joint.kind != "continuous"}
@@ -209,7 +209,7 @@ class _Jaws:
 
     def _end(self, branch: list[str], at: Mapping[str, Float64]) -> tuple[str, Float64]:
         """Return the link of a branch that extends farthest, and the centre of its far end in that link."""
-        seen = {link: self._seen(link, at) for link in branch}
+        seen = {link: self._points_in_eef(link, at) for link in branch}
         link = max(branch, key=lambda name: float((seen[name] @ self._z).max()))
         along = seen[link] @ self._z
         near, far = along.min(), along.max()
@@ -242,19 +242,19 @@ class _Jaws:
         back = np.linalg.inv(at[self._eef])
         return {link: back @ place for link, place in at.items()}
 
-    def _seen(self, link: str, at: Mapping[str, Float64]) -> Float64:
+    def _points_in_eef(self, link: str, at: Mapping[str, Float64]) -> Float64:
         """Return the corners [n, 3] of a link's shapes in the end effector, or its origin if it has none."""
         shapes = self._corners.get(link, np.zeros((1, 3)))
         return np.asarray(shapes @ at[link][:3, :3].T + at[link][:3, 3])
 
     def _centre(self, link: str, at: Mapping[str, Float64]) -> Float64:
-        seen = self._seen(link, at)
+        seen = self._points_in_eef(link, at)
         return np.asarray((seen.min(axis=0) + seen.max(axis=0)) / 2)
 
     def _reach(self, at: Mapping[str, Float64]) -> float | None:
         """Return the extent of the fingers' shapes along z, None without shapes."""
         shown = [link for branch in self._branches for link in branch if link in self._corners]
-        return max((float((self._seen(link, at) @ self._z).max()) for link in shown), default=None)
+        return max((float((self._points_in_eef(link, at) @ self._z).max()) for link in shown), default=None)
 
 
 def _behind(tree: Urdf, link: str) -> list[str]:

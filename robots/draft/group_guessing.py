@@ -144,7 +144,7 @@ class _Skeleton:
         behind = self.children(name)
         if name in self.masters:
             return True
-        if _has(name, _FINGERS) and not (behind and _words(name) & (_TURNS | _ARM - {"hand"})):
+        if _has(name, _FINGERS) and not (behind and _name_parts(name) & (_TURNS | _ARM - {"hand"})):
             return True
         if behind:
             return False
@@ -258,7 +258,7 @@ def _named(limbs: Sequence[GroupGuess]) -> tuple[GroupGuess, ...]:
     return tuple(replace(limb, name=name) for limb, name in zip(ordered, names, strict=True))
 
 
-def _words(name: str) -> set[str]:
+def _name_parts(name: str) -> set[str]:
     return {word.lower() for word in _WORD.findall(name)}
 
 
@@ -267,7 +267,7 @@ def _has(name: str, parts: Iterable[str]) -> bool:
 
 
 def _kind_of(name: str) -> Kind | None:
-    words = _words(name)
+    words = _name_parts(name)
     return next((kind for kind, telling in _WORDS if words & telling), None)
 
 
@@ -281,9 +281,9 @@ def _kind(joints: Sequence[str]) -> Kind | None:
 def _side(tree: Urdf, joints: Sequence[str]) -> str:
     """Return the side that the names of most joints, or else of their child links, indicate."""
     for names in (joints, [tree.joint(name).child for name in joints]):
-        told = np.array([[bool(_words(name) & words) for words in _SIDES.values()] for name in names]).sum(
-            axis=0
-        )
+        told = np.array(
+            [[bool(_name_parts(name) & words) for words in _SIDES.values()] for name in names]
+        ).sum(axis=0)
         if told.max() * 2 > len(names) and told[0] != told[1]:
             return list(_SIDES)[int(told.argmax())]
     return ""

@@ -47,7 +47,7 @@ class Jpegs:
         return self._pictures == 1 and self._head.startswith(_BEGIN)
 
     @property
-    def is_other(self) -> bool:
+    def is_not_mjpeg(self) -> bool:
         """True if more bytes than headers came since the last whole picture, and none was a picture."""
         return self._beside > _SHORTEST
 

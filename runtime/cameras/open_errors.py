@@ -68,7 +68,7 @@ def ended(address: Address, single: bool, stated: str) -> str:
     return _no_video(EOFError(), address)
 
 
-def others(allowed: float, stated: str) -> str:
+def undecodable_text(allowed: float, stated: str) -> str:
     """Return one clause about data that was not a picture for `allowed` [s]; `stated` is its declared content type."""
     kind = f": parts of type {stated}, no JPEG" if _is_other(stated) else ""
     return f"what it sent for {allowed:g} s cannot be decoded{kind}"
@@ -99,7 +99,7 @@ def _device(error: Exception, address: Address) -> str:
 def _no_video(error: Exception, address: Address) -> str:
     """Return one clause about a host that is unknown, or responds without a video."""
     parts = urlsplit(address.shown)
-    if parts.scheme in ("rtsp", "rtsps", "http", "https") and not _known(parts.hostname or ""):
+    if parts.scheme in ("rtsp", "rtsps", "http", "https") and not _resolves(parts.hostname or ""):
         return f"the host {parts.hostname} is not known"
     if parts.scheme in ("rtsp", "rtsps"):
         return "what answers there is no RTSP server with a video"
@@ -111,7 +111,7 @@ def _no_video(error: Exception, address: Address) -> str:
     return f"not a video: {getattr(error, 'strerror', '') or type(error).__name__}"
 
 
-def _known(host: str) -> bool:
+def _resolves(host: str) -> bool:
     try:
         socket.getaddrinfo(host, None)
     except (OSError, UnicodeError):

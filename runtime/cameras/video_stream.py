@@ -12,7 +12,7 @@ import numpy as np
 
 from runtime.cameras.base import Address, CameraError
 from runtime.cameras.jpegs import Jpegs
-from runtime.cameras.open_errors import ended, explain_open_error, others
+from runtime.cameras.open_errors import ended, explain_open_error, undecodable_text
 from runtime.core.picture_bounds import DECODING, TooLargeError, bound, require_size
 from runtime.core.types import UInt8
 
@@ -149,7 +149,9 @@ class VideoStream:
                 yield frame
                 since = time.monotonic()
             if time.monotonic() - since > self._allowed:
-                raise CameraError(others(self._allowed, "" if self._jpegs is None else self._jpegs.stated))
+                raise CameraError(
+                    undecodable_text(self._allowed, "" if self._jpegs is None else self._jpegs.stated)
+                )
 
     @property
     def _is_still(self) -> bool:
@@ -197,8 +199,8 @@ class VideoStream:
                 yield av.Packet(picture)
                 since = time.monotonic()
             if time.monotonic() - since > self._allowed:
-                if jpegs.is_other:
-                    raise CameraError(others(self._allowed, jpegs.stated))
+                if jpegs.is_not_mjpeg:
+                    raise CameraError(undecodable_text(self._allowed, jpegs.stated))
                 raise CameraError(f"mute: it sent no picture within {self._allowed:g} s")
 
     def _rgb(self, frame: Any) -> UInt8:

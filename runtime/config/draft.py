@@ -91,7 +91,7 @@ def _about(part: str, kind: str) -> str:
 def _entries(model: type[BaseModel]) -> Iterator[Entry]:
     properties = model.model_json_schema()["properties"]
     for name, field in own_first(model):
-        schema = _given(properties[name])
+        schema = _non_null_schema(properties[name])
         choices = tuple(json.dumps(value) for value in schema.get("enum", ()))
         scalar = "choice" if choices else _SCALARS.get(str(schema.get("type")), "")
         if name != "kind" and scalar:
@@ -99,7 +99,7 @@ def _entries(model: type[BaseModel]) -> Iterator[Entry]:
             yield Entry(name, scalar, choices, default, field.is_required(), meaning(model, name, field))
 
 
-def _given(schema: Mapping[str, Any]) -> Mapping[str, Any]:
+def _non_null_schema(schema: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the schema of a key that may also be null, without the null."""
     parts = [part for part in schema.get("anyOf", ()) if part.get("type") != "null"]
     return parts[0] if len(parts) == 1 else schema

@@ -82,7 +82,7 @@ def fixed(id: str, english: str) -> Sentence:
     return Pattern(id, english)()
 
 
-def known() -> Iterator[Pattern]:
+def declared_patterns() -> Iterator[Pattern]:
     """Return the patterns of all imported modules, sorted by id."""
     return (_KNOWN[id] for id in sorted(_KNOWN))
 
@@ -114,7 +114,10 @@ def identity(text: str) -> dict[str, Any]:
     """Return id and arguments of a sentence in wire form; "" and {} for another text."""
     if not isinstance(text, Sentence):
         return {"id": "", "arguments": {}}
-    return {"id": text.id, "arguments": {name: _told(value) for name, value in text.arguments.items()}}
+    return {
+        "id": text.id,
+        "arguments": {name: _argument_to_wire(value) for name, value in text.arguments.items()},
+    }
 
 
 def rewritten(text: str, change: Callable[[str], str]) -> str:
@@ -139,7 +142,7 @@ def shows(text: str, arguments: Mapping[str, Any]) -> bool:
     return True
 
 
-def told(text: str) -> dict[str, Any]:
+def to_wire(text: str) -> dict[str, Any]:
     """Return a sentence in wire form: {"id", "arguments", "text"}."""
     return {**identity(text), "text": plain(text)}
 
@@ -162,7 +165,7 @@ def _texts(tree: object, path: str) -> Iterator[tuple[str, str]]:
             yield from _texts(value, f"{path}.{key}" if path else str(key))
 
 
-def heard(text: str, id: object, arguments: object, depth: int = 0) -> str:
+def from_wire(text: str, id: object, arguments: object, depth: int = 0) -> str:
     """Return a text from another process, as a Sentence if it has an id.
 
     Raises:
@@ -174,7 +177,9 @@ def heard(text: str, id: object, arguments: object, depth: int = 0) -> str:
         raise ValueError(f"id = {id!r:.120}; expected words of a-z, 0-9 and _ with dots between them")
     if not isinstance(arguments, Mapping) or len(arguments) > _MOST or depth >= _DEEPEST:
         raise ValueError(f"arguments of {id} are no map of at most {_MOST}, {_DEEPEST} deep")
-    return Sentence(plain(text), id, {_name(name): _heard(of, depth) for name, of in arguments.items()})
+    return Sentence(
+        plain(text), id, {_name(name): _argument_from_wire(of, depth) for name, of in arguments.items()}
+    )
 
 
 def checked(said: object) -> dict[str, dict[str, Any]]:
@@ -191,7 +196,7 @@ def checked_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _checked(said: Mapping[str, Any]) -> dict[str, Any]:
     try:
-        text = heard("", said.get("id", ""), said.get("arguments"))
+        text = from_wire("", said.get("id", ""), said.get("arguments"))
     except ValueError:
         return {}
     return identity(text) if isinstance(text, Sentence) else {}
@@ -203,12 +208,12 @@ def _name(name: object) -> str:
     return name
 
 
-def _heard(value: object, depth: int) -> Argument:
+def _argument_from_wire(value: object, depth: int) -> Argument:
     if isinstance(value, Mapping):
         text = value.get("text")
         if not isinstance(text, str):
             raise ValueError(f"an argument's text is {text!r:.80}; expected a str")
-        return heard(text, value.get("id"), value.get("arguments"), depth + 1)
+        return from_wire(text, value.get("id"), value.get("arguments"), depth + 1)
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise ValueError(f"argument {value!r:.80}; expected a number, a str or a sentence")
     if isinstance(value, float) and not isfinite(value):
@@ -216,8 +221,8 @@ def _heard(value: object, depth: int) -> Argument:
     return value
 
 
-def _told(value: Argument) -> Argument | dict[str, Any]:
-    return told(value) if isinstance(value, Sentence) else value
+def _argument_to_wire(value: Argument) -> Argument | dict[str, Any]:
+    return to_wire(value) if isinstance(value, Sentence) else value
 
 
 def _argument(value: object) -> Argument:

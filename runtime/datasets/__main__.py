@@ -140,7 +140,7 @@ def _publish(options: argparse.Namespace) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    return _say(
+    return _print_result(
         operations.convert(
             options.dataset,
             options.to,
@@ -161,7 +161,9 @@ def renamed(pairs: Sequence[str]) -> dict[str, str]:
 
 
 def _merge(options: argparse.Namespace) -> int:
-    return _say(operations.merge(options.datasets, options.to, options.version, reencode=options.reencode))
+    return _print_result(
+        operations.merge(options.datasets, options.to, options.version, reencode=options.reencode)
+    )
 
 
 def _split(options: argparse.Namespace) -> int:
@@ -172,11 +174,13 @@ def _split(options: argparse.Namespace) -> int:
             raise RecordingError(f"{part!r}: expected NAME=EPISODES, with a name of its own for a folder")
         targets[options.to / name] = episodes(which)
     done = operations.split(options.dataset, targets, options.version, reencode=options.reencode)
-    return max(_say(one) for one in done)
+    return max(_print_result(one) for one in done)
 
 
 def _delete(options: argparse.Namespace) -> int:
-    return _say(operations.delete(options.dataset, episodes(options.episodes), reencode=options.reencode))
+    return _print_result(
+        operations.delete(options.dataset, episodes(options.episodes), reencode=options.reencode)
+    )
 
 
 def _repair(options: argparse.Namespace) -> int:
@@ -215,7 +219,7 @@ def is_index(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
-def _say(done: AssemblyResult) -> int:
+def _print_result(done: AssemblyResult) -> int:
     print(f"written: {done.dataset}, {done.version}, {done.episodes} episodes, {done.frames} frames")
     for video in done.encoded:
         print(f"coded again: {video}")
@@ -229,11 +233,11 @@ def _report(dataset: Path, problems: list[str]) -> int:
         print(problem)
     if not problems:
         print(f"{dataset} is whole")
-        print("\n".join(_told(layout.read_info(dataset))))
+        print("\n".join(_describe_features(layout.read_info(dataset))))
     return 1 if problems else 0
 
 
-def _told(info: layout.Info) -> list[str]:
+def _describe_features(info: layout.Info) -> list[str]:
     """Inputs and outputs of a policy as training code takes them: LeRobot goes by how names begin."""
     names = {
         "inputs": [key for key in info["features"] if key.startswith("observation")],

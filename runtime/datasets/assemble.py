@@ -26,7 +26,7 @@ from runtime.datasets.features import (
     feature_differences,
     figure_shapes,
     holds_nothing,
-    other_shape,
+    shape_problem,
     stored_features,
 )
 from runtime.datasets.layout import Line
@@ -42,7 +42,7 @@ from runtime.datasets.video_segments import (
     NotCopyableError,
     copy_segment,
     encode_segment,
-    other_streams,
+    extra_stream_kinds,
 )
 from runtime.recording.files import disk_error
 
@@ -259,7 +259,7 @@ class _Assembly:
                             found.setdefault(name, []).append(place)
         return written(found)
 
-    def _told(self, lines: Sequence[Line]) -> list[Line]:
+    def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
         """The lines of the list of episodes, with those of the sources' own keys that can be written."""
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]
@@ -294,7 +294,7 @@ class _Assembly:
                 self._sides(part, str(told["uuid"]))
             first += line["length"]
         tasks = tuple({"task_index": number, "task": task} for number, task in enumerate(self._tasks))
-        listed = tuple(self._told(lines))
+        listed = tuple(self._episode_lines(lines))
         catalog = Catalog(self._root, self._info, listed, tasks, tuple(statistics), tuple(eva))
         catalog = replace(catalog, info={**self._info, **catalog.totals(), "splits": self._splits()})
         try:
@@ -307,7 +307,7 @@ class _Assembly:
             path = self._root / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
-        self._others() if self._copying else self._carry(self._sources[0])
+        self._copy_other_files() if self._copying else self._carry(self._sources[0])
         return AssemblyResult(
             self._root,
             catalog.version,
@@ -327,7 +327,7 @@ class _Assembly:
         table = self._table(part, line, first)
         placed.data.parent.mkdir(parents=True, exist_ok=True)
         write_table(table, placed.data)
-        statistics = self._given(part)
+        statistics = self._source_statistics(part)
         for key, span in placed.videos.items():
             span.path.parent.mkdir(parents=True, exist_ok=True)
             self._video(part, key, span.path, placed.length)
@@ -340,14 +340,14 @@ class _Assembly:
                 if made is not None:
                     statistics[key] = made
         if self._info["codebase_version"] == layout.V21:
-            statistics |= {key: _of_three(statistics[key]) for key in self._shown if key in statistics}
+            statistics |= {key: _of_three(statistics[key]) for key in self._video_keys if key in statistics}
         return statistics | _fill_statistics(statistics, self._computed(part, table))
 
     @property
-    def _shown(self) -> list[str]:
+    def _video_keys(self) -> list[str]:
         return [*layout.video_keys(self._features), *layout.image_keys(self._features)]
 
-    def _given(self, part: EpisodeRef) -> dict[str, Statistic]:
+    def _source_statistics(self, part: EpisodeRef) -> dict[str, Statistic]:
         """The source's statistics of an episode, but for those that are made anew."""
         found = {}
         for key, statistic in part.source.statistics.get(part.index, {}).items():
@@ -365,7 +365,7 @@ class _Assembly:
         for key, feature in stored_features(self._features).items():
             if feature["dtype"] in WORDS:
                 continue
-            if wrong := other_shape(key, feature, row_shape(table, key)):
+            if wrong := shape_problem(key, feature, row_shape(table, key)):
                 raise RecordingError(f"{part.source.dataset.root}, episode {part.index}: {wrong}")
             rows = column_array(table, key, math.prod(feature["shape"]))
             columns[key] = rows.reshape(table.num_rows, *feature["shape"])
@@ -452,7 +452,7 @@ class _Assembly:
                 ) from error
             encode_segment(span, target, frames, self._fps)
             self._encoded.append(f"{key} of episode {part.index} of {part.source.dataset.root}")
-        for kind in sorted(other_streams(span.path) - other_streams(target)):
+        for kind in sorted(extra_stream_kinds(span.path) - extra_stream_kinds(target)):
             self._left_out[f"{kind} of {span.path}: the video is written without it"] = None
 
     def _sides(self, part: EpisodeRef, uuid: str) -> None:
@@ -461,7 +461,7 @@ class _Assembly:
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
 
-    def _others(self) -> None:
+    def _copy_other_files(self) -> None:
         """Take along files of no episode and not of the format, from a single source only; report others."""
         for source in self._sources:
             root = source.dataset.root

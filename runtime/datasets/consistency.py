@@ -29,8 +29,8 @@ from runtime.datasets.features import (
     holds_nothing,
     is_depth,
     is_language,
-    other_shape,
     picture_size,
+    shape_problem,
     stored_features,
 )
 from runtime.datasets.rows import column_array, read_rows, row_shape
@@ -67,14 +67,14 @@ def check(dataset: Path) -> list[str]:
 
 def check_with_remarks(dataset: Path) -> CheckResult:
     """As `check`, with what is only to be said."""
-    said = _said(Path(dataset))
+    said = _problems(Path(dataset))
     return CheckResult(
         [one for one in said if not isinstance(one, _Remark)],
         [str(one) for one in said if isinstance(one, _Remark)],
     )
 
 
-def _said(root: Path) -> list[str]:
+def _problems(root: Path) -> list[str]:
     try:
         info = layout.read_info(root)
         v30 = info["codebase_version"] == layout.V30
@@ -248,7 +248,7 @@ def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
             continue
         try:
             values = column_array(table, key)
-            wrong = other_shape(key, feature, row_shape(table, key))
+            wrong = shape_problem(key, feature, row_shape(table, key))
         except RecordingError as error:
             yield str(error)
             continue
@@ -268,7 +268,7 @@ def _stored_pictures(table: pa.Table, info: layout.Info, root: Path) -> Iterator
             yield f"{key!r} has no picture in {_rows(missing)}"
         for number in np.flatnonzero(~missing).tolist():
             try:
-                wrong = _other_size(
+                wrong = _size_problem(
                     f"picture {number} of {key!r}", pictures.size(number), info["features"][key]
                 )
             except RecordingError as error:
@@ -282,7 +282,7 @@ def _rows(marked: np.ndarray[Any, Any]) -> str:
     return f"{int(marked.sum())} rows, the first is {int(marked.argmax())}"
 
 
-def _other_size(what: str, size: tuple[int, int], feature: Mapping[str, Any]) -> str:
+def _size_problem(what: str, size: tuple[int, int], feature: Mapping[str, Any]) -> str:
     """Sentence on pictures of another height and width than declared, "" where they are the same."""
     declared = picture_size(feature)[:2]
     if size == declared:
@@ -395,7 +395,7 @@ def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str
         yield str(error)
         return
     try:
-        wrong = _other_size(repr(key), size, info["features"][key])
+        wrong = _size_problem(repr(key), size, info["features"][key])
     except RecordingError as error:
         wrong = f"{key!r}: {error}"
     if wrong:

@@ -61,7 +61,7 @@ def copy_with_uuids(
 
 def uuids_of(dataset: Path) -> dict[int, str]:
     """The uuid of each episode that has one, by index."""
-    return {int(line["episode_index"]): str(line["uuid"]) for line in _told(dataset)}
+    return {int(line["episode_index"]): str(line["uuid"]) for line in _recorded_lines(dataset)}
 
 
 def content_uuid(dataset: Dataset, index: int, place: int | None = None) -> str:
@@ -153,7 +153,7 @@ def _copy(
 
 def _name(root: Path, sources: Mapping[int, tuple[Dataset, int]] | None = None) -> None:
     """Write a line for each episode that has none; `sources`: the episode that each was copied from."""
-    dataset, told = open_dataset(root), {int(line["episode_index"]): line for line in _told(root)}
+    dataset, told = open_dataset(root), {int(line["episode_index"]): line for line in _recorded_lines(root)}
     lines = []
     for entry in dataset.episodes:
         source, index = (sources or {}).get(entry.index, (dataset, entry.index))
@@ -194,7 +194,7 @@ def _require_same(dataset: Path, target: Path, tell: ProgressCallback) -> None:
         )
 
 
-def _told(root: Path) -> list[dict[str, Any]]:
+def _recorded_lines(root: Path) -> list[dict[str, Any]]:
     lines = layout.read_lines(root / layout.EVA_EPISODES)
     strange = next((line for line in lines if not _names_episode(line)), None)
     if strange is not None:

@@ -97,7 +97,7 @@ def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
     return tuple(dict.fromkeys((shape, (math.prod(shape),))))
 
 
-def other_shape(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) -> str:
+def shape_problem(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) -> str:
     """Sentence on rows of several axes that are not as long as declared, "" where they are."""
     declared = list(feature["shape"])
     if len(declared) < 2 or not found or list(found) == declared:

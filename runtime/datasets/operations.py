@@ -62,7 +62,7 @@ def merge(
     with _locked_datasets(datasets):
         sources = [SourceDataset.open(Path(dataset)) for dataset in datasets]
         parts = [part for source in sources for part in source.episode_refs()]
-        return assemble(target, version or _kept(sources[0]), parts, reencode=reencode, tell=tell)
+        return assemble(target, version or _written_version(sources[0]), parts, reencode=reencode, tell=tell)
 
 
 def split(
@@ -85,7 +85,7 @@ def split(
         for target in wanted:
             if target.exists() and any(target.iterdir()):
                 raise RecordingError(f"{target} is there already and not empty")
-        made = version or _kept(source)
+        made = version or _written_version(source)
         done: list[AssemblyResult] = []
         try:
             for target, parts in wanted.items():
@@ -128,7 +128,7 @@ def delete(
         left: list[EpisodeRef] = [part for part in source.episode_refs() if part.index not in gone]
         if not gone:
             raise RecordingError(f"no episodes of {root} to delete")
-        return assemble(root, _kept(source), left, reencode=reencode, replacing=True, tell=tell)
+        return assemble(root, _written_version(source), left, reencode=reencode, replacing=True, tell=tell)
 
 
 def fingerprint(dataset: Path) -> str:
@@ -158,7 +158,7 @@ def _require_dataset(root: Path) -> None:
         raise RecordingError(f"there is no dataset folder {root}")
 
 
-def _kept(source: SourceDataset) -> str:
+def _written_version(source: SourceDataset) -> str:
     """The version of a dataset, or the one that v2.0 is written as."""
     version = source.dataset.version
     return version if version in layout.WRITABLE_VERSIONS else layout.DEFAULT_VERSION

@@ -205,7 +205,7 @@ class VideoFrames(ImageSequence):
                 continue
             number = bisect_left(self._times, frame.pts)
             if number < len(self._times) and self._times[number] == frame.pts:
-                self._keep(number, frame)
+                self._store(number, frame)
                 self._upcoming = number + 1
             if frame.pts == self._times[index]:
                 return frame
@@ -214,7 +214,7 @@ class VideoFrames(ImageSequence):
         self._upcoming = None
         raise RecordingError(f"{self._path}, frame {index} is listed but does not decode")
 
-    def _keep(self, number: int, frame: av.VideoFrame) -> None:
+    def _store(self, number: int, frame: av.VideoFrame) -> None:
         self._kept.pop(number, None)
         self._kept[number] = frame
         room = max(2, KEPT_BYTES // (frame.width * frame.height * 3 // 2))
@@ -253,7 +253,7 @@ def stored_row(found: object) -> Mapping[str, Any] | None:
     return {"bytes": None, "path": found} if isinstance(found, str) else None
 
 
-def shown(image: Image.Image) -> UInt8:
+def to_rgb(image: Image.Image) -> UInt8:
     """An open picture as RGB uint8 [H, W, 3]; one of depth in shades of grey, its most distant point white."""
     depth = _depth(image)
     if depth is None:
@@ -287,7 +287,7 @@ class StoredImages(ImageSequence):
         if not 0 <= index < len(self._rows):
             raise IndexError(f"{self._name} has pictures 0 to {len(self) - 1}, asked for {index}")
         with self._opened(index) as image:
-            picture = shown(image)
+            picture = to_rgb(image)
         picture.flags.writeable = False
         return picture
 

@@ -78,7 +78,7 @@ def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
         raise RecordingError(f"{span.path} cannot be coded again: {error}") from error
 
 
-def other_streams(path: Path) -> set[str]:
+def extra_stream_kinds(path: Path) -> set[str]:
     """Kinds of what a video file holds beside its pictures."""
     with open_video(path) as container:
         return {stream.type for stream in container.streams} - {"video"}

@@ -16,7 +16,7 @@ class Bell:
         self._poll.register(descriptor, select.POLLIN)
 
     @classmethod
-    def made(cls) -> Bell:
+    def create(cls) -> Bell:
         """Create a new bell."""
         return cls(os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC))
 

@@ -23,7 +23,7 @@ from runtime.core.msgpack_arrays import pack, unpack
 from runtime.core.sentences import Pattern
 from runtime.ipc.endpoints import LOOK_S, Endpoints, account_name, file_identity, new_socket_path
 from runtime.ipc.identity import Key
-from runtime.ipc.messages import Ack, Command, Event, decode, encode, told_by
+from runtime.ipc.messages import Ack, Command, Event, decode, encode, sentence_fields
 from runtime.ipc.readable import readable
 
 _TOO_MANY = Pattern(
@@ -351,7 +351,7 @@ class Publisher(Listener):
         super().__init__(context, zmq.XPUB, station_dir, name, high_water, high_water)
         self.topics: set[str] = set()  # prefixes of streams that have a subscriber
 
-    def hear(self) -> list[str]:
+    def poll_subscriptions(self) -> list[str]:
         """Process subscriptions; return the topics without a subscriber before."""
         begun = []
         with suppress(zmq.Again):
@@ -365,7 +365,7 @@ class Publisher(Listener):
                     self.topics.discard(topic)
         return begun
 
-    def wanted(self, stream: str) -> bool:
+    def has_subscriber(self, stream: str) -> bool:
         """Return True if `stream` has a subscriber, as of the last `hear`."""
         return any(stream.startswith(topic) for topic in self.topics)
 
@@ -434,7 +434,7 @@ class EventLog:
             "wall": time.time(),
             "step": event.step,
             "data": dict(event.data),
-            **told_by(event),
+            **sentence_fields(event),
         }
         self._events.append(row)
         return row

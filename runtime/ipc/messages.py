@@ -28,7 +28,7 @@ def _complete(message: Any, name: str) -> None:
     """Complete a message's sentence: fill `id` and `arguments` from it, or rebuild it from a received id."""
     text = getattr(message, name)
     if not isinstance(text, sentences.Sentence):
-        text = sentences.heard(text, message.id, message.arguments)
+        text = sentences.from_wire(text, message.id, message.arguments)
         object.__setattr__(message, name, text)
     for part, value in sentences.identity(text).items():
         object.__setattr__(message, part, value)
@@ -474,10 +474,10 @@ def event_row(event: Event) -> dict[str, Any]:
         "time": event.time,
         "step": event.step,
         "data": dict(event.data),
-        **told_by(event),
+        **sentence_fields(event),
     }
 
 
-def told_by(message: Event | Ack) -> dict[str, Any]:
+def sentence_fields(message: Event | Ack) -> dict[str, Any]:
     """Return id and arguments of a message's sentence, for a row that contains its text; {} without an id."""
     return {"id": message.id, "arguments": message.arguments} if message.id else {}

@@ -100,12 +100,12 @@ class Record:
         for _ in range(100):
             version = self.version
             if version == 0:
-                return _only(np.zeros(1, self._dtype))
+                return _single_record(np.zeros(1, self._dtype))
             start = self._offset + _ALIGN + (version & 1) * self._slot
             checksum = self._memory[start : start + 4]
             payload = self._memory[start + 4 : start + 4 + self._dtype.itemsize]
             if _checksum(payload, version) == checksum:
-                return _only(np.frombuffer(payload, self._dtype))
+                return _single_record(np.frombuffer(payload, self._dtype))
         raise TornReadError(f"record at offset {self._offset} could not be read in 100 tries")
 
 
@@ -113,7 +113,7 @@ def _checksum(payload: bytes, version: int) -> bytes:
     return zlib.crc32(payload, version & 0xFFFFFFFF).to_bytes(4, "little")
 
 
-def _only(records: np.ndarray[Any, np.dtype[np.void]]) -> np.void:
+def _single_record(records: np.ndarray[Any, np.dtype[np.void]]) -> np.void:
     record: np.void = records[0]
     return record
 

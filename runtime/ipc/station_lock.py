@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import IO
 
 
-class Taken(Exception):
+class StationLockedError(Exception):
     """Another process has locked the folder; `by` is its description in the lock file."""
 
     def __init__(self, by: str) -> None:
@@ -16,7 +16,7 @@ class Taken(Exception):
         super().__init__(f"process {by} has it")
 
 
-def take(station_dir: Path, what: str = "") -> IO[str]:
+def acquire(station_dir: Path, what: str = "") -> IO[str]:
     """Lock the folder; the lock lasts as long as the returned file is open.
 
     `what` is written after the process number.
@@ -33,7 +33,7 @@ def take(station_dir: Path, what: str = "") -> IO[str]:
         lock.seek(0)
         by = lock.read().strip() or "?"
         lock.close()
-        raise Taken(by) from None
+        raise StationLockedError(by) from None
     lock.truncate(0)
     os.write(lock.fileno(), f"{os.getpid()}{what}".encode())
     return lock

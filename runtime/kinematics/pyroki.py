@@ -92,12 +92,12 @@ class PyrokiKinematics(Kinematics):
         low = np.repeat(self._robot.lower[None], len(targets), axis=0)
         high = np.repeat(self._robot.upper[None], len(targets), axis=0)
         for index, arm in enumerate(self._arms):
-            asked = _Asked(targets[:, index], seed, dt, anchor, anchor_row)
+            asked = _ArmTask(targets[:, index], seed, dt, anchor, anchor_row)
             q[:, arm.dims], low[:, arm.dims], high[:, arm.dims] = arm.follow(asked)
         return evaluate_solution(self._robot, self._config, q, targets, (low, high))
 
 
-class _Asked(NamedTuple):
+class _ArmTask(NamedTuple):
     """One arm's part of a chunk: poses [T, 7] in its frame, and the bounds of its rows."""
 
     targets: Float64
@@ -119,7 +119,7 @@ class _Arm:
         self._described = _robot_of(libraries, robot, group)
         self._scan = _scan_of(libraries, config)
 
-    def follow(self, asked: _Asked) -> tuple[Float64, Float64, Float64]:
+    def follow(self, asked: _ArmTask) -> tuple[Float64, Float64, Float64]:
         """Return joints [T, n], and the lower and upper bounds of each row."""
         rows = len(asked.targets)
         goals = np.linalg.inv(self._group.carried(asked.seed)) @ transform_of(_unit(asked.targets))
@@ -144,7 +144,7 @@ class _Arm:
         low, high = np.maximum(low, self._lower), np.minimum(high, self._upper)
         return self._cut(q, asked, steps[:rows], held), low, high
 
-    def _bounds(self, asked: _Asked, rows: int) -> tuple[Float64, Float64]:
+    def _bounds(self, asked: _ArmTask, rows: int) -> tuple[Float64, Float64]:
         """Return the joints before the anchor's row [n], and each row's largest step from its predecessor [rows, n]."""
         steps = np.full((rows, len(self.dims)), np.inf)
         held = (asked.seed if asked.anchor is None else np.asarray(asked.anchor, np.float64))[self.dims]
@@ -153,7 +153,7 @@ class _Arm:
             steps[first:] = self._speed * asked.dt
         return held, steps
 
-    def _cut(self, q: Float64, asked: _Asked, steps: Float64, held: Float64) -> Float64:
+    def _cut(self, q: Float64, asked: _ArmTask, steps: Float64, held: Float64) -> Float64:
         """Return the rows [T, n] clipped to limits and velocities in float64."""
         cut = np.clip(q, self._lower, self._upper)
         for row in range(len(cut)):

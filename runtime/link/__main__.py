@@ -62,7 +62,7 @@ def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
         )
         told = Telling(Endpoints(station_dir), lab.lab)
         while not ended() and not link.failed.wait(_LOOK_S) and _written(data, station_dir) == written:
-            told.look(link.trouble)
+            told.update(link.problem)
         link.end()
         told.end()
         if link.failed.is_set():

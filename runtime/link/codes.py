@@ -25,7 +25,7 @@ class Code:
     lab: bytes
     secret: bytes
 
-    def shown(self) -> str:
+    def text(self) -> str:
         """As people copy it: nine groups of letters and digits."""
         whole = self.lab + self.secret
         letters = base64.b32encode(whole + _sum(whole)).decode()

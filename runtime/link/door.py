@@ -76,7 +76,7 @@ class Arrival:
 
 
 @dataclass(slots=True)
-class _Known:
+class _PeerIndex:
     by_descriptor: dict[int, Peer] = field(default_factory=dict)
     by_route: dict[bytes, Peer] = field(default_factory=dict)
 
@@ -99,7 +99,7 @@ class Door:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._clock, self._rate, self._allowed = clock, rate, allowed
-        self._known = _Known()
+        self._known = _PeerIndex()
         self._seldom = Seldom(clock)
         self._looked = self._watched = clock()
         self._parts: list[zmq.Frame] = []  # of a message that is not read to its end
@@ -186,7 +186,7 @@ class Door:
         if self._seldom.due(peer.key or str(peer)):
             log.warning("%s is cut off: %s", peer, why)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Cut off who floods, says nothing, or is one too many; time and again."""
         now = self._clock()
         for peer in [one for one in self._known.by_descriptor.values() if now >= one.cut_at]:

@@ -33,7 +33,7 @@ class Enrolling:
         self._ended = False
         threading.Thread(target=self._work, name="enrolment", daemon=True).start()
 
-    def ask(self, route: bytes, address: str, key: str, enrol: Enrol) -> str:
+    def request(self, route: bytes, address: str, key: str, enrol: Enrol) -> str:
         """Have it looked at; or why it is not."""
         now = self._clock()
         self._tries = [one for one in self._tries if now - one[0] < _WITHIN_S]

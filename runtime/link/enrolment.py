@@ -13,7 +13,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from runtime.core.errors import CodecError, ConfigurationError, TransportError
 from runtime.link.codes import Code
-from runtime.link.key_files import KeyPair, KnownLab, keep_lab
+from runtime.link.key_files import KeyPair, KnownLab, save_lab
 from runtime.link.line import dialled, ended
 from runtime.link.release import version
 from runtime.link.wire import RELEASE, Bye, Enrol, Enrolled, read, write
@@ -44,10 +44,10 @@ def enrol(data: Path, address: str, code: Code, key: KeyPair, timeout: float = 1
     context: zmq.Context[Any] = zmq.Context()
     heard_by = time.monotonic() + _HEARD_S
     try:
-        answer = _asked(context, f"tcp://{shown}:{port}", code, key, timeout)
+        answer = _exchange(context, f"tcp://{shown}:{port}", code, key, timeout)
         while answer == _NOT_OPEN and time.monotonic() < heard_by:
             time.sleep(_AGAIN_S)
-            answer = _asked(context, f"tcp://{shown}:{port}", code, key, timeout)
+            answer = _exchange(context, f"tcp://{shown}:{port}", code, key, timeout)
     finally:
         context.destroy(linger=0)
     if isinstance(answer, Bye):
@@ -59,11 +59,11 @@ def enrol(data: Path, address: str, code: Code, key: KeyPair, timeout: float = 1
     lab = KnownLab(
         answer.station, answer.lab, host, port, answer.second_port, code.lab.hex(), answer.tokens.hex()
     )
-    keep_lab(data / "stations" / answer.station, lab)
+    save_lab(data / "stations" / answer.station, lab)
     return lab
 
 
-def _asked(
+def _exchange(
     context: zmq.Context[Any], endpoint: str, code: Code, key: KeyPair, timeout: float
 ) -> Enrolled | Bye:
     dealer, monitor = dialled(context, endpoint, code.lab, key)

@@ -25,9 +25,9 @@ from runtime.link.enrolling import Enroller, Enrolling
 from runtime.link.incoming import Incoming
 from runtime.link.key_files import KeyPair
 from runtime.link.lab_streams import LabStreams
-from runtime.link.mirror import STOPPING, Mirror, MirrorTaken
+from runtime.link.mirror import STOPPING, Mirror, MirrorLockedError
 from runtime.link.release import version
-from runtime.link.remote import Held, Line, Pending, Remote
+from runtime.link.remote import Line, Pending, PendingPress, Remote
 from runtime.link.tokens import Signer
 from runtime.link.wire import (
     COMMANDS,
@@ -104,7 +104,7 @@ class Gate:
             raise TransportError("streams of stations elsewhere have ended: see the log above")
         for remote in self._remotes.values():
             self._press(remote)
-        heard = {self._heard(arrival) for arrival in self._door.arrivals()}
+        heard = {self._handle_safely(arrival) for arrival in self._door.arrivals()}
         for remote in [
             self._remotes[name] for name in heard if name
         ]:  # once all is heard that has come meanwhile
@@ -116,7 +116,7 @@ class Gate:
         self._lose(self._door.gone)
         if (now := self._clock()) - self._looked >= _LOOK_S:
             self._looked = now
-            self._look(now)
+            self._poll(now)
 
     def close(self) -> None:
         """End it: no station is linked any more."""
@@ -155,7 +155,7 @@ class Gate:
         presses, others = mirror.estop_turns.take_turn()
         for call, command in presses:
             payload, verified = _payload(mirror, call, command)
-            held = Held(call, command, payload, verified, self._clock())
+            held = PendingPress(call, command, payload, verified, self._clock())
             if not self._pass_press(remote, held):
                 remote.held.append(held)
                 if len(remote.held) > _MOST_HELD:
@@ -172,7 +172,7 @@ class Gate:
         for asked in (*urgent, *others):
             self._pass_command(remote, asked, (COORDINATOR, "commands"), server)
 
-    def _pass_press(self, remote: Remote, held: Held) -> bool:
+    def _pass_press(self, remote: Remote, held: PendingPress) -> bool:
         """Send a press over whichever connection lives; False where none does."""
         now = self._clock()
         line = remote.line(STOPS, now) or remote.line(COMMANDS, now)
@@ -221,16 +221,16 @@ class Gate:
 
     # --- what stations say -------------------------------------------------------------------------------------
 
-    def _heard(self, arrival: Arrival) -> str:
+    def _handle_safely(self, arrival: Arrival) -> str:
         """As `_hear`; what nobody foresaw costs its sender the connection, and no other station its link."""
         try:
-            return self._hear(arrival)
+            return self._handle(arrival)
         except Exception:
             log.exception("what a station's computer says cannot be taken up")
             self._door.cut(arrival.route, "the lab cannot take up what it said: see the log of its gate")
             return ""
 
-    def _hear(self, arrival: Arrival) -> str:
+    def _handle(self, arrival: Arrival) -> str:
         """Take up what came; the name of the station that lives, "" where none is known by it."""
         message = arrival.message
         known = self._by_route.get(arrival.route)
@@ -264,7 +264,7 @@ class Gate:
         pending.server.answer(pending.call, _failed(remote, pending.command, reason))
 
     def _greet(self, arrival: Arrival, hello: Hello) -> None:
-        remote = self._known(hello.station)
+        remote = self._find_remote(hello.station)
         if remote is None or not self._allowed.now.may_be(arrival.key, hello.station):
             self._door.cut(arrival.route, f"{hello.station!r:.80} is not known here with this key")
             return
@@ -291,7 +291,7 @@ class Gate:
 
     def _enrol(self, arrival: Arrival, enrol: Enrol) -> None:
         refusal = apart(enrol.release, enrol.version, "the station", lab_side=True)
-        refusal = refusal or self._enrolling.ask(
+        refusal = refusal or self._enrolling.request(
             arrival.route, self._door.address_of(arrival.route), arrival.key, enrol
         )
         if refusal:
@@ -307,12 +307,12 @@ class Gate:
 
     # --- what changes ------------------------------------------------------------------------------------------
 
-    def _look(self, now: float) -> None:
+    def _poll(self, now: float) -> None:
         """Who is allowed, who lives, what waits too long."""
-        self._door.look()
+        self._door.poll()
         names = self._allowed.now.names()
         for name in names:
-            self._known(name)
+            self._find_remote(name)
         for name in self._remotes.keys() - names:
             self._forget(self._remotes.pop(name))
         for remote in self._remotes.values():
@@ -324,11 +324,11 @@ class Gate:
             for number in [one for one, pending in remote.pending.items() if now >= pending.until]:
                 del remote.pending[number]
             if remote.mirror is not None:
-                remote.mirror.look()
+                remote.mirror.poll()
                 if (streams := self._streams.places.get(remote.name)) is not None:
                     remote.mirror.moved_streams(streams)
 
-    def _known(self, name: str) -> Remote | None:
+    def _find_remote(self, name: str) -> Remote | None:
         """What is known of a station that is enrolled; None where it is not."""
         if name not in self._remotes and name in self._allowed.now.names():
             self._remotes[name] = Remote(name)
@@ -347,9 +347,9 @@ class Gate:
         remote.tried_at = self._clock()
         try:
             remote.mirror = Mirror(self._context, self._stations / remote.name)
-        except (MirrorTaken, TransportError) as error:
+        except (MirrorLockedError, TransportError) as error:
             remote.refusal = str(error)
-            self._say_once(remote, f"{remote.name} cannot be linked: {error}")
+            self._log_once(remote, f"{remote.name} cannot be linked: {error}")
             return False
         remote.mirror.lower("its computer has not connected yet")
         self._streams.serve(remote.name, remote.mirror.station_dir)
@@ -371,10 +371,10 @@ class Gate:
             try:
                 remote.mirror.raise_up(streams)
             except (TransportError, zmq.ZMQError) as error:
-                self._say_once(remote, f"{remote.name} cannot be linked: {error}")
+                self._log_once(remote, f"{remote.name} cannot be linked: {error}")
                 return
             remote.up = True
-            self._say_once(remote, f"{remote.name} is linked")
+            self._log_once(remote, f"{remote.name} is linked")
         elif not up and remote.up:
             self._hold(remote)
             self._lower(remote, _NOT_RUNNING if lives else _LOST)
@@ -398,7 +398,7 @@ class Gate:
         """Let the lab's programs know why the station cannot be commanded."""
         if remote.told != why and remote.mirror is not None:
             remote.mirror.lower(why)
-            self._say_once(remote, why)
+            self._log_once(remote, why)
 
     def _hold_on(self, remote: Remote, now: float) -> None:
         """Tell who presses that the link is lost; what is too old is not pressed any more."""
@@ -409,7 +409,7 @@ class Gate:
             if now - held.at > _HELD_S:
                 remote.held.remove(held)
 
-    def _give_up(self, remote: Remote, held: Held) -> None:
+    def _give_up(self, remote: Remote, held: PendingPress) -> None:
         held.told = True
         if remote.mirror is not None:
             remote.mirror.estops.answer(held.call, _not_sent(remote, held.command, held.sent))
@@ -457,7 +457,7 @@ class Gate:
         self._by_route.pop(line.route, None)
         self._door.cut(line.route, why, again_s)
 
-    def _say_once(self, remote: Remote, what: str) -> None:
+    def _log_once(self, remote: Remote, what: str) -> None:
         if remote.told != what:
             remote.told = what
             if self._seldom.due(

@@ -77,7 +77,7 @@ class Home:
 
     def next(self) -> str:
         """The newest closed episode that the lab lacks and may be offered now, else one that may go; "" for none."""
-        self._look()
+        self._poll()
         now = self._clock()
         found = [uuid for uuid in self._closed if now >= self._put_off.get(uuid, now)]
         return max(found, key=self._closed.__getitem__) if found else self._removable(now)
@@ -109,12 +109,12 @@ class Home:
             self._remove(known)
             return
         receipt = Receipt(episode, self._lab, contents.digest, contents.size, self._wall())
-        self._keep(receipt)
+        self._store_receipt(receipt)
         self._closed.pop(episode, None)
 
     def labels_arrived(self, episode: str, lines: bytes) -> None:
         """The lab has these labels."""
-        self._keep(replace(self._receipts[episode], labels=hashlib.sha256(lines).hexdigest()))
+        self._store_receipt(replace(self._receipts[episode], labels=hashlib.sha256(lines).hexdigest()))
 
     def put_off(self, what: str, seconds: float) -> None:
         """Do not offer the episode again before; nor the labels of one, as "labels UUID"."""
@@ -122,7 +122,7 @@ class Home:
 
     # --- what there is -------------------------------------------------------------------------------------------
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         now = self._clock()
         if now < self._look_at:
             return
@@ -168,7 +168,7 @@ class Home:
                 found.append(receipt)
         return found
 
-    def _keep(self, receipt: Receipt) -> None:
+    def _store_receipt(self, receipt: Receipt) -> None:
         folder = self._data / UPLOADS / self._station
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -193,7 +193,7 @@ class Home:
             if self._over(receipt) and now >= self._put_off.get(uuid, now):
                 if self.folder(uuid).is_dir():
                     return uuid
-                self._keep(replace(receipt, removed=self._wall()))  # somebody else has
+                self._store_receipt(replace(receipt, removed=self._wall()))  # somebody else has
         return ""
 
     def _remove(self, receipt: Receipt) -> None:
@@ -206,7 +206,7 @@ class Home:
             shutil.rmtree(leaving)
         except OSError as error:
             raise disk_error("removing", folder, error) from error
-        self._keep(replace(receipt, removed=self._wall()))
+        self._store_receipt(replace(receipt, removed=self._wall()))
         log.info("episode %s is removed here: the lab has it", receipt.episode)
 
     def _finish_removing(self) -> None:

@@ -26,7 +26,7 @@ from queue import Empty, SimpleQueue
 from runtime.core.errors import CodecError, RecordingError
 from runtime.link.contents import MANIFEST, Contents, File, contents_of, is_episode, unpacked
 from runtime.link.wire import PIECE, Arrived, Declined, Labels, Message, Offer, Piece, Want
-from runtime.link.yielding import give_way
+from runtime.link.yielding import lower_priority
 from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
@@ -56,11 +56,11 @@ def progress_of(data: Path, station: str, uuid: str) -> Progress | None:
     """How far an episode of that station has come; None where it was never offered, or has arrived."""
     begun = data / "episodes" / ARRIVING / station
     try:
-        why = _beside(begun, uuid, "declined").read_text("utf-8")
+        why = _temporary_path(begun, uuid, "declined").read_text("utf-8")
     except OSError:
         why = ""
     try:
-        contents = unpacked(_beside(begun, uuid, "json").read_bytes())
+        contents = unpacked(_temporary_path(begun, uuid, "json").read_bytes())
     except (OSError, CodecError):
         return Progress(0, 0, why) if why else None
     here = sum(min(_size(begun / uuid / file.name), file.size) for file in contents.files)
@@ -85,10 +85,10 @@ class Incoming:
         self._answers: SimpleQueue[tuple[bytes, Message]] = SimpleQueue()
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
-    def hear(self, station: str, route: bytes, message: Message, part: bytes) -> None:
+    def handle(self, station: str, route: bytes, message: Message, part: bytes) -> None:
         """A message about an episode has come from the station."""
         if station not in self._desks:
-            self._desks[station] = _Desk(Shelf(self._data, station, self._owner, self._reserve), self._say)
+            self._desks[station] = _Desk(Shelf(self._data, station, self._owner, self._reserve), self._send)
         self._desks[station].put(route, message, part)
 
     def left(self, station: str, route: bytes) -> None:
@@ -112,7 +112,7 @@ class Incoming:
             desk.end()
         os.close(self.wake)
 
-    def _say(self, route: bytes, message: Message) -> None:
+    def _send(self, route: bytes, message: Message) -> None:
         self._answers.put((route, message))
         os.eventfd_write(self.wake, 1)
 
@@ -135,7 +135,7 @@ class _Desk:
         self._thread.join()
 
     def _work(self) -> None:
-        give_way()
+        lower_priority()
         while (asked := self._asked.get()) is not None:
             route, message, part = asked
             if route != self._route or message is None:
@@ -149,7 +149,7 @@ class _Desk:
 
     def _answers(self, message: Message, part: bytes) -> list[Message]:
         try:
-            return list(self._shelf.take(message, part))
+            return list(self._shelf.handle(message, part))
         except Exception:
             log.exception("%s: an episode cannot be taken in", self._shelf.station)
             self._shelf.drop()
@@ -202,7 +202,7 @@ class Shelf:
         self._root = self._episodes / ARRIVING / station
         self._begun: _Begun | None = None
 
-    def take(self, message: Message, part: bytes) -> Iterator[Message]:
+    def handle(self, message: Message, part: bytes) -> Iterator[Message]:
         """The answers to a message of the station."""
         episode = getattr(message, "episode", "")
         try:
@@ -236,13 +236,13 @@ class Shelf:
         contents = unpacked(sent)
         self._require_own(episode)
         if (self._episodes / episode).exists():
-            yield self._known(episode, contents)
+            yield self._answer_existing(episode, contents)
             return
         folder = self._staging(episode, contents)
         missing = contents.size - sum(_size(folder / file.name) for file in contents.files)
         self._require_room(missing)
         self._begun = _Begun(episode, contents, folder)
-        _beside(self._root, episode, "declined").unlink(missing_ok=True)
+        _temporary_path(self._root, episode, "declined").unlink(missing_ok=True)
         yield from self._go_on(self._begun)
 
     def _piece(self, piece: Piece, data: bytes) -> Iterator[Message]:
@@ -311,11 +311,11 @@ class Shelf:
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            return self._known(begun.episode, begun.contents)
+            return self._answer_existing(begun.episode, begun.contents)
         sync_folder(self._episodes)
         return self._arrived(begun.episode, begun.contents)
 
-    def _known(self, episode: str, contents: Contents) -> Message:
+    def _answer_existing(self, episode: str, contents: Contents) -> Message:
         """An episode that is here: the same, or another one, which stays as it is."""
         here = contents_of(self._episodes / episode)
         if here != contents:
@@ -328,7 +328,7 @@ class Shelf:
         return self._arrived(episode, contents)
 
     def _arrived(self, episode: str, contents: Contents) -> Message:
-        self._tell(episode)
+        self._request_reconcile(episode)
         self._forget(episode)
         log.info("%s: episode %s has arrived, %d bytes", self.station, episode, contents.size)
         return Arrived(episode, contents.digest)
@@ -368,7 +368,7 @@ class Shelf:
 
     def _staging(self, episode: str, contents: Contents) -> Path:
         """The folder of what is here of it, without anything that is of no use; others make room for it."""
-        folder, known = self._root / episode, _beside(self._root, episode, "json")
+        folder, known = self._root / episode, _temporary_path(self._root, episode, "json")
         sent = contents.packed()
         if (
             not known.exists() or known.read_bytes() != sent
@@ -388,19 +388,19 @@ class Shelf:
         """Remove what is here of it in part, and what is said of it."""
         shutil.rmtree(self._root / episode, ignore_errors=True)
         for kind in ("json", "declined"):
-            _beside(self._root, episode, kind).unlink(missing_ok=True)
+            _temporary_path(self._root, episode, kind).unlink(missing_ok=True)
 
     def _declined(self, episode: str, why: str, again_s: float) -> Declined:
         log.warning("%s: episode %.40r is not taken: %s", self.station, episode, why)
         if is_episode(episode):
             with suppress(OSError, RecordingError):  # a disk that is full: the station is told all the same
                 self._root.mkdir(parents=True, exist_ok=True)
-                write_atomic(_beside(self._root, episode, "declined"), why.encode())
+                write_atomic(_temporary_path(self._root, episode, "declined"), why.encode())
                 for path in sorted(self._root.glob("*.declined"), key=_changed)[:-_MOST_DECLINED]:
                     path.unlink()
         return Declined(episode, why[:500], again_s)
 
-    def _tell(self, episode: str) -> None:
+    def _request_reconcile(self, episode: str) -> None:
         """Have the worker make rows of it."""
         folder = self._data / ARRIVALS
         folder.mkdir(parents=True, exist_ok=True)
@@ -424,7 +424,7 @@ class Shelf:
         if lines != here:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(path, lines)
-            self._tell(episode)
+            self._request_reconcile(episode)
         return Arrived(episode, _digest(lines))
 
 
@@ -454,7 +454,7 @@ def _write_at(descriptor: int, data: bytes, offset: int) -> None:
         view, offset = view[written:], offset + written
 
 
-def _beside(root: Path, episode: str, kind: str) -> Path:
+def _temporary_path(root: Path, episode: str, kind: str) -> Path:
     return root / f"{episode}.{kind}"
 
 

@@ -36,7 +36,7 @@ class KeyPair:
     secret: bytes
 
     @classmethod
-    def of(cls, secret: bytes) -> KeyPair:
+    def from_secret(cls, secret: bytes) -> KeyPair:
         """The pair of a secret key."""
         public = zmq.curve_public(z85(secret))
         return cls(zmq.utils.z85.decode(public), secret)
@@ -76,7 +76,7 @@ def station_key(data: Path) -> KeyPair:
     path = key_path(data)
     if not path.exists():
         raise ConfigurationError(f"{path} is not there: make it with python -m runtime.keys new")
-    return KeyPair.of(_read(path))
+    return KeyPair.from_secret(_read(path))
 
 
 def make_station_key(data: Path, replace: bool = False) -> KeyPair:
@@ -89,17 +89,19 @@ def make_station_key(data: Path, replace: bool = False) -> KeyPair:
         )
     secret = zmq.utils.z85.decode(zmq.curve_keypair()[1])
     _write(path, secret)
-    return KeyPair.of(secret)
+    return KeyPair.from_secret(secret)
 
 
 def lab_key(data: Path) -> KeyPair:
     """The pair of this lab's gate, made where there is none."""
-    return KeyPair.of(_made_once(folder(data) / _LAB, zmq.utils.z85.decode(zmq.curve_keypair()[1])))
+    return KeyPair.from_secret(
+        _load_or_create(folder(data) / _LAB, zmq.utils.z85.decode(zmq.curve_keypair()[1]))
+    )
 
 
 def tokens_key(data: Path) -> bytes:
     """The secret with which this lab signs commands, made where there is none: the 32 bytes of an Ed25519 key."""
-    return _made_once(folder(data) / _TOKENS, secrets.token_bytes(_KEY_BYTES))
+    return _load_or_create(folder(data) / _TOKENS, secrets.token_bytes(_KEY_BYTES))
 
 
 def known_lab_path(station_dir: Path) -> Path:
@@ -107,7 +109,7 @@ def known_lab_path(station_dir: Path) -> Path:
     return station_dir / "lab.json"
 
 
-def keep_lab(station_dir: Path, lab: KnownLab) -> None:
+def save_lab(station_dir: Path, lab: KnownLab) -> None:
     """Write down what the station knows of its lab from now on."""
     _write(known_lab_path(station_dir), json.dumps(asdict(lab), indent=1).encode())
 
@@ -162,7 +164,7 @@ def _read(path: Path) -> bytes:
     return secret
 
 
-def _made_once(path: Path, secret: bytes) -> bytes:
+def _load_or_create(path: Path, secret: bytes) -> bytes:
     """The key in that file, which is `secret` where there was none; nobody ever sees a part of it."""
     if not path.exists():
         draft = _draft(path, secret)

@@ -142,7 +142,7 @@ class LabStreams:
         self._obey()
         for arrival in self._door.arrivals():
             try:
-                self._hear(arrival)
+                self._handle(arrival)
             except Exception:  # no other station is to lose its streams for it
                 log.exception("streams of a station's computer cannot be taken up")
                 self._door.cut(arrival.route, "the lab cannot take up what it sends: see the log of its gate")
@@ -152,13 +152,13 @@ class LabStreams:
             if (flow := self._by_route.pop(route, None)) is not None and flow.route == route:
                 flow.route, flow.credit = b"", 0
         self._door.gone.clear()
-        self._door.look()
+        self._door.poll()
         for (station, _), flow in self._flows.items():
             if flow.published.rebind_if_unreachable():
-                self._tell(station)
+                self._update_places(station)
             if flow.route and not self._allowed.now.may_be(self._door.key_of(flow.route), station):
                 self._leave(flow, "the lab has withdrawn or replaced this station's key")
-            self._ask(flow)
+            self._send_credits(flow)
         for route, sender in list(self._senders.items()):
             known = (sender.station, STATE) in self._flows
             if not known or not self._allowed.now.may_be(self._door.key_of(route), sender.station):
@@ -207,7 +207,7 @@ class LabStreams:
             return
         self._flows[station, STATE] = _Flow(state, STATE)
         self._flows[station, PICTURES] = _Flow(pictures, PICTURES)
-        self._tell(station)
+        self._update_places(station)
 
     def _close(self, station: str) -> None:
         for role in (STATE, PICTURES):
@@ -216,14 +216,14 @@ class LabStreams:
                 if flow.route:
                     self._leave(flow, "the lab has no such station any more")
 
-    def _tell(self, station: str) -> None:
+    def _update_places(self, station: str) -> None:
         state, pictures = (self._flows[station, role].published.endpoint for role in (STATE, PICTURES))
         self.places[station] = (state, pictures)
 
-    def _hear(self, arrival: Arrival) -> None:
+    def _handle(self, arrival: Arrival) -> None:
         message, flow = arrival.message, self._by_route.get(arrival.route)
         if (sender := self._senders.get(arrival.route)) is not None:
-            self._hear_sender(arrival, sender)
+            self._on_sender(arrival, sender)
         elif isinstance(message, Hello) and flow is None:
             self._greet(arrival, message)
         elif flow is None:
@@ -266,9 +266,9 @@ class LabStreams:
             if _NAMES[flow.role].fullmatch(stream):
                 flow.published.publish(stream, payload)
 
-    def _ask(self, flow: _Flow) -> None:
+    def _send_credits(self, flow: _Flow) -> None:
         """Give back credits, while anybody listens; say what is wanted where that has changed."""
-        flow.published.hear()
+        flow.published.poll_subscriptions()
         wanted = sorted(flow.published.topics)[:_MOST_TOPICS]
         if not flow.route:
             return
@@ -280,14 +280,14 @@ class LabStreams:
 
     # --- episodes ------------------------------------------------------------------------------------------------
 
-    def _hear_sender(self, arrival: Arrival, sender: _Sender) -> None:
+    def _on_sender(self, arrival: Arrival, sender: _Sender) -> None:
         message, incoming = arrival.message, self._incoming
         assert incoming is not None
         if isinstance(message, Beat):
             self._door.send(arrival.route, Beat())
         elif isinstance(message, Offer | Labels | Piece) and len(arrival.parts) == 1:
             if sender.may_send(message):
-                incoming.hear(sender.station, arrival.route, message, arrival.parts[0])
+                incoming.handle(sender.station, arrival.route, message, arrival.parts[0])
             else:
                 self._cut_sender(arrival.route, "it sends what nobody has asked for")
 

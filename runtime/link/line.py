@@ -146,7 +146,7 @@ class Line:
             self.drop(f"nothing was heard of the lab for {now - self._heard_at:.1f} s")
             return []
         heard = self._received(now)
-        if self.socket is not None and (trouble := self._trouble()):
+        if self.socket is not None and (trouble := self._connection_problem()):
             self.drop(*trouble)
         elif self.up and now >= self._due:
             self._due = now + BEAT_S
@@ -226,7 +226,7 @@ class Line:
         self._due = -float("inf")
         self.connections += 1
 
-    def _trouble(self) -> tuple[str, float | None] | None:
+    def _connection_problem(self) -> tuple[str, float | None] | None:
         """What ZMQ says has become of the connection: why, and when to try again; None where nothing has."""
         assert self._monitor is not None
         if not readable(self._monitor):

@@ -17,7 +17,7 @@ from runtime.core.errors import TransportError
 from runtime.ipc.bus import CommandServer, Endpoints, Key
 from runtime.ipc.endpoints import socket_folder
 from runtime.ipc.fair_queue import LONGEST_STOP, FairQueue
-from runtime.ipc.station_lock import Taken, take
+from runtime.ipc.station_lock import StationLockedError, acquire
 from runtime.link.wire import COORDINATOR, GUARD, MEDIA
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ _SHARE = 8  # of commands that are no stops, in one turn
 _GATE = ", the gate, for a station on another computer"
 
 
-class MirrorTaken(Exception):
+class MirrorLockedError(Exception):
     """The station's name is used by another process of this computer."""
 
 
@@ -37,7 +37,7 @@ class Mirror:
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
         self._context, self.station_dir = context, station_dir
-        self._lock = _held(station_dir)
+        self._lock = _acquire_lock(station_dir)
         self._endpoints = Endpoints(station_dir)
         self.key = Key(station_dir)
         self.commands: CommandServer | None = None
@@ -76,7 +76,7 @@ class Mirror:
         self._endpoints.write(LINK, {"why": why, "since": repr(time.time())})
         self._lower()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Listen anew where clients cannot connect any more."""
         if self.estops.rebind_if_unreachable() or self._endpoints.is_missing(GUARD):
             self._endpoints.write(GUARD, {"estop": self.estops.endpoint})
@@ -124,12 +124,12 @@ class Mirror:
         self.commands = self.command_turns = None
 
 
-def _held(station_dir: Path) -> IO[str]:
+def _acquire_lock(station_dir: Path) -> IO[str]:
     try:
-        lock = take(station_dir, _GATE)
+        lock = acquire(station_dir, _GATE)
         socket_folder(station_dir)
-    except Taken as taken:
-        raise MirrorTaken(
+    except StationLockedError as taken:
+        raise MirrorLockedError(
             f"a station of this name runs on the lab's own computer (process {taken.by}): end it, or give one of the "
             "two another name"
         ) from None

@@ -28,7 +28,7 @@ _FIND_S, _TELL_S = 5.0, 0.8  # for which the socket of a stop is looked for; aft
 
 
 @dataclass(slots=True)
-class _Asked:
+class _PendingQuestion:
     process: str
     socket: str
     payload: bytes
@@ -70,19 +70,21 @@ class Relay:
     ) -> None:
         self._context, self._clock = context, clock
         self._endpoints = Endpoints(station_dir)
-        self._asked: dict[int, _Asked] = {}
+        self._asked: dict[int, _PendingQuestion] = {}
         self._free: dict[tuple[str, str], _Free] = {}
 
-    def ask(self, number: int, place: tuple[str, str], payload: bytes, signature: bytes, stops: bool) -> None:
+    def send(
+        self, number: int, place: tuple[str, str], payload: bytes, signature: bytes, stops: bool
+    ) -> None:
         """Send it to the socket; a stop goes after its socket wherever that goes meanwhile."""
         if len(self._asked) >= _MOST:
             self._end(next(iter(self._asked)))
         now = self._clock()
-        asked = self._asked[number] = _Asked(*place, payload, signature, stops, now, now)
+        asked = self._asked[number] = _PendingQuestion(*place, payload, signature, stops, now, now)
         self._send(asked)
 
     @property
-    def asked(self) -> bool:
+    def is_pending(self) -> bool:
         """True while a question waits for the station."""
         return bool(self._asked)
 
@@ -97,7 +99,7 @@ class Relay:
             packed = asked.client.packed_answer() if asked.client is not None else None
             if packed is not None:
                 found.append(Answered(number, packed))
-                self._keep(asked)
+                self._store(asked)
                 del self._asked[number]
             elif asked.client is None and not asked.told and (not asked.stops or now - asked.since > _TELL_S):
                 found.append(
@@ -129,7 +131,7 @@ class Relay:
             free.close()
         self._free.clear()
 
-    def _send(self, asked: _Asked) -> None:
+    def _send(self, asked: _PendingQuestion) -> None:
         """To the socket where it is now, unless it was sent there."""
         try:
             endpoint = str(self._endpoints.read(asked.process)[asked.socket])
@@ -155,14 +157,14 @@ class Relay:
             return free.clients.pop()
         return CommandClient(self._context, endpoint, owner=self._endpoints.owner)
 
-    def _keep(self, asked: _Asked) -> None:
+    def _store(self, asked: _PendingQuestion) -> None:
         free, client = self._free[asked.process, asked.socket], self._taken(asked)
         if free.endpoint == asked.endpoint:
             free.clients.append(client)
         else:
             client.close()
 
-    def _taken(self, asked: _Asked) -> CommandClient:
+    def _taken(self, asked: _PendingQuestion) -> CommandClient:
         client, asked.client = asked.client, None
         assert client is not None
         return client

@@ -27,11 +27,11 @@ class Pending:
     call: IncomingMessage
     command: Command
     until: float
-    press: Held | None = None
+    press: PendingPress | None = None
 
 
 @dataclass(slots=True)
-class Held:
+class PendingPress:
     """A press of the e-stop; `told` once its sender has an answer."""
 
     call: IncomingMessage
@@ -55,7 +55,7 @@ class Remote:
     lines: dict[str, Line] = field(default_factory=dict)
     listening: list[str] = field(default_factory=list)
     pending: dict[int, Pending] = field(default_factory=dict)
-    held: list[Held] = field(default_factory=list)
+    held: list[PendingPress] = field(default_factory=list)
     lives: bool = False  # its connections; `up`: and what they lead to
     up: bool = False
     told: str = ""

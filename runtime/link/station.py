@@ -28,7 +28,7 @@ from runtime.link.station_streams import Flow, source_of
 from runtime.link.tokens import Challenges
 from runtime.link.uploads import Uploads, UploadSettings
 from runtime.link.wire import COMMANDS, EPISODES, PICTURES, STATE, STOPS, Answer, Ask, Beat, Credit
-from runtime.link.yielding import give_way
+from runtime.link.yielding import lower_priority
 
 log = logging.getLogger(__name__)
 _POLL_MS = 50
@@ -71,7 +71,7 @@ class Commands:
 
     def turn(self) -> None:
         """Wait for the lab or the station, and pass on what either says."""
-        wait_ms = _POLL_MS if self._relay.asked else _IDLE_MS
+        wait_ms = _POLL_MS if self._relay.is_pending else _IDLE_MS
         poller = zmq.Poller()
         for socket in (self._line.socket, *self._relay.sockets()):
             if socket is not None:
@@ -87,7 +87,7 @@ class Commands:
             self._line.send(Answer(answered.number, answered.failure), answered.packed)
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why there is no connection to the lab, "" where there is; any thread may ask."""
         return "" if self._line.up else self._line.why
 
@@ -118,7 +118,7 @@ class Commands:
         if wrong:
             log.warning("a stop of the lab is passed on, of a user who is not verified: %s", wrong)
         signature = NOBODY if wrong else self._signature(payload)
-        self._relay.ask(ask.number, (ask.process, ask.socket), payload, signature, ask.stops)
+        self._relay.send(ask.number, (ask.process, ask.socket), payload, signature, ask.stops)
 
     def _signature(self, payload: bytes) -> bytes:
         try:
@@ -217,9 +217,9 @@ class StationLink:
             thread.join()
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why the lab cannot stop the station just now, "" where it can."""
-        return "not connected yet" if self._stops is None else self._stops.trouble
+        return "not connected yet" if self._stops is None else self._stops.problem
 
     def _work(self, name: str, make: Callable[[], Commands | Streams]) -> None:
         """One thread; what nobody foresaw ends the process, which is started again, rather than a part of it."""
@@ -239,7 +239,7 @@ class StationLink:
 
     def _upload(self, make: Callable[[], Uploads]) -> None:
         """The thread of episodes: whatever befalls it, stops and commands go on, and it begins anew."""
-        give_way()
+        lower_priority()
         while not self._ended.is_set():
             try:
                 with closing(make()) as part:

@@ -72,7 +72,7 @@ class Flow:
 
     def bundle(self) -> tuple[Bundle, list[bytes]] | None:
         """What is new since the last one, None where nothing is, or the lab takes nothing yet."""
-        self._hear()
+        self._receive()
         if not self._credit or not self._newest:
             return None
         names = list(self._newest)[:MOST_PARTS]
@@ -83,7 +83,7 @@ class Flow:
         """Release the socket."""
         self._disconnect()
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         self._turns += 1
         if self._wanted and (self.socket is None or self._turns % _LOOK_EVERY == 0):
             self._connect(self._source.endpoint())

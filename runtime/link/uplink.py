@@ -31,7 +31,7 @@ class Telling:
         self._said: Uplink | None = None
         self._lab = lab
 
-    def look(self, trouble: str) -> None:
+    def update(self, trouble: str) -> None:
         """`trouble` says why there is no link just now, "" where there is one."""
         before = self._said
         lost = before is not None and before.why

@@ -174,7 +174,7 @@ class Uploads:
             self._connection = self._line.connections
             self._forget()
         for message, _ in heard:
-            self._hear(message)
+            self._handle(message)
         if not self._line.up or (self._runs is not None and self._runs.going()):
             return
         self._send()
@@ -203,7 +203,7 @@ class Uploads:
         self._offered = self._reading = None
         self._wanted.clear()
 
-    def _hear(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         offered = self._offered
         if offered is None or getattr(message, "episode", "") != offered.episode:
             return
@@ -217,7 +217,7 @@ class Uploads:
             self._forget()
             what = offered.episode if offered.contents is not None else f"labels {offered.episode}"
             self._home.put_off(what, min(max(message.again_s, _SOONEST_S), _LATEST_S))
-            self._say_once(what, f"the lab does not take it: {message.why}")
+            self._log_once(what, f"the lab does not take it: {message.why}")
 
     def _arrived(self, offered: _Offered, message: Arrived) -> None:
         try:
@@ -227,7 +227,7 @@ class Uploads:
                 self._home.arrived(offered.episode, offered.contents)
         except RecordingError as error:  # the receipt finds no room: it is offered again
             self._home.put_off(offered.episode, _UNREADABLE_S)
-            self._say_once(offered.episode, str(error))
+            self._log_once(offered.episode, str(error))
 
     def _send(self) -> None:
         """The bytes that the lab lacks, as far as the bucket goes."""
@@ -235,7 +235,7 @@ class Uploads:
         while self._wanted and not self._throttle.wait_s() and self._clock() < until:
             want = self._wanted.popleft()
             data = self._read(want)
-            self._throttle.take(max(1, len(data)))
+            self._throttle.consume(max(1, len(data)))
             if not self._line.send(Piece(want.episode, want.file, want.offset), data):
                 self._forget()
 
@@ -252,7 +252,7 @@ class Uploads:
             finally:
                 os.close(descriptor)
         except OSError as error:
-            self._say_once(want.episode, f"{want.file} cannot be read: {error.strerror}")
+            self._log_once(want.episode, f"{want.file} cannot be read: {error.strerror}")
             return b""
 
     def _offer(self) -> None:
@@ -276,10 +276,10 @@ class Uploads:
             self._reading = None
         except RecordingError as error:
             self._home.put_off(self._reading.episode, _UNREADABLE_S)
-            self._say_once(self._reading.episode, str(error))
+            self._log_once(self._reading.episode, str(error))
             self._reading = None
 
-    def _say_once(self, what: str, why: str) -> None:
+    def _log_once(self, what: str, why: str) -> None:
         if self._told.get(what) != why:
             self._told[what] = why
             log.warning("episode %s is not sent to the lab: %s", what, why)

@@ -14,7 +14,7 @@ _IDLE, _OF_THREAD = 3 << 13, 1  # IOPRIO_CLASS_IDLE, IOPRIO_WHO_PROCESS
 _IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
 
 
-def give_way() -> None:
+def lower_priority() -> None:
     """Put the calling thread, and those that it starts, last: nice 19, and the disk while nobody else wants it.
 
     Whoever reads in that class is served when the disk is idle, where its scheduler knows classes; else as all others.
@@ -38,6 +38,6 @@ class Throttle:
         self._left, self._at = min(self._burst, self._left + self._rate * (now - self._at)), now
         return max(0.0, -self._left / self._rate)
 
-    def take(self, count: int) -> None:
+    def consume(self, count: int) -> None:
         """So many bytes are sent; to be asked for with `wait_s` before."""
         self._left -= count

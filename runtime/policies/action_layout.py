@@ -62,7 +62,7 @@ class ActionLayoutSettings(ActionFormatSettings):
     """With image_size: "pad" keeps the aspect on black, "stretch" does not."""
 
     @property
-    def sees_poses(self) -> bool:
+    def uses_poses(self) -> bool:
         """True if the responses depend on the poses of an observation."""
         relative = self.action_space == "eef" and self.action_mode != "absolute"
         return self.observation_space == "eef" or relative

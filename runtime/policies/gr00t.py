@@ -93,7 +93,7 @@ class Gr00tPolicy(Policy):
         self._token = _token(config)
         self._request = Gr00tRequest(config, robot, control_rate)
         self.observation_eef = config.observation_eef
-        self.uses_poses = config.sees_poses
+        self.uses_poses = config.uses_poses
         self._link = self._new_link()
         self._lock = threading.Lock()  # for the connection; held through every wait
         self._turning = threading.Lock()  # for the change between open and closed; held briefly
@@ -230,9 +230,9 @@ class Gr00tPolicy(Policy):
                 f"the policy server at {url} has no endpoint {endpoint!r} ({text}): it is of another version"
             )
         kind = RefusedError if text.startswith("Unauthorized") else ServerReportedError
-        return kind(self._told(text))
+        return kind(self._error_text(text))
 
-    def _told(self, text: str) -> str:
+    def _error_text(self, text: str) -> str:
         url = self._config.url
         if text.startswith("Unauthorized"):
             given = "a wrong one was given" if self._token else "none was given"

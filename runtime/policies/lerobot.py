@@ -98,7 +98,7 @@ class LerobotPolicy(Policy):
         self._config = config
         self._request = AsyncRequest(config, robot, control_rate)
         self.observation_eef = config.observation_eef
-        self.uses_poses = config.sees_poses
+        self.uses_poses = config.uses_poses
         self._link = self._new_link()
         self._lock = threading.Lock()  # for the connection; held through every wait
         self._turning = threading.Lock()  # for the change between open and closed; held briefly

@@ -135,7 +135,7 @@ class OpenpiPolicy(WebsocketPolicy):
         return self._layout.build(self._grip.convert_observation(observation))
 
     def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
-        _refuse_others(metadata)
+        _check_protocol(metadata)
         space = check_server_claims(metadata, self._declared, "metadata")
         supports_rtc = self._dialect.check_supported(metadata)
         horizon = metadata.get("action_horizon")
@@ -202,7 +202,7 @@ class OpenpiPolicy(WebsocketPolicy):
         return replace(conditioning, previous=rows)
 
 
-def _refuse_others(metadata: Mapping[str, Any]) -> None:
+def _check_protocol(metadata: Mapping[str, Any]) -> None:
     """Raise WrongProtocolError for servers that greet like openpi's but accept other requests."""
     kind = next((kind for mark, kind in _MARKS.items() if mark in metadata), None)
     if kind is not None:

@@ -58,7 +58,7 @@ class RoboarenaPolicy(WebsocketPolicy):
         self._shown = ArenaRequest(config, robot)
         self._meant = ArenaActions(config, config.gripper, robot)
         self.observation_eef = config.observation_eef
-        self.uses_poses = self._shown.sees_poses or (self._meant.cartesian and self._meant.velocity)
+        self.uses_poses = self._shown.uses_poses or (self._meant.cartesian and self._meant.velocity)
         self._wants: ServerRequirements | None = None
         self.observe_period_s = self._shown.glances_s
         self._session = _new_session()

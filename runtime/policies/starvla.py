@@ -88,7 +88,7 @@ class StarvlaPolicy(WebsocketPolicy):
             config.statistics.require_width(self._width)
         self._layout = self._layout_for(config.image_size)
         self.observation_eef = config.observation_eef
-        self.uses_poses = config.sees_poses
+        self.uses_poses = config.uses_poses
         self._unnorm_key = config.unnorm_key
         self._number = 0
         self._spoken = time.monotonic()
@@ -101,7 +101,7 @@ class StarvlaPolicy(WebsocketPolicy):
         if self._config.ping_every is not None and self._silent.is_set():
             self._silent = threading.Event()
             threading.Thread(
-                target=self._keep_awake,
+                target=self._ping_while_idle,
                 args=(self._silent, self._config.ping_every),
                 name="starvla-ping",
                 daemon=True,
@@ -188,7 +188,7 @@ class StarvlaPolicy(WebsocketPolicy):
         self._check_reply(reply, envelope)
         self._spoken = time.monotonic()
 
-    def _keep_awake(self, silent: threading.Event, every: float) -> None:
+    def _ping_while_idle(self, silent: threading.Event, every: float) -> None:
         """Ping while there are no requests; a request in progress counts as traffic."""
         while not silent.wait(every / 2):
             if not self._lock.acquire(blocking=False):

@@ -115,10 +115,10 @@ class PreflightRunner:
         policy = self._policy
         if policy is None:
             return ""
-        return policy.current_call or ("" if self._asked else "connect")
+        return policy.current_call or ("" if self._is_policy_called else "connect")
 
     @property
-    def _asked(self) -> bool:
+    def _is_policy_called(self) -> bool:
         return self._policy is not None and any(call.name == "infer" for call in self._policy.calls)
 
     def _stage(self, verdict: PreflightVerdict) -> PreflightStage:

@@ -54,7 +54,7 @@ class DatasetSource(EpisodeSource):
         self._robot = robot
         self._entry = dataset.entry(index)
         self._features = dataset.features
-        self._state = self._found(state)
+        self._state = self._state_column(state)
         ours = layout.read_lines(dataset.root / layout.EVA_EPISODES)
         told = next((line for line in ours if line.get("episode_index") == index), {})
         uuid, self.drawn = str(told.get("uuid", "")), told.get("simulated") is True
@@ -69,7 +69,7 @@ class DatasetSource(EpisodeSource):
         self.vectors = {name: self._vector(name) for name in self._features if self._is_vector(name)}
         self.started = "tick_time" if "tick_time" in self._features else ""
 
-    def _found(self, state: str) -> str:
+    def _state_column(self, state: str) -> str:
         """Return the column of measured joints, "" without one.
 
         Raises RecordingError if `state` is given and absent.
@@ -122,7 +122,7 @@ class DatasetSource(EpisodeSource):
             absent = [name for name in self.vectors if name not in there]
             if absent:
                 raise RecordingError(f"{path} has no column {absent}, though the metadata declare it")
-            wanted = [name for name in self._wanted() if name in there]
+            wanted = [name for name in self._required_columns() if name in there]
             chosen = pads.field("episode_index") == self._entry.index if self._entry.shared else None
             scanned = table.scanner(
                 columns=wanted, filter=chosen, batch_size=BLOCK_ROWS, batch_readahead=1, use_threads=False
@@ -136,7 +136,7 @@ class DatasetSource(EpisodeSource):
         if first != self._entry.length:
             raise RecordingError(f"{path} holds {first} rows of it, the metadata say {self._entry.length}")
 
-    def _wanted(self) -> list[str]:
+    def _required_columns(self) -> list[str]:
         scalars = [_INDEX, "timestamp", "tick_time", "control_source"]
         ours = [name for name in self._features if name.startswith((CAPTURE, REPEATED, LOST))]
         return [*self.vectors, *scalars, *ours]

@@ -176,7 +176,7 @@ class _RepeatCheck:
         self._repeated = self._skipped = 0
         self._spans = {"repeated": [-1, -1], "skipped": [-1, -1]}
         self._said = RunCollector(self._no_new)
-        self._seen = RunCollector(self._stands)
+        self._seen = RunCollector(self._flag_frozen)
         self._last: Float64 = np.full(2, np.nan)  # changes of the two previous pictures
         self._key = False  # whether the previous picture was a key frame
 
@@ -251,7 +251,7 @@ class _RepeatCheck:
             )
             self._frozen("error", run, text, seconds, bound)
 
-    def _stands(self, run: FrameRun) -> None:
+    def _flag_frozen(self, run: FrameRun) -> None:
         seconds, bound = run.frames / self._fps, self._settings.frozen_s
         if seconds > bound:
             where = frame_range(run.first, run.last)

@@ -157,9 +157,9 @@ class RunCollector:
         breaks = np.flatnonzero(np.diff(frames) > self._apart + 1)
         for part in np.split(frames, breaks + 1):
             at = int(part[np.argmax(worst[part])])
-            self._take(FrameRun(first + int(part[0]), first + int(part[-1]), float(worst[at]), first + at))
+            self._add_run(FrameRun(first + int(part[0]), first + int(part[-1]), float(worst[at]), first + at))
 
-    def _take(self, new: FrameRun) -> None:
+    def _add_run(self, new: FrameRun) -> None:
         known = self._open
         if known is None or new.first - known.last > self._apart + 1:
             self.close()

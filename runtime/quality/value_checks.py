@@ -124,10 +124,10 @@ class _Column:
 
     def _missing(self, run: FrameRun) -> None:
         severity: Severity = "info" if self._vector.sparse else "error" if self._moves else "warning"
-        self._say("missing_values", severity, run, f"{self.name} was not recorded", None, None)
+        self._flag("missing_values", severity, run, f"{self.name} was not recorded", None, None)
 
     def _malformed(self, run: FrameRun) -> None:
-        self._say(
+        self._flag(
             "dimensions", "error", run, f"{self.name} has another width than {self._vector.width}", None, None
         )
 
@@ -136,11 +136,11 @@ class _Column:
         self._broken = set()
         severity: Severity = "error" if self._moves else "warning"
         text = f"{self.name} is not finite in {names}: it counts as 0"
-        self._say("not_finite", severity, run, text, float(run.frames), 0.0)
+        self._flag("not_finite", severity, run, text, float(run.frames), 0.0)
 
     def _no_rotation(self, run: FrameRun) -> None:
         text = f"{self.name}: the length of a quaternion is {run.value:.3f} off 1"
-        self._say("quaternion", "error", run, text, run.value, self._settings.quaternion_error)
+        self._flag("quaternion", "error", run, text, run.value, self._settings.quaternion_error)
 
     def _jump(self, run: FrameRun) -> None:
         assert self._speeds is not None
@@ -149,13 +149,13 @@ class _Column:
         bound = float(self._speeds[dim])
         unit = "m/s" if self._vector.role == "poses" else "rad/s"
         text = f"{self.name}: {self._vector.names[dim]} jumps, at {run.value * bound:.2f} {unit}"
-        self._say("jump", "warning", run, text, run.value * bound, bound)
+        self._flag("jump", "warning", run, text, run.value * bound, bound)
 
     @property
     def _moves(self) -> bool:
         return self._vector.role in MOVING
 
-    def _say(
+    def _flag(
         self,
         kind: str,
         severity: Severity,

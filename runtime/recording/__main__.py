@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.command == "export":
             if options.background:
-                _stand_back()
+                _lower_priority()
             return _export(options.paths, options.to)
         if options.command == "scrub":
             return _scrub(options.paths, options.json)
@@ -149,7 +149,7 @@ def _data_of(folder: Path) -> Path:
     return episodes.parent
 
 
-def _stand_back() -> None:
+def _lower_priority() -> None:
     """Run at the lowest priority, and end together with the process that started this one."""
     os.nice(19)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

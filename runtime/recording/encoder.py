@@ -155,8 +155,8 @@ class CameraEncoder:
 
     def _run(self) -> None:
         try:
-            while (entry := self._queue.take()) is not None:
-                self._keep(entry)
+            while (entry := self._queue.get()) is not None:
+                self._encode_or_fail(entry)
             if not self._abandoned:
                 self._all_coded = True
                 self._video.close()
@@ -169,7 +169,7 @@ class CameraEncoder:
         finally:
             self._queue.close(discard=True)
 
-    def _keep(self, entry: Picture | int) -> None:
+    def _encode_or_fail(self, entry: Picture | int) -> None:
         """Encode one entry; bytes that a full disk refuses stay in memory for the next write or the end."""
         try:
             self._encode(entry)

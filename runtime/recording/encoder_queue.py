@@ -76,7 +76,7 @@ class PictureQueue:
             self._changed.notify_all()
         return taken
 
-    def take(self) -> Picture | int | None:
+    def get(self) -> Picture | int | None:
         """Return the oldest entry, waiting for one; None when the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._entries or self._closed)

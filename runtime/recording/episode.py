@@ -261,7 +261,7 @@ class _Recording:
         full: DiskFullError | None = self._writer.full
         try:
             if full is None:
-                self._look_at_losses()
+                self._report_losses()
                 write_outcome(self.folder, seal_outcome(self._conclusion(outcome), self._digests(stuck)))
         except DiskFullError as error:
             full = error
@@ -277,7 +277,7 @@ class _Recording:
         self._writer.save()
         self._conclude(outcome, stuck)
 
-    def _look_at_losses(self) -> None:
+    def _report_losses(self) -> None:
         """Report encoders that dropped pictures because the disk was full, even if it has room again."""
         for encoder in self._encoders.values():
             if isinstance(encoder.failure, DiskFullError):
@@ -290,7 +290,7 @@ class _Recording:
         stuck = [encoder for encoder in self._encoders.values() if not encoder.drain(deadline)]
         for encoder in stuck:
             encoder.abandon()
-        self._look_at_encoders()
+        self._check_encoders()
         return stuck
 
     def _conclusion(self, outcome: Outcome) -> dict[str, object]:
@@ -333,10 +333,10 @@ class _Recording:
         return digests
 
     def _raise_pending(self) -> None:
-        self._look_at_encoders()
+        self._check_encoders()
         self._faults.raise_pending()
 
-    def _look_at_encoders(self) -> None:
+    def _check_encoders(self) -> None:
         """End the recording if the disk is full; any other failure ends only the video of its camera."""
         for camera, encoder in self._encoders.items():
             failure = encoder.failure

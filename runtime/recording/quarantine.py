@@ -25,7 +25,7 @@ def update_mark(verdict: IntegrityCheck) -> None:
     if verdict.state == "damaged":
         _mark(data, verdict)
     elif mark_file(data, verdict.path.name).exists():
-        _take_back(data, verdict)
+        _remove_mark(data, verdict)
 
 
 def marked_damage(data: Path, uuid: str) -> list[dict[str, Any]]:
@@ -47,7 +47,7 @@ def _mark(data: Path, verdict: IntegrityCheck) -> None:
             write_atomic(path, to_json(told, "the mark", indent=1))
 
 
-def _take_back(data: Path, verdict: IntegrityCheck) -> None:
+def _remove_mark(data: Path, verdict: IntegrityCheck) -> None:
     """Remove the mark after checking again: another process may have found damage since `verdict`."""
     path = mark_file(data, verdict.path.name)
     with exclusive(path.parent):

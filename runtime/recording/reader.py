@@ -45,7 +45,7 @@ class Episode:
         lost = (self.outcome or {}).get("lost_cameras")
         return lost if isinstance(lost, Mapping) else {}
 
-    def shown(self, camera: str) -> int:
+    def frame_count(self, camera: str) -> int:
         """Return the number of rows, from the first, that have a frame of that camera."""
         return min(self.frames, int(self.lost[camera]["row"])) if camera in self.lost else self.frames
 

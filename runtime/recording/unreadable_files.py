@@ -44,7 +44,7 @@ def _tables(episode: Episode) -> Iterator[Damage]:
 
 def _videos(episode: Episode) -> Iterator[Damage]:
     for camera, path in episode.videos.items():
-        frames, wanted = count_frames(path), episode.shown(camera)
+        frames, wanted = count_frames(path), episode.frame_count(camera)
         if frames < wanted:
             yield Damage(path.name, f"is torn: {frames} frames can be read, its rows want {wanted}")
 

@@ -230,9 +230,11 @@ class SafetyFilter:
         velocity = (reachable - state.previous) / state.elapsed
         brake = braking(reachable, velocity, self._limits, self._settings)
         changed = reachable is not action  # an unchanged action has been checked already
-        return (self._place(reachable, state, path) if changed else "") or self._on_way(brake, state, path)
+        return (self._place(reachable, state, path) if changed else "") or self._path_problem(
+            brake, state, path
+        )
 
-    def _on_way(self, brake: Brake, state: RobotState, path: Path) -> str:
+    def _path_problem(self, brake: Brake, state: RobotState, path: Path) -> str:
         """Return why the braking path is forbidden, "" if it is allowed.
 
         The path is sampled: finely for boxes, coarsely for collisions.

@@ -118,7 +118,7 @@ class CommandGate:
 
     def _switch(self, word: str, message: dict[Any, Any]) -> AcceptedCommand | None:
         """Whoever stands at the robot switches its drives; that does not make them its master."""
-        switch = drives.parse_word(word, message)
+        switch = drives.parse_switch(word, message)
         if switch is None:
             self.refused["malformed"] += 1
             return None

@@ -30,7 +30,7 @@ class DriveSwitch:
     fault: str = ""
 
 
-def parse_word(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
+def parse_switch(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
     """Switch that one of WORDS asks for; None if its fault is invalid."""
     if word != "drives_fault":
         return DriveSwitch(word == "drives_enable")

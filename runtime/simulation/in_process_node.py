@@ -75,17 +75,17 @@ class InProcessNode(Source, Sink):
 
     def send(self, command: RobotCommand) -> None:
         """The node obeys it when it is looked at next."""
-        self._say({"t": command.time, "target": "real", "action": command.action})
+        self._queue_message({"t": command.time, "target": "real", "action": command.action})
 
     def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
         """The same for a control word."""
-        self._say({**data, "t": self._clock.now(), "target": word})
+        self._queue_message({**data, "t": self._clock.now(), "target": word})
 
     def close(self) -> None:
         """Release what the node has."""
         self._node.close()
 
-    def _say(self, message: dict[str, Any]) -> None:
+    def _queue_message(self, message: dict[str, Any]) -> None:
         self._commands.append(msgpack_arrays.pack(message | {"master": _NAME}))
 
 

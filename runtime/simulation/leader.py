@@ -86,11 +86,11 @@ class AttachedLeader(Leader):
     def connect(self) -> None:
         """There is nothing to open."""
 
-    def see(self, observation: Observation) -> None:
+    def update(self, observation: Observation) -> None:
         """The bench and the robot now."""
         now = self._clock.now()
         self._simulated.update(observation, now)
-        self._take(self._simulated.joints_at(now), now)
+        self._set_pose(self._simulated.joints_at(now), now)
 
     def close(self) -> None:
         """There is nothing to release."""

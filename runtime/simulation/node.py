@@ -113,7 +113,7 @@ class Node:
             if accepted is not None and accepted.control is not None:
                 self._control(accepted)
             elif accepted is not None and accepted.reset is not None:
-                self._lay(accepted.reset)
+                self._reset_bench(accepted.reset)
             elif accepted is not None and accepted.switch is not None:
                 self._drives.apply(accepted.switch)
             elif accepted is not None:
@@ -135,7 +135,7 @@ class Node:
         elif accepted.control == "hil_stop":
             self._hil_error = ""
 
-    def _lay(self, wish: ResetRequest) -> None:
+    def _reset_bench(self, wish: ResetRequest) -> None:
         try:
             self._surroundings.reset(wish)
         except BenchError:

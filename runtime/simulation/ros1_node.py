@@ -83,30 +83,32 @@ class Ros1Node(RosRobot):
         while self._inbox:
             yield self._inbox.popleft()
 
-    def _say_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
+    def _publish_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
         from sensor_msgs.msg import JointState
 
-        self._say(topic, JointState(_header(stamp), names, position, [], []))
+        self._publish_message(topic, JointState(_header(stamp), names, position, [], []))
 
-    def _say_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
+    def _publish_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
         from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 
         x, y, z, qw, qx, qy, qz = pose
         placed = Pose(Point(x, y, z), Quaternion(qx, qy, qz, qw))
-        self._say(topic, PoseStamped(_header(stamp, frame), placed))
+        self._publish_message(topic, PoseStamped(_header(stamp, frame), placed))
 
-    def _say_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
+    def _publish_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
         from sensor_msgs.msg import Image
 
         height, width = pixels.shape[:2]
-        self._say(topic, Image(_header(stamp), height, width, encoding, 0, 3 * width, pixels.tobytes()))
+        self._publish_message(
+            topic, Image(_header(stamp), height, width, encoding, 0, 3 * width, pixels.tobytes())
+        )
 
-    def _say_compressed(self, topic: str, stamp: int, data: bytes) -> None:
+    def _publish_compressed(self, topic: str, stamp: int, data: bytes) -> None:
         from sensor_msgs.msg import CompressedImage
 
-        self._say(topic, CompressedImage(_header(stamp), "bgr8; jpeg compressed bgr8", data))
+        self._publish_message(topic, CompressedImage(_header(stamp), "bgr8; jpeg compressed bgr8", data))
 
-    def _say(self, topic: str, message: Any) -> None:
+    def _publish_message(self, topic: str, message: Any) -> None:
         import rospy
 
         if topic not in self._publishers:

@@ -67,31 +67,33 @@ class Ros2Node(RosRobot):
                 if hasattr(sample, "position"):  # else a publisher has gone
                     yield ReceivedCommand(outlet, tuple(sample.name), sample.position)
 
-    def _say_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
+    def _publish_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
         from runtime.simulation.ros import ros2_types as types
 
-        self._say(topic, types.JointState(_header(stamp), names, position))
+        self._publish_message(topic, types.JointState(_header(stamp), names, position))
 
-    def _say_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
+    def _publish_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
         from runtime.simulation.ros import ros2_types as types
 
         x, y, z, qw, qx, qy, qz = pose
         placed = types.Pose(types.Point(x, y, z), types.Quaternion(qx, qy, qz, qw))
-        self._say(topic, types.PoseStamped(_header(stamp, frame), placed))
+        self._publish_message(topic, types.PoseStamped(_header(stamp, frame), placed))
 
-    def _say_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
+    def _publish_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
         from runtime.simulation.ros import ros2_types as types
 
         height, width = pixels.shape[:2]
         image = types.Image(_header(stamp), height, width, encoding, 0, 3 * width, pixels.tobytes())
-        self._say(topic, image)
+        self._publish_message(topic, image)
 
-    def _say_compressed(self, topic: str, stamp: int, data: bytes) -> None:
+    def _publish_compressed(self, topic: str, stamp: int, data: bytes) -> None:
         from runtime.simulation.ros import ros2_types as types
 
-        self._say(topic, types.CompressedImage(_header(stamp), "bgr8; jpeg compressed bgr8", data))
+        self._publish_message(
+            topic, types.CompressedImage(_header(stamp), "bgr8; jpeg compressed bgr8", data)
+        )
 
-    def _say(self, topic: str, message: Any) -> None:
+    def _publish_message(self, topic: str, message: Any) -> None:
         if topic not in self._writers:
             self._writers[topic] = self._writer(topic, type(message))
         self._writers[topic].write(message)

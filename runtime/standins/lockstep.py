@@ -73,7 +73,7 @@ def in_process_peers(
             f"transport.kind = {transport.kind!r} with a bench in lockstep; allowed: zmq with simulated = true"
         )
     leader = AttachedLeader(made.robot, clock, demonstrator(made.robot, made.deployment.task, options.seed))
-    link = InProcessNode(Node(made.robot, options, clock, around), made.robot, clock, leader.see)
+    link = InProcessNode(Node(made.robot, options, clock, around), made.robot, clock, leader.update)
     return Peers(
         source=lambda spec, clock: make_source(spec, clock, lambda *of: link),
         sink=lambda spec, clock: link,
@@ -133,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             urls: dict[str, str] = {}
             for line in options.serve:
                 given = serve.parser().parse_args(shlex.split(line))
-                server = stack.enter_context(closing(serve.made(given, clock)))
+                server = stack.enter_context(closing(serve.build_server(given, clock)))
                 urls[str(given.name or len(urls))] = str(server.start()["url"])
             own = [f'policy.url="{url}"' for url in [*urls.values()][:1]] + (_PATIENT if urls else [])
             bench = ("--seed", options.seed, "--width", options.width, "--height", options.height)

@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     told = program.stop_event(options.lifeline)
     try:
-        with contextlib.closing(made(options)) as server:
+        with contextlib.closing(build_server(options)) as server:
             program.announce_ready(server.start(), options.ready_file)
             told.wait()
     except (RuntimeFault, robots.RobotError) as error:
@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def made(options: argparse.Namespace, clock: Clock | None = None) -> StandInServer:
+def build_server(options: argparse.Namespace, clock: Clock | None = None) -> StandInServer:
     """The server that a command line asks for, not yet started; RuntimeFault, RobotError where it cannot be.
 
     With a virtual `clock` it lives by that, and its answers say how long they took without anybody waiting for it;

@@ -6,7 +6,7 @@ from typing import IO
 
 from runtime.config.schema import Deployment
 from runtime.core.errors import SetupError
-from runtime.ipc.station_lock import Taken, take
+from runtime.ipc.station_lock import StationLockedError, acquire
 
 
 def acquire_station_lock(settings: Deployment) -> IO[str]:
@@ -30,8 +30,8 @@ def unwritable_error(settings: Deployment, error: OSError) -> SetupError:
 
 def _locked(settings: Deployment) -> IO[str]:
     try:
-        return take(settings.station_dir)
-    except Taken as taken:
+        return acquire(settings.station_dir)
+    except StationLockedError as taken:
         raise SetupError(
             f"station {settings.station!r} is already running (process {taken.by}); "
             "end it first, or give this one another name with --set station=NAME"

@@ -160,7 +160,7 @@ def run_preflight(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
     late = threading.Timer(longest, child.kill)
     late.start()
     try:
-        report, failure = _told(child, asked)
+        report, failure = _child_result(child, asked)
     finally:
         late.cancel()
     if failure:
@@ -173,14 +173,14 @@ def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
     report: dict[str, Any] = {}
     failure: str = _UNREADABLE
     try:
-        report, failure = _told(flight.child, asked)
+        report, failure = _child_result(flight.child, asked)
     finally:
         if not flight.failure:
             flight.finished, flight.failure = report, failure
         flight.over.set()
 
 
-def _told(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+def _child_result(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     """Return the child's report and why there is none; returns when the child has ended."""
     assert child.stdin is not None
     assert child.stdout is not None

@@ -154,7 +154,7 @@ def _hashes(then: str, stored: Mapping[str, Any], now: Resolved) -> str:
         return f"the same, {_short(then)}"
     before, after = _leaves(stored), _leaves(now.tree)
     differ = [
-        f"{key} {_shown(before, key)} -> {_shown(after, key)}"
+        f"{key} {_format_value(before, key)} -> {_format_value(after, key)}"
         for key in sorted({*before, *after})
         if before.get(key, _ABSENT) != after.get(key, _ABSENT)
     ]
@@ -173,7 +173,7 @@ def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _shown(leaves: Mapping[str, Any], key: str) -> str:
+def _format_value(leaves: Mapping[str, Any], key: str) -> str:
     return json.dumps(leaves[key]) if key in leaves else "(none)"
 
 

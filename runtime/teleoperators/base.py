@@ -81,7 +81,7 @@ class Leader(ABC):
             self._newest, self._refused = None, ""
             self._arrivals.clear()
 
-    def _take(self, joints: Float64, arrived: float) -> None:
+    def _set_pose(self, joints: Float64, arrived: float) -> None:
         with self._lock:
             self._newest, self._refused = LeaderPose(joints, arrived), ""
             self._arrivals.append(arrived)

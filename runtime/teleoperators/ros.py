@@ -66,7 +66,7 @@ class RosLeader(Leader):
         open_middleware: Callable[[], Middleware],
     ) -> None:
         super().__init__(robot, clock)
-        self._groups = _known(config.groups, robot)
+        self._groups = _groups_by_name(config.groups, robot)
         own = robot.ros.groups if robot.ros is not None and robot.ros.version == version else {}
         self._parts = {
             name: _part(self._groups[name], led, own.get(name)) for name, led in config.groups.items()
@@ -146,7 +146,7 @@ class RosLeader(Leader):
             joints[self._groups[name].slice] = numbers
         oldest = min(when for _, when in self._fresh.values())
         self._fresh.clear()
-        self._take(joints, oldest)
+        self._set_pose(joints, oldest)
 
 
 def _silence(topic: str, match: Match) -> str:
@@ -155,7 +155,7 @@ def _silence(topic: str, match: Match) -> str:
     return match.refused or f"nobody publishes {topic}"
 
 
-def _known(led: Mapping[str, LeaderGroup], robot: Robot) -> dict[str, Group]:
+def _groups_by_name(led: Mapping[str, LeaderGroup], robot: Robot) -> dict[str, Group]:
     groups = {group.name: group for group in robot.groups}
     unknown = [name for name in led if name not in groups]
     if unknown:

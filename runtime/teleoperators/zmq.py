@@ -125,7 +125,7 @@ class ZmqLeader(Leader):
             return
         if stamp != self._stamp:
             self._stamp = stamp
-            self._take(joints, self._clock.now())
+            self._set_pose(joints, self._clock.now())
 
     def _parse(self, payload: bytes) -> tuple[float, np.ndarray]:
         message = msgpack_arrays.unpack(payload, _LIMIT)

@@ -95,7 +95,9 @@ def source(config: Config, robot: Robot, clock: Clock) -> RosSource:
     """Create the source of observations from the robot's topics. Raises ConfigurationError if a topic is unknown."""
     parts, _ = config.streams(robot, 1)
     opener = lambda: middleware(config, f"{NODE}_source")  # noqa: E731
-    return RosSource(robot, _heard(parts), config.acceptance_limits, clock, ros1_serialization, opener)
+    return RosSource(
+        robot, _subscribed_topics(parts), config.acceptance_limits, clock, ros1_serialization, opener
+    )
 
 
 def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
@@ -110,7 +112,7 @@ def middleware(config: Link, name: str) -> Middleware:
     return TcpRosMiddleware(RosEnvironment(config.python, config.master, config.address), name)
 
 
-def _heard(parts: tuple[StreamSpec, ...]) -> tuple[Subscription, ...]:
+def _subscribed_topics(parts: tuple[StreamSpec, ...]) -> tuple[Subscription, ...]:
     pictured = {part.topic for part in parts if part.kind == "camera"}
     return subscriptions(parts, lambda topic: _PICTURES if topic in pictured else _NUMBERS)
 

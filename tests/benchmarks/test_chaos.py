@@ -5,17 +5,17 @@ import sys
 import pytest
 
 from benchmarks import __main__ as command_line
-from benchmarks.chaos import Act, Found, counted
+from benchmarks.chaos import Act, DataAtEnd, counted
 
 ACTS = [Act("prepare", 1), Act("run", 1, "r1", "e1"), Act("score", 1, "s1")]
 
 
-def kept(**other: object) -> Found:
+def kept(**other: object) -> DataAtEnd:
     facts = {"trials": {1: "scored"}, "scores": [(1, "s1")], "rows": {"e1"}, "folders": {"e1"}}
-    return Found(**{**facts, "trial_episodes": ["e1"], **other})  # type: ignore[arg-type]
+    return DataAtEnd(**{**facts, "trial_episodes": ["e1"], **other})  # type: ignore[arg-type]
 
 
-def wrong(found: Found) -> set[str]:
+def wrong(found: DataAtEnd) -> set[str]:
     return {name for name, things in counted(ACTS, found).items() if things}
 
 

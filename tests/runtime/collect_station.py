@@ -49,7 +49,7 @@ class HeldLeader(Leader):
     def speak(self) -> None:
         """Say where it is."""
         if not self.silent and self.joints is not None:
-            self._take(self.joints.copy(), self._clock.now())
+            self._set_pose(self.joints.copy(), self._clock.now())
 
 
 class SelfDriven(StubRobot):

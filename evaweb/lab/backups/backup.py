@@ -128,7 +128,7 @@ def _write(draft: Path, before: Backup | None, now: str, tell: Tell) -> None:
     known = (before.path / FILES, {each.path: each for each in before.listed()}) if before else None
     files = FileCopies(Path(settings.DATA_DIR), draft / FILES, known, without)
     (draft / FILES).mkdir()
-    count, bytes_ = write_list(draft / LIST, files.made())
+    count, bytes_ = write_list(draft / LIST, files.copy())
     about = {
         "format": FORMAT,
         "made": now,

@@ -70,7 +70,7 @@ class FileCopies:
         self.changing: list[str] = []
         self.linked = 0
 
-    def made(self) -> Iterator[Listed]:
+    def copy(self) -> Iterator[Listed]:
         """Copy everything, and yield the list.
 
         Raises:

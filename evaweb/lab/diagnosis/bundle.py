@@ -74,7 +74,7 @@ def _fill(
 
 
 def _parts(sight: Visibility, notes: list[str], tell: Tell) -> Iterator[Named]:
-    if not sight.sees_everything:
+    if not sight.hides_nothing:
         notes.append(f"logs, policies of deployments, and what tells of checkpoints: {sight.plans}")
     tell("versions and settings")
     yield "versions.json", contents.versions()
@@ -116,7 +116,7 @@ def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Na
 
 def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
     """Yield names and ends of logs; none for blind readers, because logs name checkpoints and servers."""
-    if not sight.sees_everything:
+    if not sight.hides_nothing:
         return
     room = LONGEST_LOGS
     for path in contents.logs():
@@ -135,7 +135,7 @@ def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
         yield f"logs/{path.name}", end.decode("utf-8", "replace")
 
 
-def sight_for(user: Any) -> Visibility:
+def visibility_for(user: Any) -> Visibility:
     """Return the visibility of a user; if the database does not answer, everything that a plan could hide is hidden."""
     try:
         return visibility_for_user(user)

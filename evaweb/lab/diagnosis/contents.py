@@ -110,7 +110,7 @@ def jobs(sight: Visibility) -> list[dict[str, Any]]:
     rows = []
     for job in Job.objects.order_by("-created_at", "-pk")[:_JOBS]:
         row = {name: getattr(job, name) for name in names} | {"result": job.result}
-        if not sight.sees_everything:
+        if not sight.hides_nothing:
             row |= {name: HIDDEN if row[name] else "" for name in ("progress", "error")} | {"result": {}}
         times = {name: getattr(job, name) for name in ("created_at", "claimed_at", "finished_at")}
         rows.append(row | {name: at and at.isoformat() for name, at in times.items()})
@@ -119,7 +119,7 @@ def jobs(sight: Visibility) -> list[dict[str, Any]]:
 
 def deployment_files(sight: Visibility) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield name and content of each deployment of a station or of the data folder, without comments."""
-    known = {one.name: one.path for one in deployments.kept()}
+    known = {one.name: one.path for one in deployments.stored_deployments()}
     for station in Station.objects.exclude(deployment=""):
         known.setdefault(station.name, Path(station.deployment))
     for name, path in sorted(known.items()):
@@ -127,7 +127,7 @@ def deployment_files(sight: Visibility) -> Iterator[tuple[str, dict[str, Any]]]:
             tree = tree_of(path)
         except ConfigurationError as fault:
             tree = {"unreadable": str(fault)}
-        if not sight.sees_everything and "policy" in tree:
+        if not sight.hides_nothing and "policy" in tree:
             tree["policy"] = HIDDEN
         yield name, tree
 
@@ -142,7 +142,7 @@ def station_parts(station: Station, sight: Visibility) -> Iterator[tuple[str, An
     except StationGone as gone:
         yield "state", {"station": about, "gone": str(gone)}
     else:
-        veiled = not sight.sees_everything and (
+        veiled = not sight.hides_nothing and (
             sight.redacts_snapshot(station.name, snapshot) or sight.redacts_events(station.name)
         )
         yield (
@@ -166,12 +166,12 @@ def programs(sight: Visibility) -> list[dict[str, Any]]:
     """
     now = time.time()
     rows: list[dict[str, Any]] = [{"program": "lab", "runs": deployments.lab_runs()}]
-    seen = logs() if sight.sees_everything else []
+    seen = logs() if sight.hides_nothing else []
     return rows + [{"program": path.stem, "silent_s": round(now - path.stat().st_mtime, 1)} for path in seen]
 
 
 def _command(row: Command, sight: Visibility) -> dict[str, Any]:
-    hidden = not sight.sees_everything and sight.redacts_events(row.station.name)
+    hidden = not sight.hides_nothing and sight.redacts_events(row.station.name)
     return {
         "at": row.issued_at.isoformat(),
         "kind": row.kind,

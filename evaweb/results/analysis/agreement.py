@@ -62,7 +62,7 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
     }
 
 
-def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:
@@ -85,7 +85,7 @@ def _score_at(rating: Rating | Judgement) -> Score:
 def _milestones(verdicts: list[tuple[Score, Rating]]) -> dict[str, Any]:
     pairs: dict[str, list[tuple[bool, bool]]] = {}
     for verdict, rating in verdicts:
-        again = by_words((text, bool(reached)) for text, reached in rating.milestones)
+        again = by_text((text, bool(reached)) for text, reached in rating.milestones)
         for text, reached in _scored(verdict).items():
             if text in again:
                 pairs.setdefault(text, []).append((reached, again[text]))
@@ -93,7 +93,7 @@ def _milestones(verdicts: list[tuple[Score, Rating]]) -> dict[str, Any]:
 
 
 def _scored(score: Score) -> dict[str, bool]:
-    return by_words((row.text, row.reached) for row in score.outcomes.all())
+    return by_text((row.text, row.reached) for row in score.outcomes.all())
 
 
 def _defined(statistic: Callable[..., float], *given: Any) -> float | None:
@@ -122,7 +122,7 @@ def judge_agreement(plan: Plan) -> list[dict[str, Any]] | None:
 def _judged(judge: str, version: str, rows: list[Judgement]) -> dict[str, Any]:
     said: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
     for row in rows:
-        words = by_words((text, own) for text, *own in row.milestones)
+        words = by_text((text, own) for text, *own in row.milestones)
         for text, reached in _scored(_score_at(row)).items():
             if text in words:
                 said.setdefault(text, []).append((reached, *words[text]))

@@ -22,7 +22,7 @@ from evaweb.plans.counting import end_of
 from evaweb.plans.design import Names, compared
 from evaweb.plans.models import Achieved, CameraCheck, Plan
 from evaweb.plans.models import Look as Behind
-from evaweb.plans.selectors import plans_beside
+from evaweb.plans.selectors import overlapping_plans
 from evaweb.results.analysis.drift import anchors_of
 from evaweb.results.analysis.integrity import checkpoint_changes, with_changes
 from evaweb.statistics.multiple_comparisons import holm
@@ -84,7 +84,7 @@ class AttemptRecord:
         return _seconds(self.handed_at, self.started_at)
 
 
-def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Look]) -> dict[str, Any]:
+def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[BenchImage]) -> dict[str, Any]:
     """Return the conduct of a plan; `runs` are all attempts, `looks` all camera checks of their bench.
 
     It takes one more query per earlier version of the plan.
@@ -94,7 +94,7 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Look
         "looks": looked_behind(plan),
         "beside": [
             {"plan": row.name, "version": row.version, "state": row.state, "trials": row.trials}
-            for row in plans_beside(plan).annotate(trials=Count("handouts", distinct=True))
+            for row in overlapping_plans(plan).annotate(trials=Count("handouts", distinct=True))
         ],
         "checkpoints": _checkpoints(plan, runs),
         "voids": _voids(plan, runs),
@@ -116,18 +116,20 @@ def looked_behind(plan: Plan) -> list[dict[str, Any]]:
     """Return the unblindings of this version, earlier versions and related plans; `before`: this plan was
     frozen later.
     """
-    of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(plan__in=plans_beside(plan))
+    of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(
+        plan__in=overlapping_plans(plan)
+    )
     rows = Behind.objects.filter(of_the_same).order_by("at", "pk")
     named = {"by_name": F("user__username"), "name": F("plan__name"), "version": F("plan__version")}
     return [
         {**row, "own": (row["name"], row["version"]) == (plan.name, plan.version)}
         | {"before": plan.frozen_at is not None and row["at"] < plan.frozen_at}
         for row in rows.values("at", **named)
-        if plan.kept_at is None or row["at"] <= plan.kept_at
+        if plan.stored_at is None or row["at"] <= plan.stored_at
     ]
 
 
-def all_attempts(plan: Plan, looks: Iterable[Look]) -> list[AttemptRecord]:
+def all_attempts(plan: Plan, looks: Iterable[BenchImage]) -> list[AttemptRecord]:
     """Return every attempt in the order of allocation; one query."""
     fields = (
         "number",
@@ -157,7 +159,7 @@ def all_attempts(plan: Plan, looks: Iterable[Look]) -> list[AttemptRecord]:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class BenchImage:
     """Camera image of the bench before a run: smallest match (None without a reference), and why a low one was
     accepted.
 
@@ -176,12 +178,12 @@ class Look:
         return self.place[-1]
 
 
-def looks_of(plan: Plan) -> list[Look]:
+def bench_images(plan: Plan) -> list[BenchImage]:
     """Return all looks at the bench in the order in which they were made; one query."""
     rows = Achieved.objects.filter(trial__handout__plan=plan).order_by("pk")
     place = ("trial__station__name", "trial__scene__name", "trial__position__number", "camera")
     return [
-        Look(
+        BenchImage(
             trial,
             (station, scene, position, camera),
             reference,
@@ -194,9 +196,9 @@ def looks_of(plan: Plan) -> list[Look]:
     ]
 
 
-def _accepted(looks: Iterable[Look]) -> dict[int, tuple[float | None, str]]:
+def _accepted(looks: Iterable[BenchImage]) -> dict[int, tuple[float | None, str]]:
     """Return by trial the smallest match of its last look at the bench, and why it was accepted."""
-    newest: dict[int, dict[str, Look]] = defaultdict(dict)
+    newest: dict[int, dict[str, BenchImage]] = defaultdict(dict)
     for look in looks:
         newest[look.trial][look.camera] = look
     return {
@@ -304,7 +306,7 @@ def _corrections(plan: Plan, runs: Sequence[AttemptRecord]) -> list[dict[str, An
     scores = Score.objects.filter(trial__handout__plan=plan)
     for row in with_changes(scores, why=F("reason"), at=F("scored_at"), by_name=F("rater__username")):
         earlier, run = row["earlier"], known[row["trial_id"]]
-        late = bool(plan.kept_at and row["at"] > plan.kept_at)
+        late = bool(plan.stored_at and row["at"] > plan.stored_at)
         if earlier is None and not late:
             continue
         told = {name: row[name] for name in ("trial_id", "success", "score", "at", "by_name", "changed")}
@@ -348,7 +350,7 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
         content_type__model__in=("scene", "checkpoint"),
         action_flag=CHANGE,
         action_time__gte=plan.frozen_at,
-        action_time__lte=plan.kept_at or timezone.now(),
+        action_time__lte=plan.stored_at or timezone.now(),
     )
     found = list(rows.select_related("user", "content_type").order_by("action_time"))
     if not found:
@@ -446,7 +448,7 @@ def _cameras(plan: Plan, runs: Sequence[AttemptRecord]) -> dict[str, Any]:
     return {"checks": checks, "unchecked": unchecked}
 
 
-def _bench(plan: Plan, runs: Iterable[AttemptRecord], looks: Iterable[Look]) -> dict[str, Any]:
+def _bench(plan: Plan, runs: Iterable[AttemptRecord], looks: Iterable[BenchImage]) -> dict[str, Any]:
     """Return the match gate of the plan, trials below it, trials without a known match, and replaced references."""
     gate = (plan.document or {}).get("match_gate")
     ran = [run for run in runs if run.started_at is not None] if gate is not None else []

@@ -85,7 +85,7 @@ def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
         row = found[score["name"]]
         row.to_success += success and not earlier["success"]
         row.to_failure += earlier["success"] and not success
-        row.late += score["changed"] == VERDICT and bool(plan.kept_at and score["at"] > plan.kept_at)
+        row.late += score["changed"] == VERDICT and bool(plan.stored_at and score["at"] > plan.stored_at)
     return list(found.values())
 
 

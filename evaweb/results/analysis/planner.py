@@ -123,7 +123,7 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
     affordable = int(q.hours * 3600 * q.stations / q.cycle_s / q.checkpoints)
     tried = min(affordable, MOST)
     gains = tuple(gain for gain in _GAINS if q.rate + gain <= 1)
-    found: Outlook = computations.questions.ask(
+    found: Outlook = computations.questions.result(
         person, outlook, q.rate, q.better, q.power, alpha, tried, gains, soon=soon
     )
     return {
@@ -131,7 +131,8 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
         "alpha": alpha,
         "most": MOST,
         "designs": [
-            told(q, rule, need, alone=comparisons == 1) for rule, need in zip(RULES, found.needs, strict=True)
+            design_for_power(q, rule, need, alone=comparisons == 1)
+            for rule, need in zip(RULES, found.needs, strict=True)
         ],
         "affordable": affordable,
         "tried": tried,
@@ -143,7 +144,7 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
     }
 
 
-def told(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
+def design_for_power(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
     """Return a design that reaches the power, with its trials and robot hours at most and on average; without
     one, `pairs` is None.
     """

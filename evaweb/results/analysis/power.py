@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from threading import Condition
 from typing import Any
 
-from evaweb.results.analysis.planner import Question, told
+from evaweb.results.analysis.planner import Question, design_for_power
 from evaweb.serving import computations
 from evaweb.statistics import score_courses
 from evaweb.statistics.base import StatisticsError
@@ -32,7 +32,7 @@ _KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class PowerRequest:
     """Request for the power of a design with `pairs` pairs, at each comparison's share of alpha and at assumed rates.
 
     `question` has rates, wanted power and times; its weaker rate is that of the control. `alone`: the plan has a
@@ -88,7 +88,7 @@ class Figures:
         """Whether the results are complete."""
         return bool(self.fault) or self.done == self.of
 
-    def planned(self, asked: Asked) -> dict[str, DesignPower]:
+    def planned(self, asked: PowerRequest) -> dict[str, DesignPower]:
         """Return the power at the planned number of trials, by design."""
         found = ((rule, one) for rule, curve in self.curves.items() for one in curve)
         return {rule: one for rule, one in found if one.pairs == asked.pairs}
@@ -102,7 +102,7 @@ def _computed(work: Callable[..., Any], *given: Any) -> Any:
 _Step = Callable[[Figures], Figures]
 
 
-def _steps(asked: Asked) -> Iterator[_Step]:
+def _steps(asked: PowerRequest) -> Iterator[_Step]:
     """Yield the steps in order of display: selected design, planned number of all designs, needs, remaining points."""
     planned = [asked.pairs] if asked.pairs in asked.numbers else []
     yield from (_point(asked, asked.rule, number) for number in [*planned, *asked.numbers])
@@ -113,7 +113,7 @@ def _steps(asked: Asked) -> Iterator[_Step]:
     yield from (_point(asked, rule, number) for rule in others for number in asked.numbers)
 
 
-def _point(asked: Asked, rule: str, number: int) -> _Step:
+def _point(asked: PowerRequest, rule: str, number: int) -> _Step:
     def step(so_far: Figures) -> Figures:
         found = {one.pairs: one for one in so_far.curves.get(rule, ())} | {number: asked.at(rule, number)}
         curve = tuple(found[pairs] for pairs in sorted(found))
@@ -122,14 +122,14 @@ def _point(asked: Asked, rule: str, number: int) -> _Step:
     return step
 
 
-def _need(asked: Asked, rule: str) -> _Step:
+def _need(asked: PowerRequest, rule: str) -> _Step:
     def step(so_far: Figures) -> Figures:
         question = asked.question
         if asked.scores is None:
             found = _computed(pairs_needed, rule, question.rate, question.better, question.power, asked.alpha)
         else:
             found = _computed(score_pairs_needed, rule, asked.scores, question.power, asked.alpha)
-        row = told(question, rule, found, alone=asked.alone)
+        row = design_for_power(question, rule, found, alone=asked.alone)
         return replace(so_far, needs={**so_far.needs, rule: row})
 
     return step
@@ -140,12 +140,12 @@ class _Desk:
 
     def __init__(self) -> None:
         self._changed = Condition()
-        self._found: OrderedDict[Asked, Figures] = OrderedDict()
-        self._newest: dict[Hashable, tuple[Asked, float]] = {}
-        self._under_way: set[Asked] = set()
+        self._found: OrderedDict[PowerRequest, Figures] = OrderedDict()
+        self._newest: dict[Hashable, tuple[PowerRequest, float]] = {}
+        self._under_way: set[PowerRequest] = set()
         self._thread = ThreadPoolExecutor(1, "power")
 
-    def ask(self, person: Hashable, asked: Asked, patience_s: float) -> Figures:
+    def query(self, person: Hashable, asked: PowerRequest, patience_s: float) -> Figures:
         """Return the results so far, after at most `patience_s` [s] or as soon as they are complete."""
         with self._changed:
             self._newest[person] = (asked, time.monotonic())
@@ -160,12 +160,12 @@ class _Desk:
                 self._found.popitem(last=False)
             return self._found.get(asked, Figures())
 
-    def _wanted(self, asked: Asked) -> bool:
+    def _wanted(self, asked: PowerRequest) -> bool:
         since = time.monotonic() - _GIVEN_UP_S
         self._newest = {who: row for who, row in self._newest.items() if row[1] > since}
         return any(newest == asked for newest, _ in self._newest.values())
 
-    def _compute(self, asked: Asked) -> None:
+    def _compute(self, asked: PowerRequest) -> None:
         steps = list(_steps(asked))
         for number, step in enumerate(steps, start=1):
             with self._changed:
@@ -194,6 +194,6 @@ class _Desk:
 _desk = _Desk()
 
 
-def figures(person: Hashable, asked: Asked, patience_s: float = 0.5) -> Figures:
+def figures(person: Hashable, asked: PowerRequest, patience_s: float = 0.5) -> Figures:
     """Return the results so far; the computation continues as long as the person repeats the request."""
-    return _desk.ask(person, asked, patience_s)
+    return _desk.query(person, asked, patience_s)

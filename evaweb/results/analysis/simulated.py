@@ -8,7 +8,7 @@ from typing import Any
 
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan
-from evaweb.plans.selectors import plans_beside
+from evaweb.plans.selectors import overlapping_plans
 from evaweb.results.analysis.caching import cached_runs
 from evaweb.results.analysis.outcomes import Outcome, by_checkpoint
 from evaweb.stations.models import Station
@@ -31,11 +31,11 @@ def simulated_plans(plan: Plan) -> list[Plan]:
     if is_simulated(plan) is not False:
         return []
     there = Station.objects.filter(simulated=True)
-    rows = plans_beside(plan).filter(handouts__trial__station__in=there).distinct()
+    rows = overlapping_plans(plan).filter(handouts__trial__station__in=there).distinct()
     return [row for row in rows.select_related("owner") if is_simulated(row)]
 
 
-def set_beside(real: Plan, simulated: Plan) -> dict[str, Any]:
+def compare_with_real(real: Plan, simulated: Plan) -> dict[str, Any]:
     """Return rates of the shared checkpoints, agreement of their order, and differences that use the simulated trials
     too.
 

@@ -20,7 +20,7 @@ from evaweb.plans.models import Allocation, Comparing, Plan, PrimaryOutcome, Ref
 from evaweb.plans.schedule import IMBALANCE, Condition, foretold, schedule
 from evaweb.plans.seeded_draws import KEY_BYTES
 from evaweb.results.analysis.planner import Question
-from evaweb.results.analysis.power import Asked, Figures
+from evaweb.results.analysis.power import Figures, PowerRequest
 from evaweb.results.presentation.drawings import time_courses
 from evaweb.results.templatetags.results_tags import design_text
 from evaweb.stations.models import Station
@@ -245,7 +245,7 @@ def _end(name: str, value: str) -> tuple[str, str, Any, str]:
     return name, field.verbose_name, field.choices, value
 
 
-def told(name: str, value: Any, sight: Visibility) -> str:
+def value_text(name: str, value: Any, sight: Visibility) -> str:
     """Return a value of a draft as text."""
     if value in (None, "", []):
         return "nothing"
@@ -274,7 +274,7 @@ def _pictures(positions: Iterable[Position]) -> dict[int, str]:
     return found
 
 
-def asked_of(plan: Plan, question: Question, spread: float) -> Asked | None:
+def power_request(plan: Plan, question: Question, spread: float) -> PowerRequest | None:
     """Return the request for the draft's power; None if it compares nothing, or no trial is planned.
 
     `spread` is the assumed standard deviation of scores, if these are compared.
@@ -287,7 +287,9 @@ def asked_of(plan: Plan, question: Question, spread: float) -> Asked | None:
     scores = None
     if plan.outcome == PrimaryOutcome.SCORE:
         scores = Scores(question.better, question.rate, spread, _points(plan))
-    return Asked(plan.stopping, size.each, share, plan.margin, looks, question, comparisons == 1, scores)
+    return PowerRequest(
+        plan.stopping, size.each, share, plan.margin, looks, question, comparisons == 1, scores
+    )
 
 
 def _points(plan: Plan) -> int:
@@ -313,7 +315,7 @@ def question_for(plan: Plan, given: Question) -> Question:
     )
 
 
-def power_page(plan: Plan, asked: Asked, found: Figures) -> dict[str, Any]:
+def power_page(plan: Plan, asked: PowerRequest, found: Figures) -> dict[str, Any]:
     """Return the figure and the table of designs, as far as computed."""
     size, question = Size.of(plan), asked.question
     at = found.planned(asked)

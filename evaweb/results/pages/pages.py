@@ -34,7 +34,7 @@ from evaweb.results.presentation.listings import (
     pair_rows,
     scene_rows,
 )
-from evaweb.results.presentation.wording import anytime_words, evidence_words
+from evaweb.results.presentation.wording import anytime_text, evidence_text
 from evaweb.statistics.designs import Design
 from evaweb.trials.failures import ordered_terms
 from runtime.core.sentences import Pattern
@@ -214,7 +214,7 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
             (
                 what,
                 time_courses.draw_evidence(evidence, *names, design.blocks, drawn),
-                evidence_words(evidence),
+                evidence_text(evidence),
             )
             for what, evidence in (
                 ("By success and failure", found.evidence),
@@ -223,8 +223,8 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
             if evidence
         ],
         "open": found.standing is Standing.OPEN,
-        "difference": anytime_words(found.anytime, found.pairs),
-        "score_difference": anytime_words(found.score_anytime, found.pairs),
+        "difference": anytime_text(found.anytime, found.pairs),
+        "score_difference": anytime_text(found.score_anytime, found.pairs),
         "level": 100 * (1 - design.share),
         "wanted": 2 / design.share,
     }

@@ -26,11 +26,11 @@ from evaweb.results import selectors
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
 from evaweb.results.analysis.filters import parse_filter
-from evaweb.results.analysis.simulated import is_simulated, set_beside, simulated_plans
+from evaweb.results.analysis.simulated import compare_with_real, is_simulated, simulated_plans
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
 from evaweb.results.presentation.citation import HEAD, Citation, citation
-from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_words
+from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_text
 from evaweb.results.ratings.automatic import judges_ready, request_judging
 from evaweb.results.ratings.result_visibility import (
     has_results,
@@ -160,7 +160,7 @@ def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
     context = {
         "record": record,
         "banner": delays_banner(record),
-        "too_few": too_few_words(record),
+        "too_few": too_few_text(record),
         "most": MOST_LINES,
         **_common(request, found),
     }
@@ -176,7 +176,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
         return sealed
     others = [row for row in simulated_plans(found) if not sealed_reason(row, request.user)]
     context = {
-        "beside": [set_beside(found, row) for row in others],
+        "beside": [compare_with_real(found, row) for row in others],
         "real": is_simulated(found),
         **_common(request, found),
     }

@@ -142,7 +142,7 @@ def _saved(request: HttpRequest, plan: Plan) -> HttpResponse:
             plan, sight, faults=faults, agreed=not others, cycle_s=_assumed(request.POST).cycle_s
         ),
         **_shown(changed.now, seen, faults),
-        "others": [(name, draft.told(name, changed.now[name], sight)) for name in others],
+        "others": [(name, draft.value_text(name, changed.now[name], sight)) for name in others],
         "keep": " ".join(others),
         "fault_rows": [
             (name, faults.get(name, ""))
@@ -208,7 +208,7 @@ def power(request: HttpRequest, name: str, version: int) -> HttpResponse:
     try:
         given = question_of(request.GET, alike=plan.margin is not None)
         spread = _spread(request.GET) if plan.outcome == PrimaryOutcome.SCORE else _SPREAD
-        asked = draft.asked_of(plan, draft.question_for(plan, given), spread)
+        asked = draft.power_request(plan, draft.question_for(plan, given), spread)
         if asked is not None:
             context |= draft.power_page(plan, asked, figures(request.user.pk, asked))
     except EvaError as error:

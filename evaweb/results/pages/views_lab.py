@@ -46,7 +46,7 @@ def planner(request: HttpRequest) -> HttpResponse:
     try:
         question = question_of(request.GET)
         table = table_of(question, request.user.pk, soon=True)
-    except computations.UnderWay:
+    except computations.StillRunning:
         waiting = True
     except EvaError as error:
         fault = error

@@ -30,7 +30,7 @@ def compare_address(plan: Plan, found: Comparison, only: TrialFilter) -> str:
     return f"{address}?{query}" + (f"&{only.query}" if only.query else "")
 
 
-def beside_address(episodes: Sequence[object]) -> str:
+def side_by_side_url(episodes: Sequence[object]) -> str:
     """Return the address that plays recordings synchronously; "" for fewer than two."""
     if len(episodes) < 2:
         return ""

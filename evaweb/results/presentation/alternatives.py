@@ -9,9 +9,17 @@ from typing import Any
 
 from evaweb.core.fingerprint_cache import FingerprintCache
 from evaweb.plans.counting import declared_failures
-from evaweb.plans.design import Attempt, arms_of, attempts_of, blocks_of, compared, frozen_design, kept_blocks
+from evaweb.plans.design import (
+    Attempt,
+    arms_of,
+    attempts_of,
+    blocks_of,
+    compared,
+    frozen_design,
+    stored_blocks,
+)
 from evaweb.plans.models import Plan
-from evaweb.results.presentation.headline import in_the_worst_case, sentence_of, told_alone
+from evaweb.results.presentation.headline import conclude_alone, in_the_worst_case, sentence_of
 from evaweb.statistics.designs import (
     FIXED,
     Block,
@@ -41,7 +49,7 @@ def headline_alternatives(plan: Plan, matches: Mapping[int, float]) -> list[dict
     if found is None:
         return []
     attempts = attempts_of(plan)
-    kept = kept_blocks(plan)
+    kept = stored_blocks(plan)
     at = (tuple(attempts), None if kept is None else tuple(kept), tuple(sorted(matches.items())), plan.state)
     return _kept.get(
         (plan.pk, plan.digest), at, lambda: list(_alternatives(plan, found, attempts, matches, kept))
@@ -96,7 +104,7 @@ def _alternatives(
                 first, second = compared(plan.document or {})[number]
                 told.append(f"No pair of {first} and {second} is left")
                 continue
-            sentence, way = told_alone(plan, by, number, blocks)
+            sentence, way = conclude_alone(plan, by, number, blocks)
             told.append(sentence)
             ways.append(way)
         same = _concluded(ways) == _concluded(decided.each) if len(ways) == len(told) else None

@@ -13,7 +13,7 @@ from evaweb.core.errors import Conflict
 from evaweb.plans.counting import ENDS
 from evaweb.plans.design import (
     arms_of,
-    blocks_kept,
+    blocks_of_record,
     compared,
     counted_now,
     frozen_design,
@@ -23,11 +23,11 @@ from evaweb.plans.design import (
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.drawings.svg import Drawing, printable
-from evaweb.results.presentation.headline import alpha_words, letters_of, rule_words, sentence_of
+from evaweb.results.presentation.headline import alpha_text, letters_of, rule_text, sentence_of
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.setting import setting_now
 from evaweb.results.presentation.wording import format_interval, rate_words
-from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Block, Design, looks_at
+from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Block, Design, look_schedule
 from evaweb.statistics.proportions import Proportion, proportion
 from runtime.core.sentences import Pattern
 
@@ -118,7 +118,7 @@ class Citation:
     @cached_property
     def blocks(self) -> list[Block]:
         """Blocks that count."""
-        return blocks_kept(self.kept)
+        return blocks_of_record(self.kept)
 
     @cached_property
     def design(self) -> str:
@@ -131,8 +131,8 @@ class Citation:
         drops = "; checkpoints dropped once they were found worse" if found.drops else ""
         order = "" if found.counts is None else ", checkpoints in random order"
         return (
-            f"Design: {rule_words(self.plan)}, {_looks(found)}, {found.blocks} {found.unit} foreseen{order}, "
-            f"{alpha_words(found)}; asks {asks}, by {outcome}{drops}; {blind}{_declared(document)}."
+            f"Design: {rule_text(self.plan)}, {_looks(found)}, {found.blocks} {found.unit} foreseen{order}, "
+            f"{alpha_text(found)}; asks {asks}, by {outcome}{drops}; {blind}{_declared(document)}."
         )
 
     @cached_property
@@ -198,7 +198,7 @@ class Citation:
         """Whether scores were corrected or added after the reveal."""
         now = counted_now(self.plan)
         arms = self.kept.get("arms", now["arms"])
-        return not same_blocks(blocks_kept(now), self.blocks) or now["arms"] != arms
+        return not same_blocks(blocks_of_record(now), self.blocks) or now["arms"] != arms
 
     @cached_property
     def text(self) -> dict[str, str]:
@@ -261,7 +261,7 @@ class Citation:
                 "alpha": self.found.alpha,
                 "outcome": self.found.outcome,
                 "margin": self.found.margin,
-                "looks": looks_at(self.found),
+                "looks": look_schedule(self.found),
                 "words": self.design,
             },
             "blocks": self.blocks,
@@ -319,7 +319,7 @@ def _question(found: Design, first: str, second: str) -> str:
 def _looks(found: Design) -> str:
     if found.rule == FIXED:
         return "one test at the end"
-    at = looks_at(found)
+    at = look_schedule(found)
     if found.rule == ANYTIME or at == list(range(1, found.blocks + 1)):
         return f"looked at after every {found.unit[:-1]}"
     return f"looked at after {', '.join(map(str, at))} {found.unit}"

@@ -14,9 +14,9 @@ from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.wording import (
-    anytime_words,
+    anytime_text,
     difference_sentence,
-    evidence_words,
+    evidence_text,
     format_points,
     p_words,
     probability,
@@ -118,13 +118,13 @@ def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator
 def _of_the_evidence(found: Comparison) -> Iterator[ComparisonFact]:
     if found.evidence:
         yield ComparisonFact(
-            "Enough evidence to stop?", f"e-process, alpha {found.alpha:.2g}", evidence_words(found.evidence)
+            "Enough evidence to stop?", f"e-process, alpha {found.alpha:.2g}", evidence_text(found.evidence)
         )
     if found.score_evidence:
         yield ComparisonFact(
             "With partial credit, at any time?",
             "betting e-process on scores",
-            evidence_words(found.score_evidence),
+            evidence_text(found.score_evidence),
         )
     for question, interval in (
         ()
@@ -135,7 +135,7 @@ def _of_the_evidence(found: Comparison) -> Iterator[ComparisonFact]:
         )
     ):
         how = f"confidence sequence, {100 * (1 - found.alpha):.3g} %"
-        yield ComparisonFact(question, how, anytime_words(interval, found.pairs))
+        yield ComparisonFact(question, how, anytime_text(interval, found.pairs))
 
 
 def _later_facts(found: Comparison) -> Iterator[ComparisonFact]:

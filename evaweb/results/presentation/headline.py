@@ -13,8 +13,8 @@ from evaweb.plans.design import (
     compared,
     current_pairs,
     frozen_design,
-    kept_blocks,
     same_blocks,
+    stored_blocks,
     visible_close_reason,
 )
 from evaweb.plans.models import Plan, PlanState
@@ -73,14 +73,14 @@ class Headline:
     setting: str = ""
 
     @property
-    def said(self) -> tuple[str, ...]:
+    def all_sentences(self) -> tuple[str, ...]:
         """Sentence on the best checkpoint, if any, then one per comparison."""
         return (self.best, *self.sentences) if self.best else self.sentences
 
     @property
     def sentence(self) -> str:
         """All sentences as one text."""
-        return ". ".join(self.said)
+        return ". ".join(self.all_sentences)
 
     @property
     def caveats(self) -> tuple[str, ...]:
@@ -110,11 +110,11 @@ def headline(plan: Plan) -> Headline | None:
     if found is None:
         return None
     now = current_pairs(plan)
-    kept = kept_blocks(plan)
+    kept = stored_blocks(plan)
     at_reveal = now.counted if kept is None else kept
     return Headline(
         sentences_of(plan, found, at_reveal),
-        f"{rule_words(plan)}, {alpha_words(found)}",
+        f"{rule_text(plan)}, {alpha_text(found)}",
         _other(plan, found, now.counted, at_reveal),
         _other(plan, found, now.at_first, at_reveal),
         ". ".join(told.sentence for told in in_the_worst_case(plan, found, at_reveal, now)),
@@ -132,7 +132,7 @@ def headline_document(plan: Plan) -> dict[str, Any] | None:
     return said and {**asdict(said), "letters": dict(said.letters), "caveats": list(said.caveats)}
 
 
-def alpha_words(found: Design) -> str:
+def alpha_text(found: Design) -> str:
     """Return alpha, and how many comparisons share it."""
     several = len(found.comparisons)
     how = "Holm over" if found.holm and found.rule == FIXED and found.margin is None else "shared by"
@@ -151,7 +151,7 @@ def with_planned_letters(plan: Plan, analysis: Analysis) -> Analysis:
     return replace(analysis, letters={name: letter for name, letter in said.letters if name in there})
 
 
-def rule_words(plan: Plan) -> str:
+def rule_text(plan: Plan) -> str:
     """Return the stopping rule of the design in one or two words."""
     return str(plan.get_stopping_display()).partition(":")[0]
 
@@ -243,7 +243,7 @@ def _sentence(
     if found.margin is not None:
         claim = f"{first} is {'' if one.winner else 'not shown to be '}not worse than {second}"
         return f"{claim} by {100 * found.margin:g} points or more: {counts}"
-    if one.winner is None and not one.dropped and not _could_tell(plan, found, pair, blocks):
+    if one.winner is None and not one.dropped and not _could_separate(plan, found, pair, blocks):
         return f"Undecided: {one.ended_at_pair} {found.unit} cannot tell {first} and {second} apart: {counts}"
     if one.winner is None:
         why = ", when one of them was dropped" if one.dropped else ""
@@ -256,7 +256,7 @@ def _sentence(
     return f"{better} reached higher scores than {worse}: {counts}"
 
 
-def _could_tell(plan: Plan, found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
+def _could_separate(plan: Plan, found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
     """Return True if some outcomes of this many trials could have separated these two."""
     if (plan.document or {}).get("format", 1) < _UNDECIDED:
         return True
@@ -319,7 +319,7 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
             # Other outcomes would have dropped other arms, whose trials do not exist: each comparison counts on its
             # own, up to its end.
             single, both = alone(found, pair, blocks[: one.ended_at_pair]) if found.drops else (found, blocks)
-            sentence, other = told_alone(plan, single, number, both)
+            sentence, other = conclude_alone(plan, single, number, both)
             told.append(WorstCase(sentence, other.winner == one.winner))
     return told
 
@@ -343,7 +343,9 @@ def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
     return replace(now, counted=outcomes)
 
 
-def told_alone(plan: Plan, single: Design, number: int, blocks: Sequence[Block]) -> tuple[str, Conclusion]:
+def conclude_alone(
+    plan: Plan, single: Design, number: int, blocks: Sequence[Block]
+) -> tuple[str, Conclusion]:
     """Return sentence and conclusion of comparison `number` from these blocks by the design `single`."""
     names = compared(plan.document or {})[number]
     pair = single.comparisons[number if len(single.comparisons) > 1 else 0]
@@ -357,7 +359,7 @@ def _versions(plan: Plan) -> tuple[str, ...]:
     while version is not None:
         found = frozen_design(version.document) if version.document else None
         if found is not None:
-            kept = kept_blocks(version)
+            kept = stored_blocks(version)
             sentence = sentence_of(version, found, current_pairs(version).counted if kept is None else kept)
             told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
         version = version.amends

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.conduct import all_attempts, looks_of, plan_conduct
+from evaweb.results.analysis.conduct import all_attempts, bench_images, plan_conduct
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT
 from evaweb.results.presentation.alternatives import headline_alternatives
 from evaweb.results.presentation.wording import p_words
@@ -18,7 +18,7 @@ _RARE = 0.05  # probability at or below which an anchor counts as drifting
 
 def integrity_document(plan: Plan) -> dict[str, Any]:
     """Return the conduct of the plan, its alternative headlines, and `remarks` that summarise both."""
-    looks = looks_of(plan)
+    looks = bench_images(plan)
     runs = all_attempts(plan, looks)
     matches = {run.trial: run.match for run in runs if run.match is not None}
     found = {**plan_conduct(plan, runs, looks), "headline": headline_alternatives(plan, matches)}
@@ -46,7 +46,7 @@ def delays_banner(found: Mapping[str, Any]) -> str:
     )
 
 
-def too_few_words(found: Mapping[str, Any]) -> str:
+def too_few_text(found: Mapping[str, Any]) -> str:
     """Return a sentence if the pairs are too few for any test of delays to be significant, else ""."""
     delays = found["delays"]
     pairs = [test["pairs"] for row in delays["rows"] for test in row["tests"] if test["p"] is not None]

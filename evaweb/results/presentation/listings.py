@@ -14,7 +14,7 @@ from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis, Arm
 from evaweb.results.analysis.filters import TrialFilter, filter_choices
 from evaweb.results.analysis.outcomes import Outcome, Pair
-from evaweb.results.presentation.addresses import beside_address, trials_address
+from evaweb.results.presentation.addresses import side_by_side_url, trials_address
 from evaweb.results.presentation.drawings import conditions
 from evaweb.results.presentation.wording import format_interval
 from evaweb.results.ratings.footage import is_watchable
@@ -30,7 +30,7 @@ from evaweb.statistics.proportions import Proportion
 from evaweb.trials.failure_text import UNSPECIFIED
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.rate_bars import average_words
+from evaweb.trials.rate_bars import average_text
 
 MOST_PAIRS = 200
 
@@ -61,8 +61,8 @@ def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str
             "speed": arm.speed
             and f"{arm.speed.per_hour:.1f} [{arm.speed.interval.low:.1f}, {arm.speed.interval.high:.1f}]",
             "between": _between(arm),
-            "smoothness": average_words(arm.smoothness, arm.success.n),
-            "commanded": average_words(arm.commanded, arm.success.n),
+            "smoothness": average_text(arm.smoothness, arm.success.n),
+            "commanded": average_text(arm.commanded, arm.success.n),
         }
         for arm in analysis.arms
     ]
@@ -163,7 +163,7 @@ def pair_rows(pairs: Sequence[tuple[int, Pair]]) -> list[dict[str, Any]]:
     rows = []
     for number, pair in pairs:
         sides = [Side(run, episodes.get(run.trial)) for run in (pair.first, pair.second)]
-        beside = beside_address([side.episode.uuid for side in sides if side.episode])
+        beside = side_by_side_url([side.episode.uuid for side in sides if side.episode])
         rows.append({"number": number, "pair": pair, "sides": sides, "beside": beside})
     return rows
 

@@ -73,7 +73,7 @@ def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
     )
 
 
-def evidence_words(found: Evidence) -> str:
+def evidence_text(found: Evidence) -> str:
     """Return the state of the evidence as text, and whether it suffices."""
     if found.stop is not None:
         return f"suffices since pair {found.stop}"
@@ -83,7 +83,7 @@ def evidence_words(found: Evidence) -> str:
     return f"not enough after {found.pairs} pairs (e = {_power(e)}, wanted {2 / found.alpha:.0f})"
 
 
-def anytime_words(found: Interval | None, pairs: int) -> str:
+def anytime_text(found: Interval | None, pairs: int) -> str:
     """Return for example "[−3, 55] points, of 40 pairs"."""
     return (
         f"[{format_interval(found)}] points, of {pairs} pairs"

@@ -136,7 +136,7 @@ register_check(_rated_first)
 
 
 @still_judges
-def _may_be_asked(user: User, episode: Episode) -> bool:
+def _can_rate(user: User, episode: Episode) -> bool:
     """Return True if this user may be asked to rate the trial of an episode a second time."""
     trial = getattr(episode, "trial", None)
     if trial is None or role_of(user) is Role.VIEWER:

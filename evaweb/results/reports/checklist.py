@@ -127,7 +127,7 @@ def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
 
 def _voids(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
     voided = trials.filter(status=TrialStatus.VOIDED)
-    late = voided.filter(voided_at__gte=plan.kept_at).count() if plan.kept_at else 0
+    late = voided.filter(voided_at__gte=plan.stored_at).count() if plan.stored_at else 0
     words = f"{voided.count()} voided in this version, each with a reason, {late} of them after the reveal"
     return Item("No trial of this version voided after the reveal", _yes_or_no(late == 0), words)
 
@@ -136,7 +136,7 @@ def _corrections(plan: Plan) -> Item:
     scores = Score.objects.filter(trial__evaluation=plan.evaluation_id)
     rows = with_changes(scores, why=F("reason"), at=F("scored_at"))
     corrected = sum(bool(row["why"]) for row in rows if row["changed"] == VERDICT)
-    late = Counter(row["changed"] for row in rows if plan.kept_at and row["at"] > plan.kept_at)
+    late = Counter(row["changed"] for row in rows if plan.stored_at and row["at"] > plan.stored_at)
     categories = sum(row["changed"] == CATEGORY for row in rows)
     words = (
         f"{corrected} corrections, each a row of its own with author and reason, {late[VERDICT]} scores after the "

@@ -9,7 +9,7 @@ from typing import Any
 
 from evaweb.core.canonical_json import digest
 from evaweb.core.tabular_export import plain
-from evaweb.plans.design import declare_kept
+from evaweb.plans.design import register_reveal_data
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.headline import headline
@@ -28,11 +28,11 @@ STAYS = ("looks", "voids", "cameras")  # parts of the integrity document
 LOOKED_AT = ("smoothness", "smoothness_commanded")  # computed from a recording by the worker
 
 
-def kept_of(plan: Plan) -> dict[str, Any]:
+def record_to_seal(plan: Plan) -> dict[str, Any]:
     """Return headline, setting and caveats as texts, and digests of attempts, scores, measurements and judgements."""
     said = headline(plan)
     return {
-        "headline": list(said.said) if said else [],
+        "headline": list(said.all_sentences) if said else [],
         "caveats": caveats_of(plan),
         "setting": setting_now(plan),
         "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
@@ -85,4 +85,4 @@ def _scores(plan: Plan) -> Iterator[list[str]]:
         yield from ([plain(row[name]) for name in SCORE_COLUMNS] for row in page)
 
 
-declare_kept(kept_of)
+register_reveal_data(record_to_seal)

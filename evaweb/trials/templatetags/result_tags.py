@@ -58,7 +58,7 @@ def interval(found: Proportion) -> str:
 @register.filter
 def mean_with_interval(found: Average | None, of: int) -> str:
     """Return a mean with its interval and count; a dash if there is none."""
-    return rate_bars.average_words(found, of) or "–"
+    return rate_bars.average_text(found, of) or "–"
 
 
 @register.filter

@@ -51,7 +51,7 @@ class CommandExecutor:
         """The answer to one message; every fault is a sentence in it."""
         script = self._scripts.get_or_create(holder)
         if message.form == "query":
-            return self._asked(script, message)
+            return self._run_query(script, message)
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "", "done")
         known = self._outcomes.get(outcome.id)
         if known is not None and known.result != "unknown":
@@ -163,7 +163,7 @@ class CommandExecutor:
 
     # --- questions -----------------------------------------------------------------------------------------
 
-    def _asked(self, script: Script, message: Message) -> dict[str, Any]:
+    def _run_query(self, script: Script, message: Message) -> dict[str, Any]:
         if message.name not in QUERIES:
             return {
                 "ok": False,

@@ -53,14 +53,14 @@ def read(frames: list[bytes]) -> Message:
     fields = _object(frames)
     client, identity = _client(fields), _identity(fields)
     if "query" in fields:
-        return Message("query", _word(fields, "query"), fields, client=client, id=identity)
+        return Message("query", _text_field(fields, "query"), fields, client=client, id=identity)
     if "cmd" in fields:
         verb, argument = _verb(fields["cmd"])
         return Message("cmd", verb, fields, argument, client=client, id=identity)
     if "command" in fields:
         arguments = _arguments(fields)
         return Message(
-            "command", _word(fields, "command"), fields, arguments=arguments, client=client, id=identity
+            "command", _text_field(fields, "command"), fields, arguments=arguments, client=client, id=identity
         )
     raise Malformed("message must carry 'cmd' or 'query' (or 'command')")
 
@@ -102,7 +102,7 @@ def _no_number(word: str) -> NoReturn:
     raise ValueError(f"{word} is no number of JSON")
 
 
-def _word(fields: Mapping[str, Any], key: str) -> str:
+def _text_field(fields: Mapping[str, Any], key: str) -> str:
     word: object = fields[key]
     if not isinstance(word, str):
         raise Malformed(f"unknown {key}: {word!r:.80}; it is a word")

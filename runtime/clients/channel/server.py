@@ -75,14 +75,14 @@ class ChannelServer:
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._replies, zmq.POLLIN)
         poller.poll(int(timeout * 1000))
-        for act, socket in ((self._send, self._replies), (self._take, self._socket)):
+        for act, socket in ((self._send, self._replies), (self._route, self._socket)):
             for _ in range(_AT_ONCE):
                 frames = _next(socket)
                 if frames is None:
                     break
                 act(frames)
 
-    def _take(self, frames: list[bytes]) -> None:
+    def _route(self, frames: list[bytes]) -> None:
         """Hand a message to its lane; what cannot be read, or finds no room, is answered at once."""
         end = frames.index(b"", 1) + 1 if b"" in frames[1:] else 1
         address, body = frames[:end], frames[end:]

@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     station_dir = data / "stations" / given.station
     try:
         if given.set_pin:
-            PinFile(station_dir).set(_asked())
+            PinFile(station_dir).set(_prompt_pin())
             print(f"the panel of {given.station} has another PIN: who had given the former one gives it anew")
             return 0
         logs.configure_logging("panel")
@@ -97,7 +97,7 @@ def _open(panel: Panel, ended: Callable[[], bool]) -> PanelServer | None:
     return None
 
 
-def _asked() -> str:
+def _prompt_pin() -> str:
     """The PIN from a terminal, twice; from a pipe, its first line."""
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")

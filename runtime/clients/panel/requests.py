@@ -32,7 +32,7 @@ from runtime.clients.panel.pin import PinFile
 from runtime.clients.panel.server import REQUEST_S, Connection, PanelServer
 from runtime.clients.panel.sessions import LASTS_S, Refusal, Sessions
 from runtime.clients.panel.settings import PanelPlace
-from runtime.clients.panel.stops import Stops, Told
+from runtime.clients.panel.stops import StopResult, Stops
 from runtime.clients.panel.watch import Watch
 
 log = logging.getLogger(__name__)
@@ -102,8 +102,8 @@ class PanelRequests(BaseHTTPRequestHandler):
         elif path in _FILES:
             self._answer(HTTPStatus.OK, (_PAGE / path[1:]).read_bytes(), _FILES[path])
         elif path == "/state" and self._has_pin():
-            self._panel.watch.look()
-            self._json(HTTPStatus.OK, self._panel.watch.shown())
+            self._panel.watch.note_viewer()
+            self._json(HTTPStatus.OK, self._panel.watch.status())
         elif path.startswith("/camera/") and self._has_pin():
             self._picture(unquote(path.removeprefix("/camera/")))
         elif path == "/state" or path.startswith("/camera/"):
@@ -117,11 +117,11 @@ class PanelRequests(BaseHTTPRequestHandler):
         self._connection.presses = path == "/estop"
         if not self._known_host() or not self._own_origin():
             return
-        said = self._said()
+        said = self._posted_fields()
         if path == "/estop":
-            self._told(self._panel.stops.press(self._connection.source, _uuid(said)))
+            self._send_result(self._panel.stops.press(self._connection.source, _uuid(said)))
         elif path == "/stop" and self._has_pin():
-            self._told(self._panel.stops.stop(self._connection.source, _uuid(said)))
+            self._send_result(self._panel.stops.stop(self._connection.source, _uuid(said)))
         elif path == "/stop":
             self._refuse(HTTPStatus.UNAUTHORIZED, "give the PIN first: the E-STOP needs none")
         elif path == "/pin":
@@ -142,7 +142,7 @@ class PanelRequests(BaseHTTPRequestHandler):
         self._answer(HTTPStatus.OK, page.encode(), "text/html; charset=utf-8")
 
     def _picture(self, camera: str) -> None:
-        self._panel.watch.look()
+        self._panel.watch.note_viewer()
         picture = self._panel.watch.picture(camera)
         seen = parse_qs(urlsplit(self.path).query).get("seen", [""])[0]
         if picture is None or seen == str(picture.number):
@@ -162,7 +162,7 @@ class PanelRequests(BaseHTTPRequestHandler):
         log.info("the PIN was given from %s", source)
         self._json(HTTPStatus.OK, {}, self._cookie(secret, int(LASTS_S)))
 
-    def _told(self, told: Told) -> None:
+    def _send_result(self, told: StopResult) -> None:
         """As JSON to our script; as text to a form, which works where the script does not."""
         status = HTTPStatus.OK if told.done else HTTPStatus.BAD_GATEWAY
         if HEADER in self.headers:
@@ -202,7 +202,7 @@ class PanelRequests(BaseHTTPRequestHandler):
             return ""
         return found.value if found is not None else ""
 
-    def _said(self) -> dict[str, Any]:
+    def _posted_fields(self) -> dict[str, Any]:
         """What was posted, {} where it cannot be read: no press is lost for what is in it."""
         length = self.headers.get("Content-Length", "0")
         if "Transfer-Encoding" in self.headers or not length.isascii() or not length.isdigit():

@@ -19,7 +19,7 @@ _GUARD_S, _COORDINATOR_S = 1.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StopResult:
     """What became of it: whether the station has done it, and the sentence that says so."""
 
     done: bool
@@ -32,7 +32,7 @@ class Stops:
     def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
         self._context, self._endpoints = context, Endpoints(station_dir)
 
-    def press(self, source: str, uuid: str) -> Told:
+    def press(self, source: str, uuid: str) -> StopResult:
         """Press the e-stop: at the guard, and where that does not answer at the coordinator, which has the flag too."""
         command = self._command(
             uuid, "estop", source, {"why": sanitize_text(f"at the station's panel, from {source}")}
@@ -43,21 +43,21 @@ class Stops:
             try:
                 ack = self._ask(command, ("coordinator", "commands"), _COORDINATOR_S)
             except (TransportError, CodecError) as fault:
-                return Told(False, f"USE THE HARDWARE STOP: {fault}")
+                return StopResult(False, f"USE THE HARDWARE STOP: {fault}")
         if ack.status in ("done", "accepted"):
-            return Told(True, ack.reason)
+            return StopResult(True, ack.reason)
         text = ack.reason if "HARDWARE STOP" in ack.reason else f"USE THE HARDWARE STOP: {ack.reason}"
-        return Told(False, text)
+        return StopResult(False, text)
 
-    def stop(self, source: str, uuid: str) -> Told:
+    def stop(self, source: str, uuid: str) -> StopResult:
         """Stop the run, whoever holds the lease."""
         command = self._command(uuid, "stop", source, {})
         try:
             ack = self._ask(command, ("coordinator", "commands"), _COORDINATOR_S)
         except (TransportError, CodecError) as fault:
-            return Told(False, f"{fault}; the E-STOP goes another way")
+            return StopResult(False, f"{fault}; the E-STOP goes another way")
         done = ack.status in ("done", "accepted")
-        return Told(done, "stopped" if done else ack.reason)
+        return StopResult(done, "stopped" if done else ack.reason)
 
     def _command(self, uuid: str, kind: str, source: str, args: dict[str, Any]) -> Command:
         holder = PANEL + source

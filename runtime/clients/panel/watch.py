@@ -71,15 +71,15 @@ class Watch:
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
         self._thread.start()
 
-    def look(self) -> None:
+    def note_viewer(self) -> None:
         """Somebody looks just now."""
         self._looked = self._clock()
         self._wanted.set()
 
-    def shown(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         """What the page shows, for JSON; `silent_s`: for how long nothing was heard [s], 0 where it is."""
         silent = self._clock() - self._heard
-        told = shown(self._state) if self._state else {}
+        told = displayed_state(self._state) if self._state else {}
         told["silent_s"] = 0.0 if silent < SILENT_S else round(min(silent, 1e6), 1)
         told["cameras"] = {name: picture.number for name, picture in sorted(self._pictures.items())}
         return told | {"station": self._station_dir.name, "lab": read_uplink(self._endpoints)}
@@ -114,11 +114,11 @@ class Watch:
                     found = self._clock()
                     state.turn_to(self._place("coordinator", "state"))
                     cameras.turn_to(self._place("media", "cameras"))
-                for name, jpeg in cameras.hear(0.0).items():
+                for name, jpeg in cameras.receive(0.0).items():
                     camera = name.removeprefix("camera/")
                     before = self._pictures.get(camera)
                     self._pictures[camera] = Picture(before.number + 1 if before else 1, bytes(jpeg))
-                said = state.hear(_TURN_S)
+                said = state.receive(_TURN_S)
                 if "state" in said:
                     self._state, self._heard = complete_state_meaning(said["state"]), self._clock()
         finally:
@@ -149,7 +149,7 @@ class _Ear:
         self._place = place
         self._subscriber = Subscriber(self._context, place, self._stream) if place else None
 
-    def hear(self, seconds: float) -> dict[str, Any]:
+    def receive(self, seconds: float) -> dict[str, Any]:
         if self._subscriber is None:
             time.sleep(seconds)
             return {}
@@ -158,7 +158,7 @@ class _Ear:
         return {}
 
 
-def shown(snapshot: Mapping[str, Any]) -> dict[str, Any]:
+def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
     """Of a snapshot what somebody at the robot needs: state, reason, who commands, how long it runs, the e-stop."""
     meaning, run = snapshot["state_is"], snapshot.get("run") or {}
     lease = snapshot.get("lease") or {}

@@ -10,11 +10,11 @@ from typing import Any
 def arguments(given: argparse.Namespace) -> dict[str, Any]:
     """The arguments of a command that needs nothing of the station to be known."""
     build = _BUILDERS.get(given.command)
-    return {} if build is None else _said(build(given))
+    return {} if build is None else _without_none(build(given))
 
 
 def _setup(given: argparse.Namespace) -> dict[str, Any]:
-    policy = dict(given.policy or []) | _said({"url": given.policy_url})
+    policy = dict(given.policy or []) | _without_none({"url": given.policy_url})
     return {
         "policy": policy or None,
         "strategy": None if given.strategy is None else {"kind": given.strategy},
@@ -50,7 +50,7 @@ def _gripper(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def _tune(given: argparse.Namespace) -> dict[str, Any]:
-    strategy = dict(given.set or []) | _said({"kind": given.strategy})
+    strategy = dict(given.set or []) | _without_none({"kind": given.strategy})
     return {"strategy": strategy or None, "task": given.task}
 
 
@@ -64,5 +64,5 @@ _BUILDERS = {
 }
 
 
-def _said(values: Mapping[str, Any]) -> dict[str, Any]:
+def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}

@@ -32,7 +32,7 @@ def watch(client: StationClient, as_json: bool) -> int:
             boot, seen = status["boot"], 0
         if status["newest_event"] > seen:
             for event in client.events_since(seen):
-                tell(event, as_json)
+                print_event(event, as_json)
                 seen = event["number"]
         if time.monotonic() - shown > _SHOW_S:
             shown = time.monotonic()
@@ -41,7 +41,7 @@ def watch(client: StationClient, as_json: bool) -> int:
             )
 
 
-def tell(event: dict[str, Any], as_json: bool = False) -> None:
+def print_event(event: dict[str, Any], as_json: bool = False) -> None:
     """One event as a line."""
     print(json.dumps(event, default=str) if as_json else f"  {event['kind']}: {event['text']}", flush=True)
 
@@ -56,7 +56,7 @@ def list_events(client: StationClient, given: argparse.Namespace) -> int:
     ]
     for event in events if given.last is None else events[-given.last or len(events) :]:
         if given.json:
-            tell(event, as_json=True)
+            print_event(event, as_json=True)
         else:
             ago = f"{now - event['time']:8.1f} s ago"
             print(f"{event['number']:6} {ago}  {event['kind']}: {event['text']}")

@@ -106,7 +106,7 @@ class ArenaRequest:
             self._history.add(observation)
 
     @property
-    def sees_poses(self) -> bool:
+    def uses_poses(self) -> bool:
         """True if poses are sent."""
         return self._poses is not None
 

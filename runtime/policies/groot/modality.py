@@ -155,13 +155,13 @@ def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
     if not isinstance(configs, list) or len(configs) != len(keys):
         return {}
     return {
-        key: ActionFormat(_word(config.get("rep")), _word(config.get("format")))
+        key: ActionFormat(_enum_name(config.get("rep")), _enum_name(config.get("format")))
         for key, config in zip(keys, configs, strict=True)
         if isinstance(config, Mapping)
     }
 
 
-def _word(given: object) -> str:
+def _enum_name(given: object) -> str:
     """Return the name of an enumeration member from its name or value."""
     return str(given).upper().replace("+", "_")
 

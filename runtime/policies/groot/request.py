@@ -133,7 +133,7 @@ class Gr00tRequest:
         assert wanted is not None, "configure comes first"
         self._remember(moment)
         settings = self._settings
-        seen, felt = self._at(wanted.video.steps), self._at(wanted.state.steps)
+        seen, felt = self._nearest_inputs(wanted.video.steps), self._nearest_inputs(wanted.state.steps)
         video = {key: np.stack([one.pictures[key] for one in seen]) for key in settings.video}
         states = np.stack([one.state for one in felt])
         state = {key: np.ascontiguousarray(states[:, dims]) for key, dims in settings.state.items()}
@@ -202,7 +202,7 @@ class Gr00tRequest:
         while len(self._moments) > 1 and self._moments[1].step <= earliest:
             self._moments.popleft()
 
-    def _at(self, steps: Sequence[int]) -> list[ModelInput]:
+    def _nearest_inputs(self, steps: Sequence[int]) -> list[ModelInput]:
         now = self._moments[-1].step
         return [
             min(reversed(self._moments), key=lambda one, at=now + step * self._pace: abs(one.step - at))  # type: ignore[misc]

@@ -62,11 +62,11 @@ class TunnelKeeper:
 
     def start(self) -> None:
         """Run in a thread of its own: ssh ends with the thread that started it."""
-        threading.Thread(target=self._keep, name="tunnel", daemon=True).start()
+        threading.Thread(target=self._run, name="tunnel", daemon=True).start()
 
     def close(self) -> None:
         """Return at once; the thread ends its ssh."""
-        self._tell(closed=True, why="it was closed from our side")
+        self._set_status(closed=True, why="it was closed from our side")
         self._stop.set()
 
     def duration(self, status: Status) -> float:
@@ -102,7 +102,7 @@ class TunnelKeeper:
             return
         elif ssh.is_listening():
             self._taken = 0
-            self._tell(up=True, since=now, port=ssh.port)
+            self._set_status(up=True, since=now, port=ssh.port)
             log.info("the tunnel to %s is up, at port %d", self._name, ssh.port)
         elif now - self._begun > self._deadline:
             last = f" ({ssh.said[-1]})" if ssh.said else ""
@@ -125,7 +125,7 @@ class TunnelKeeper:
     def _count(self, ssh: Ssh) -> None:
         if ssh.refusals > self._refused:
             new, self._refused = ssh.refusals - self._refused, ssh.refusals
-            self._tell(refusals=self.status.refusals + new, refusal=ssh.refusal)
+            self._set_status(refusals=self.status.refusals + new, refusal=ssh.refusal)
 
     def _discard(self, ssh: Ssh, reason: str) -> None:
         """End this ssh and record the failure; retry at once if only its port was taken."""
@@ -143,23 +143,23 @@ class TunnelKeeper:
         self._back_off.record_failure(now)
         self._taken = 0
         since = now if before.up else before.since
-        self._tell(up=False, since=since, port=0, why=reason, failures=before.failures + 1)
+        self._set_status(up=False, since=since, port=0, why=reason, failures=before.failures + 1)
         again = self._back_off.remaining_delay(now)
         log.warning("the tunnel to %s is down: %s; trying again in %.1f s", self._name, reason, again)
 
-    def _tell(self, **changes: Any) -> None:
+    def _set_status(self, **changes: Any) -> None:
         with self._changed:
             self.status = replace(self.status, **changes)
             self._changed.notify_all()
 
-    def _keep(self) -> None:
+    def _run(self) -> None:
         try:
             while not self._stop.is_set():
                 self.poll()
                 self._stop.wait(_POLL_S)
         except Exception as error:  # an error of our own code must be reported to waiting threads
             log.exception("the tunnel to %s is not kept any more", self._name)
-            self._tell(why=f"it is not kept any more ({type(error).__name__}: {error})")
+            self._set_status(why=f"it is not kept any more ({type(error).__name__}: {error})")
         finally:
             self.stop()
-            self._tell(up=False, since=self._now(), port=0, closed=True)
+            self._set_status(up=False, since=self._now(), port=0, closed=True)

@@ -205,7 +205,7 @@ class CommandPipeline:
         if run is not None and self._gap is not None:
             return self._wait_for_joints(run, self._gap, step, planned, seen)
         if run is not None and self._unseen:
-            self._look_whether_seen(run, step, planned, seen)
+            self._check_joints_returned(run, step, planned, seen)
         target = self.behaviour.target(step, self.actuator.elapsed(planned))
         if target is None:
             return self._nothing_planned(step, planned, seen)
@@ -328,7 +328,7 @@ class CommandPipeline:
             self.hold_because("refusals", why)
         return self._send_braking(step, planned, seen)._replace(refused=True)
 
-    def _look_whether_seen(
+    def _check_joints_returned(
         self, run: ExecuteChunks, step: int, planned: float, seen: LatestObservation
     ) -> None:
         """Discard the plan if joints are back before the run had to wait, but the plan has moved on."""

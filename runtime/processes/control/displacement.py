@@ -104,7 +104,7 @@ class DisplacementMonitor:
         if self.goal is not None:  # joints that are pushed beyond the goal, or back, are left where they are
             on = (self.goal - robot.commanded) * (measured - robot.commanded) > 0.0
             assert self._led is not None
-            along = self._angles & self._led.look(
+            along = self._angles & self._led.update(
                 robot.commanded, measured, self.goal, self._plausibility.speed(), now
             )
             self._doubt = self._named(along & ~self._off, robot, measured)

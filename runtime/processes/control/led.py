@@ -67,7 +67,7 @@ class Led:
         """Return how far the command may now be moved towards `goal` [D]."""
         return np.where(self.whole, goal, np.clip(goal, self._from - PART, self._from + PART))
 
-    def look(
+    def update(
         self, commanded: Float64, measured: Float64, goal: Float64, speed: Float64, now: float
     ) -> np.ndarray:
         """Evaluate the readings after each part and its rest; return joints that moved with the command, bool [D]."""

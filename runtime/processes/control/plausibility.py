@@ -142,7 +142,7 @@ class JointPlausibility:
         fresh = seen.joints_captured != self._captured
         if fresh or (self._unseen <= UNSEEN_S and not np.array_equal(seen.joints, self._joints)):
             self._captured, self._joints = seen.joints_captured, seen.joints
-            self._doubt = self._take(_Sample(seen.joints, seen.joints_captured, now), commanded)
+            self._doubt = self._accept(_Sample(seen.joints, seen.joints_captured, now), commanded)
             self._unseen = 0.0 if fresh else self._unseen
         return replace(seen, implausible_reason=self._doubt) if self._doubt else seen
 
@@ -192,7 +192,7 @@ class JointPlausibility:
         ]
         return np.asarray(np.median(steps, axis=0)) if steps else np.zeros(len(self._limits.names))
 
-    def _take(self, sample: _Sample, commanded: Float64 | None) -> str:
+    def _accept(self, sample: _Sample, commanded: Float64 | None) -> str:
         if self._chain and self._unseen > UNSEEN_S:
             self._before, self._missing = self._chain.newest.joints, self._unseen
             self._chain = self._other = None

@@ -46,7 +46,7 @@ class SteadyError:
         self.last: Float64 = np.full(len(settings.limits.names), np.nan)
         self._presses = np.zeros(len(self.last), bool)  # joints that did not follow their command, bool [D]
 
-    def look(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
+    def update(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
         """Update at each tick; `measured` [D] is None if the joints are unknown."""
         if not robot.engaged:
             self._samples.clear()
@@ -63,7 +63,7 @@ class SteadyError:
         self._samples.clear()
         self._presses[:] = False
 
-    def keeps(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
+    def unchanged_joints(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
         """Return the joints whose command a stop does not change, bool [D].
 
         Either their error is steady, or the command has been constant for so long that the cause of a displacement is
@@ -96,7 +96,7 @@ class SteadyError:
         return self._settings.limits.position_mask & far & rests & ~self._presses
 
     @property
-    def known(self) -> Float64:
+    def last_error(self) -> Float64:
         """Error of each joint when it was last stationary [D]; 0 if it never was."""
         return np.nan_to_num(self.last)
 

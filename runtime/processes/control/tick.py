@@ -349,7 +349,7 @@ class Tick:
         if (stopped is not None and stopped.is_settling) or self._displacement.goal is not None:
             self._steady.leave_out()
         else:
-            self._steady.look(self._actuator, self._measured(now), now)
+            self._steady.update(self._actuator, self._measured(now), now)
 
     def _check_estop(self, now: float) -> None:
         latched = self._shared_state.estop is EStop.LATCHED
@@ -399,8 +399,8 @@ class Tick:
         elif stopped.is_settling:
             measured = self._plausibility.median_joints(measured)
             if stopped.kept is None:
-                stopped.kept = self._steady.keeps(actuator, measured, now)
-            measured = np.where(stopped.kept, actuator.commanded, measured + self._steady.known)
+                stopped.kept = self._steady.unchanged_joints(actuator, measured, now)
+            measured = np.where(stopped.kept, actuator.commanded, measured + self._steady.last_error)
             if not stopped.was_measured:
                 self._displacement.update_target(actuator, measured)
             measured = self._displacement.substitute_untrusted(actuator, measured)

@@ -116,7 +116,7 @@ class Coordinator:
             self.handle_event(*noticed)
         if missed := self.collecting.poll(self.session.state):
             self.handle_event(*missed)
-        for event in (*self.health.look_at_recorder(self.session.state), *self.timing.poll(self.clock.now())):
+        for event in (*self.health.poll_recorder(self.session.state), *self.timing.poll(self.clock.now())):
             self.emit(event)
         self.runs.poll()
         self._advance_setup()

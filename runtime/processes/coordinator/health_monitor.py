@@ -122,7 +122,7 @@ class HealthMonitor:
         """Used share of the fullest ring to media."""
         return max(self._shared_state.rings[ring].fill for ring in _TO_RECORD)
 
-    def look_at_recorder(self, state: SessionState) -> Iterator[Event]:
+    def poll_recorder(self, state: SessionState) -> Iterator[Event]:
         """Yield events when the recorder's heartbeat expires during a run, and when it returns."""
         now, late = self._clock.now(), not self._alive("media")
         if late and not self._recording_late and state is SessionState.RUNNING:

@@ -192,9 +192,9 @@ class CommandService:
 
     def _publish(self) -> None:
         coordinator, now = self._coordinator, self._coordinator.client_clock.now()
-        if begun := self._streams.hear():  # new subscribers get the present content at once
+        if begun := self._streams.poll_subscriptions():  # new subscribers get the present content at once
             self._due = {name: due for name, due in self._due.items() if not name.startswith(tuple(begun))}
-        self._read = [stream for stream in _PERIODS if self._streams.wanted(stream)]
+        self._read = [stream for stream in _PERIODS if self._streams.has_subscriber(stream)]
         news = coordinator.events.newest != self._told
         if coordinator.rests and news:
             self._due.pop("state", None)
@@ -212,7 +212,7 @@ class CommandService:
 
     def _publish_chunk(self, now: float) -> None:
         """Publish the newest chunk when it changes, and once a second for late subscribers."""
-        if not self._streams.wanted("chunk"):
+        if not self._streams.has_subscriber("chunk"):
             return
         shown = self._coordinator.inference.shown
         if shown is not self._shown or (shown is not None and now >= self._due.get("chunk", 0.0)):

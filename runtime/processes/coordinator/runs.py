@@ -147,7 +147,7 @@ class Runs:
             manifest |= {} if asked.operator is None else {"operator": asked.operator}
             manifest |= more
         identity = str(manifest["uuid"]) if manifest else str(uuid.uuid4())
-        self._tell(BeginEpisode(self._count, manifest, self._generation))
+        self._send(BeginEpisode(self._count, manifest, self._generation))
         self._inference.use_simulated(mode == "sim" and sim_state == "simulated")
         self.open = Run(
             self._count,
@@ -173,7 +173,7 @@ class Runs:
             return message.error
         if message.error:
             run.stop_recording(message.error)
-            self._tell(BeginEpisode(run.number, None, self._generation))  # the source plays all the same
+            self._send(BeginEpisode(run.number, None, self._generation))  # the source plays all the same
             return ""
         run.open()
         doubt = self._shared_state.joint_problem if running and self._plan.capabilities.moves_robot else ""
@@ -270,7 +270,7 @@ class Runs:
         """Discard plan or motion, and stop; the run continues."""
         if self.open is not None:
             self._inference.cancel()
-            self._stand(self.open)
+            self._start_after_arrival(self.open)
 
     def approach(self, goal: Float64) -> None:
         """Move to the start of the shown chunk."""
@@ -281,9 +281,9 @@ class Runs:
     def on_motion_done(self) -> None:
         """End an approach of the open run, because control has finished the motion."""
         if self.open is not None and self.open.is_approaching:
-            self._stand(self.open)
+            self._start_after_arrival(self.open)
 
-    def _stand(self, run: Run) -> None:
+    def _start_after_arrival(self, run: Run) -> None:
         run.arrive()
         if run.mode == "manual":
             self._orders.send_order("hold", run=run.number)
@@ -308,7 +308,7 @@ class Runs:
             raise RuntimeFault(_RECORDING_OPEN)
         self._require_room()
         manifest = self._provenance.manifest("observe", info)
-        self._tell(BeginEpisode(0, manifest, self._generation))
+        self._send(BeginEpisode(0, manifest, self._generation))
         self._alone = str(manifest["uuid"])
         return self._alone
 
@@ -320,7 +320,7 @@ class Runs:
         """
         if not self._alone:
             raise RuntimeFault(_NO_RECORDING_ALONE)
-        self._tell(self._end_alone("finished", STOPPED))
+        self._send(self._end_alone("finished", STOPPED))
         self._alone = ""
 
     def _end_alone(self, status: str, reason: str) -> EndEpisode:
@@ -361,10 +361,10 @@ class Runs:
     def record_event(self, message: Message) -> None:
         """Send a message for the record; if media does not read, it is lost and that is logged."""
         try:
-            self._tell(message)
+            self._send(message)
         except RuntimeFault as error:
             log.error("%s is missing from the record: %s", type(message).__name__, error)
 
-    def _tell(self, message: Message) -> None:
+    def _send(self, message: Message) -> None:
         if not self._shared_state.rings["minutes"].push(encode(message)):
             raise RuntimeFault(_MEDIA_DOES_NOT_READ)

@@ -23,7 +23,7 @@ class Work(Protocol):
     def socket(self) -> zmq.Socket[Any]:
         """Socket that becomes readable when the set of clients may have changed."""
 
-    def wanted(self) -> bool:
+    def is_requested(self) -> bool:
         """Return True if a client wants the work now; called at least every 0.2 s."""
 
     def __call__(self, observation: Observation) -> None:
@@ -40,9 +40,9 @@ class LowPriorityWorker:
     def __init__(self, work: Work, nice: int = NICE) -> None:
         self._work = work
         self._nice = nice
-        self._bell = Bell.made()
+        self._bell = Bell.create()
         self._newest: deque[Observation] = deque(maxlen=1)  # not processed yet
-        self._wanted = True  # last answer to `work.wanted`
+        self._wanted = True  # last answer to `work.is_requested`
         self._failure: Exception | None = None
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="aside", daemon=True)
@@ -80,7 +80,7 @@ class LowPriorityWorker:
         poller.register(self._bell.descriptor, zmq.POLLIN)
         while not self._closed:
             # Before the newest is read: an observation that came while the work was not wanted has rung no bell.
-            self._wanted = self._work.wanted()
+            self._wanted = self._work.is_requested()
             if self._wanted and self._newest:
                 self._work(self._newest.pop())
             else:

@@ -42,11 +42,11 @@ class Previews:
         socket: zmq.Socket[Any] = self._publisher.socket
         return socket
 
-    def wanted(self) -> bool:
+    def is_requested(self) -> bool:
         """Return True if there are viewers. Call it five times a second: it also repairs an unreachable socket."""
         if self._publisher.rebind_if_unreachable():
             self._write_endpoints()
-        for topic in self._publisher.hear():  # a new viewer gets the newest pictures
+        for topic in self._publisher.poll_subscriptions():  # a new viewer gets the newest pictures
             self._due = {
                 name: due for name, due in self._due.items() if not f"camera/{name}".startswith(topic)
             }
@@ -55,9 +55,9 @@ class Previews:
 
     def __call__(self, observation: Observation) -> None:
         self._newest = observation
-        self.wanted()
+        self.is_requested()
         for camera in observation.pictures:
-            if not self._publisher.wanted(f"camera/{camera}"):
+            if not self._publisher.has_subscriber(f"camera/{camera}"):
                 continue
             captured = observation.captured.get(camera, observation.arrived)
             if observation.arrived < self._due.get(camera, 0.0) or captured == self._shown.get(camera):

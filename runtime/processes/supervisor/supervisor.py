@@ -72,7 +72,7 @@ class Supervisor:
         self._endpoints.prepare()
         Key(self._station_dir).secret()  # errors of the key are reported before anything moves
         self._shared_state, self._page_fd = SharedState.create(self._plan.layout)
-        self._bells, self._signalled = [Bell.made() for _ in WOKEN], Bell.made()
+        self._bells, self._signalled = [Bell.create() for _ in WOKEN], Bell.create()
         # Children have the reading end as standard input: it closes when this process ends, however it ends.
         self._lifeline_out, self._lifeline_in = os.pipe()
         for number in (signal.SIGINT, signal.SIGTERM):

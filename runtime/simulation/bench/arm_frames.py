@@ -38,7 +38,7 @@ class ArmFrames:
         self._body = _body_of(robot)
         first = urdf.read(robot.urdf).joint(arm.urdf_joints[0])
         self._first = self._body.link_of(arm.name, first.child)
-        self._below, self._dims = _way_to_frame(robot, arm)
+        self._below, self._dims = _chain_to_frame(robot, arm)
         root = transform_of(robot.stand) @ transform_of(copy_of(arm, robot.groups)[0].mount)
         still = self._body.poses(robot.poses["home"])[self._body.link_of(arm.name, arm.frame)]
         self._base: Float64 = still if self._below is None else root
@@ -73,7 +73,7 @@ def _body_of(robot: Robot) -> Body:
     return Body(robot)
 
 
-def _way_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
+def _chain_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
     """The chain from the root to an arm's frame and the places of the joints that drive it; None where none does."""
     tree, members = urdf.read(robot.urdf), copy_of(arm, robot.groups)
     movers = {

@@ -70,7 +70,7 @@ class Block:
         along = self.pose[:2, flattest] / np.linalg.norm(self.pose[:2, flattest])
         return np.array([[along[0], -along[1]], [along[1], along[0]]])
 
-    def take(self, arm: str, tip: Float64) -> None:
+    def attach_to(self, arm: str, tip: Float64) -> None:
         """From now on it moves with the tip [4, 4] of an arm."""
         self.held_by = arm
         self._falling = 0.0

@@ -38,7 +38,7 @@ def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
     if hand.opening >= width:
         return None
     if width <= block.edge + _SLACK and _from_above(hand, place):
-        block.take(hand.arm, hand.tip)
+        block.attach_to(hand.arm, hand.tip)
     return width
 
 

@@ -27,7 +27,7 @@ def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: i
     so that one side of the bench reaches both. BenchError where `positions` is not of this form, lies outside
     the area or has block and plate closer than APART_M, or where `blocks` do not fit.
     """
-    block, plate = _wanted(positions or {})
+    block, plate = _parse_positions(positions or {})
     if blocks < 1 or seed < 0:
         raise BenchError(f"{blocks} blocks by seed {seed} were asked for; allowed: one or more, from 0 on")
     chance = np.random.default_rng(seed)
@@ -38,7 +38,7 @@ def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: i
     return BenchLayout(tuple(placed), placed_plate)
 
 
-def _wanted(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
+def _parse_positions(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
     """Block (x, y, yaw in rad) and plate (x, y) as asked for."""
     unknown = sorted(str(name) for name in positions if name not in ("block", "plate"))
     if unknown:

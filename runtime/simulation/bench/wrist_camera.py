@@ -49,7 +49,7 @@ def place_wrist_camera(robot: Robot, arm: str) -> CameraPlacement:
     for aside, ahead in _BESIDE:
         for side in (-1.0, 1.0):
             eye = CameraPlacement((side * aside, 0.0, ahead), (side * 0.005, 0.0, _AHEAD), (side, 0.0, 0.0))
-            share = boxes.share_seen(_placed(tip, np.array(eye.place)), _placed(tip, _SEEN))
+            share = boxes.visible_share(_placed(tip, np.array(eye.place)), _placed(tip, _SEEN))
             if share >= _ENOUGH:
                 return eye
             if share > most:
@@ -67,7 +67,7 @@ class _Boxes:
         self._low, self._high = bounds[:, 0], bounds[:, 1]
         self._back = np.linalg.inv(places)
 
-    def share_seen(self, eye: Float64, points: Float64) -> float:
+    def visible_share(self, eye: Float64, points: Float64) -> float:
         """The share of points [n, 3] that no box hides from `eye` [3]; none from inside a box."""
         start = self._back[:, :3, :3] @ eye + self._back[:, :3, 3]  # [S, 3]
         if ((start >= self._low) & (start <= self._high)).all(axis=1).any():

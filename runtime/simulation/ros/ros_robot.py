@@ -83,19 +83,19 @@ class RosRobot(ABC):
         """The commands that have come since the last tick."""
 
     @abstractmethod
-    def _say_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
+    def _publish_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
         """Publish a sensor_msgs/JointState with a stamp [ns]."""
 
     @abstractmethod
-    def _say_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
+    def _publish_pose(self, topic: str, stamp: int, frame: str, pose: list[float]) -> None:
         """Publish a geometry_msgs/PoseStamped of x, y, z [m], quaternion w, x, y, z."""
 
     @abstractmethod
-    def _say_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
+    def _publish_image(self, topic: str, stamp: int, encoding: str, pixels: UInt8) -> None:
         """Publish a sensor_msgs/Image of uint8 [H, W, 3]."""
 
     @abstractmethod
-    def _say_compressed(self, topic: str, stamp: int, data: bytes) -> None:
+    def _publish_compressed(self, topic: str, stamp: int, data: bytes) -> None:
         """Publish a sensor_msgs/CompressedImage of a JPEG."""
 
     def tick(self, seconds: float) -> None:
@@ -143,10 +143,10 @@ class RosRobot(ABC):
                 spoken = [f"x_{joint}" if self._options.wrong_names else joint for joint in joints]
                 order = np.random.default_rng(self._sequence).permutation(len(dims))  # as drivers may
                 position = self._plant.q[np.array(dims)[order]].tolist()
-                self._say_joints(name, stamp, [spoken[i] for i in order], position)
+                self._publish_joints(name, stamp, [spoken[i] for i in order], position)
             if topic.eef and group.chain is not None and not self._options.no_eef:
                 pose = poses(self._robot, self._plant.q)[group.name][:7].tolist()
-                self._say_pose(topic.eef, stamp, group.frame or "", pose)
+                self._publish_pose(topic.eef, stamp, group.frame or "", pose)
         drawn = self._surroundings.pictures(self._sequence, self._clock.now(), self._plant.q)
         for key, picture in drawn.items():
             if not self._silent(self._pictures[key]):
@@ -156,10 +156,10 @@ class RosRobot(ABC):
         import simplejpeg
 
         if topic.endswith("/compressed") == self._options.other_pictures:
-            self._say_image(topic, stamp, self._options.encoding, bgr)
+            self._publish_image(topic, stamp, self._options.encoding, bgr)
         else:
             data = simplejpeg.encode_jpeg(np.ascontiguousarray(bgr), 90, "BGR")
-            self._say_compressed(topic, stamp, data)
+            self._publish_compressed(topic, stamp, data)
 
     def _silent(self, topic: str) -> bool:
         return bool(topic == self._options.silence and self._sequence >= self._options.silence_from)

@@ -148,7 +148,7 @@ class PickPlaceEpisode:
             return self._still(q)
         self._advance(q, elapsed)
         if self._misses(q):
-            self._take(self._policy.planner.retreat(q, self._on().arm))
+            self._follow_route(self._policy.planner.retreat(q, self._on().arm))
         if self._route is None:
             self._decide(q, sight)
         return self._still(q) if self._route is None else self._ahead(self._route)
@@ -179,15 +179,15 @@ class PickPlaceEpisode:
         route = self._policy.planner.pick_and_place(q, block, sight.plate, self._luck.slip)
         if route is not None:
             self._seen = sight
-            self._take(route)
+            self._follow_route(route)
 
-    def _take(self, route: Route | None) -> None:
+    def _follow_route(self, route: Route | None) -> None:
         self._route, self._leg, self._row = route, 0, 0.0
 
     def _forget(self) -> None:
         self._luck = self._left = None
         self._resigned = False
-        self._take(None)
+        self._follow_route(None)
 
     def _is_over(self, pause: float) -> bool:
         """True if another episode follows the pause [s]: nothing was going on any more before it."""
@@ -226,7 +226,7 @@ class PickPlaceEpisode:
                 row = max(row, float(self._route.starts[self._leg]))
             if self._leg == len(self._route.legs):
                 self._resigned = self._luck is not None and self._luck.slip.lets_go
-                self._take(None)
+                self._follow_route(None)
         if self._route is not None:
             self._row = self._agreed(row, q)
 

@@ -124,7 +124,7 @@ class Postures:
                 return np.asarray(found[0])
         return q
 
-    def aside(self, arm: Group, q: Float64) -> Float64:
+    def stowed(self, arm: Group, q: Float64) -> Float64:
         """Joints [D] with an arm at rest, its jaws as they are."""
         rest = q.copy()
         rest[arm.joint_dims] = self._rest[arm.joint_dims]
@@ -132,7 +132,7 @@ class Postures:
 
     def rested(self, arm: Group, q: Float64) -> Float64:
         """Joints [D] with an arm at rest, its jaws open."""
-        return opened(arm, self.aside(arm, q))
+        return opened(arm, self.stowed(arm, q))
 
     def tip(self, arm: Group, q: Float64) -> Float64:
         """An arm's fingertips in the world, [4, 4], at joints q [D]."""
@@ -184,9 +184,9 @@ class Postures:
         """Find an arm's nominal posture; returns why it has none, "" where it has."""
         if arm.tip is None or arm.gripper is None or arm.gripper.apart is None:
             return f"{arm.name} needs fingertips and a gripper that says how far it opens (apart)"
-        wanted = self._wanted(arm)
+        wanted = self._arm_places(arm)
         best, reached = None, 0
-        for nominal in self._found(arm):
+        for nominal in self._search_postures(arm):
             count = sum(self._reaches(arm, nominal, place) for place in wanted)
             if best is None or count > reached:
                 best, reached = nominal, count
@@ -197,7 +197,7 @@ class Postures:
         self._nominal[arm.name] = best
         return ""
 
-    def _found(self, arm: Group) -> Iterator[Nominal]:
+    def _search_postures(self, arm: Group) -> Iterator[Nominal]:
         """Postures with the fingertips down: from the rest posture, then from more and more random ones."""
         chance = np.random.default_rng(0)
         seed = self._rest
@@ -225,7 +225,7 @@ class Postures:
         below = replace(above, height=low, tilt=TILTS[0][0])
         return self._descent(arm, self._rest, nominal, [above, below]) is not None
 
-    def _wanted(self, arm: Group) -> list[Place]:
+    def _arm_places(self, arm: Group) -> list[Place]:
         """Places of the area that are this arm's: nearer to it than to any other."""
         x_from, x_to, y_from, y_to = self._table.area
         places = [

@@ -140,7 +140,7 @@ class RoutePlanner:
         others = tuple(
             other
             for other in self._robot.arms
-            if other is not arm and np.abs(self._postures.aside(other, q) - q).max() > _AT_REST
+            if other is not arm and np.abs(self._postures.stowed(other, q) - q).max() > _AT_REST
         )
         if not others:
             return []
@@ -149,7 +149,7 @@ class RoutePlanner:
             high = self._postures.risen(other, high) if self._low(other, high) else high
         rest = high
         for other in others:
-            rest = self._postures.aside(other, rest)
+            rest = self._postures.stowed(other, rest)
         ways = [("rise", q, high)] * (high is not q) + [("make way", high, rest)]
         return [replace(self._leg(*way), others=others) for way in ways]
 

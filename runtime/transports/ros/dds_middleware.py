@@ -130,7 +130,7 @@ class DdsMiddleware(Middleware):
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 
-        reader = self._made(DataReader, topic, life=False)
+        reader = self._create_endpoint(DataReader, topic, life=False)
         condition = ReadCondition(reader, SampleState.Any | ViewState.Any | InstanceState.Any)
         with self._lock:
             self._readers.append((topic, reader, deliver))
@@ -146,7 +146,7 @@ class DdsMiddleware(Middleware):
 
         from runtime.transports.ros.idl import TYPES
 
-        writer = self._made(DataWriter, topic, life=True)
+        writer = self._create_endpoint(DataWriter, topic, life=True)
         kind = TYPES[topic.message]
         self._writers.append((topic, writer))
 
@@ -202,7 +202,7 @@ class DdsMiddleware(Middleware):
             self._entered = False
             _domains.leave(self._domain)
 
-    def _made(self, kind: Any, topic: Topic, life: bool) -> Any:
+    def _create_endpoint(self, kind: Any, topic: Topic, life: bool) -> Any:
         """Create a reader or writer of the topic."""
         from cyclonedds.core import DDSException
         from cyclonedds.topic import Topic as DdsTopic

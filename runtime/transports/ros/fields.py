@@ -45,7 +45,7 @@ class Reader(ABC):
     def header(self) -> tuple[int, str]:
         """Decode std_msgs/Header: the stamp [ns] and the frame."""
 
-    def take(self, size: int, alignment: int) -> int:
+    def advance(self, size: int, alignment: int) -> int:
         """Advance by `size` aligned bytes and return their offset."""
         start = self._at + self._gap(alignment)
         if size > len(self._payload) - start:
@@ -56,11 +56,11 @@ class Reader(ABC):
         return start
 
     def _number(self, code: str, size: int) -> int:
-        value: int = struct.unpack_from(self._order + code, self._payload, self.take(size, size))[0]
+        value: int = struct.unpack_from(self._order + code, self._payload, self.advance(size, size))[0]
         return value
 
     def u8(self) -> int:
-        return self._payload[self.take(1, 1)]
+        return self._payload[self.advance(1, 1)]
 
     def u32(self) -> int:
         return self._number("I", 4)
@@ -70,7 +70,7 @@ class Reader(ABC):
 
     def string(self) -> str:
         size = self.u32()
-        start = self.take(size, 1)
+        start = self.advance(size, 1)
         raw = self._text(self._payload[start : start + size], start)
         try:
             return raw.decode("utf-8")
@@ -88,13 +88,13 @@ class Reader(ABC):
         count = self.u32() if count is None else count
         if count == 0:  # an empty sequence is not aligned
             return np.zeros(0)
-        start = self.take(8 * count, 8)
+        start = self.advance(8 * count, 8)
         return np.frombuffer(self._payload, self._order + "f8", count, start).astype(np.float64)
 
     def octets(self) -> UInt8:
         """Decode a sequence of uint8 as a view."""
         count = self.u32()
-        return np.frombuffer(self._payload, np.uint8, count, self.take(count, 1))
+        return np.frombuffer(self._payload, np.uint8, count, self.advance(count, 1))
 
     def stamp(self, seconds: int, nanoseconds: int) -> int:
         """Return ROS time [ns]."""

@@ -209,11 +209,11 @@ class RosSource(Source):
                 )
                 return
             for part in one.parts:
-                self._take(part, message, arrived)
+                self._store_message(part, message, arrived)
 
         return take
 
-    def _take(self, part: StreamSpec, message: Message, arrived: float) -> None:
+    def _store_message(self, part: StreamSpec, message: Message, arrived: float) -> None:
         """Store one message; any error is counted and does not end the thread."""
         try:
             value = self._readers.read(part, message)

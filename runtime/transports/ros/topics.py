@@ -89,9 +89,9 @@ class TopicPlan:
     def __init__(self, robot: Robot, version: Literal[1, 2], given: Topics, disabled: list[str]) -> None:
         self._robot, self._given = robot, given
         self._own = robot.ros if robot.ros is not None and robot.ros.version == version else None
-        _known("topics.cameras", given.cameras, [camera.name for camera in robot.cameras], robot)
-        _known("topics.groups", given.groups, [group.name for group in robot.groups], robot)
-        _known("disabled_cameras", disabled, [camera.key for camera in robot.cameras], robot)
+        _require_known("topics.cameras", given.cameras, [camera.name for camera in robot.cameras], robot)
+        _require_known("topics.groups", given.groups, [group.name for group in robot.groups], robot)
+        _require_known("disabled_cameras", disabled, [camera.key for camera in robot.cameras], robot)
         self.cameras = tuple(camera for camera in robot.cameras if camera.key not in disabled)
         for group in robot.groups:
             self._check_joints(group)
@@ -212,7 +212,9 @@ def _merged(before: CommandTopic | None, outlet: CommandTopic) -> CommandTopic:
     return replace(before, dims=before.dims + outlet.dims, joints=joints)
 
 
-def _known(key: str, given: Mapping[str, object] | list[str], allowed: list[str], robot: Robot) -> None:
+def _require_known(
+    key: str, given: Mapping[str, object] | list[str], allowed: list[str], robot: Robot
+) -> None:
     unknown = [name for name in given if name not in allowed]
     if unknown:
         raise ConfigurationError(

@@ -44,7 +44,7 @@ def test_a_hash_is_that_of_django(settings):
 @pytest.fixture
 def turns(monkeypatch):
     """Three wait, behind the one that is hashed."""
-    made = FairLookupPool(1, 3, "passwords", password_hashing._give_way)
+    made = FairLookupPool(1, 3, "passwords", password_hashing._lower_priority)
     monkeypatch.setattr(password_hashing, "_turns", made)
     return made
 

@@ -161,7 +161,7 @@ def test_an_administrator_who_has_run_a_trial_reads_it_in_no_page_of_administrat
     client.force_login(alma)
     lab.operator = alma
     lab.allocate()
-    assert not visibility_for_user(alma).sees_everything
+    assert not visibility_for_user(alma).hides_nothing
     for model in ("trials_trial", "trials_score", "stations_command", "episodes_episode", "jobs_job"):
         answer = client.get(reverse(f"admin:{model}_changelist"), headers={"Accept": "text/html"})
         assert answer.status_code == 403, model

@@ -87,7 +87,7 @@ class Page:
         return {"ok": True}
 
     def says(self, number):
-        return self.aims.ask(Aim(number, {"n": number}))
+        return self.aims.submit(Aim(number, {"n": number}))
 
 
 def test_while_one_question_is_under_way_the_newest_replaces_the_one_that_waits(monkeypatch):
@@ -113,7 +113,7 @@ def test_a_question_that_breaks_does_not_end_the_asking(monkeypatch):
     page.go.set()
 
     async def scenario():
-        assert page.aims.ask(Aim(1, {"n": -1}))
+        assert page.aims.submit(Aim(1, {"n": -1}))
         with pytest.raises(ValueError, match="broken"):
             await page.aims.answer()
         assert page.says(2)

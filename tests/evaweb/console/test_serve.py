@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 
 from evaweb.console.server import _address
-from evaweb.serving.listeners import PortTaken, open_listener
+from evaweb.serving.listeners import PortInUseError, open_listener
 from tests import migrated
 from tests.processes import PATIENCE_S, eventually
 
@@ -54,12 +54,14 @@ def served(folder, *options, path=None, command="serve", program=MANAGE):
 def test_a_taken_port_is_an_error_that_names_the_option():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(PortTaken, match=rf"cannot listen on 127.0.0.1:{port}: .* with --host, --port"):
+        with pytest.raises(
+            PortInUseError, match=rf"cannot listen on 127.0.0.1:{port}: .* with --host, --port"
+        ):
             open_listener("127.0.0.1", port)
 
 
 def test_an_address_of_another_machine_is_an_error_too():
-    with pytest.raises(PortTaken, match=r"cannot listen on 192\.0\.2\.1:0"):
+    with pytest.raises(PortInUseError, match=r"cannot listen on 192\.0\.2\.1:0"):
         open_listener("192.0.2.1", 0)
 
 

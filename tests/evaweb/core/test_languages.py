@@ -15,7 +15,7 @@ from django.test import Client
 from evaweb.console.feed import History
 from evaweb.core import languages
 from evaweb.stations.runtime_client import connection_to
-from runtime.core.sentences import Pattern, fixed, told
+from runtime.core.sentences import Pattern, fixed, to_wire
 from runtime.processes.coordinator.session.transitions import SessionEvent
 
 STATIC = Path(__file__).parents[3] / "static"
@@ -89,7 +89,7 @@ def shown_by_node(rows):
 )
 def test_server_and_page_say_the_same(german, said, words):
     here = languages.translated(said, german)
-    english, there = shown_by_node([told(said)])
+    english, there = shown_by_node([to_wire(said)])
     assert english == [said]
     if words is None:  # how each quotes a quote is its own
         assert there[0].startswith("{3 %} 2.00 s hält")

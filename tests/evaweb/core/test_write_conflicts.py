@@ -12,7 +12,7 @@ from django.test import Client, RequestFactory
 from django.urls import reverse
 
 from evaweb.core.errors import EvaError
-from evaweb.core.write_conflicts import TAKEN, once_more, was_taken
+from evaweb.core.write_conflicts import TAKEN, is_duplicate, once_more
 from evaweb.plans.models import Plan
 from evaweb.plans.services import plan_draft
 from evaweb.serving.error_pages import RefusalMiddleware
@@ -110,7 +110,7 @@ def test_a_name_that_was_taken_is_a_sentence_and_any_other_fault_stays_one() -> 
         IntegrityError("NOT NULL constraint failed: trials_scene.title"),
         ValueError("UNIQUE constraint"),
     ):
-        assert not was_taken(other)
+        assert not is_duplicate(other)
         assert RefusalMiddleware(lambda request: None).process_exception(request, other) is None
 
 

@@ -44,11 +44,11 @@ def send(data: Path, folder: Path, pieces: int = 10**6) -> None:
     """What its link does, with so many pieces."""
     (data / "episodes").mkdir(exist_ok=True)
     shelf = Shelf(data, folder_station(folder), lambda uuid: "", reserve=0)
-    wanted = list(shelf.take(Offer(folder.name), contents_of(folder).packed()))
+    wanted = list(shelf.handle(Offer(folder.name), contents_of(folder).packed()))
     while wanted and isinstance(wanted[0], Want) and pieces:
         want, pieces = wanted.pop(0), pieces - 1
         content = (folder / want.file).read_bytes()[want.offset : want.offset + want.count]
-        wanted += shelf.take(Piece(want.episode, want.file, want.offset), content)
+        wanted += shelf.handle(Piece(want.episode, want.file, want.offset), content)
     shelf.drop()
 
 
@@ -104,7 +104,7 @@ def test_a_page_says_how_much_of_it_is_here_and_why_no_more(
     said = playback_stage(episode=away).sentence
     assert said.startswith(f"It is on the computer of station {elsewhere.name}, not here yet: ")
     assert said.endswith(f" of {size / 1e6:.1f} MB.")
-    list(Shelf(data, elsewhere.name, lambda uuid: "bench-9", reserve=0).take(Offer(folder.name), b"[]"))
+    list(Shelf(data, elsewhere.name, lambda uuid: "bench-9", reserve=0).handle(Offer(folder.name), b"[]"))
     assert "not here yet: the list of its files cannot be used" in playback_stage(episode=away).sentence
 
 

@@ -15,7 +15,7 @@ from evaweb.episodes.http_ranges import (
     Validators,
     not_modified,
     range_holds,
-    span_asked,
+    requested_range,
 )
 
 VALIDATORS = Validators('"a-b-c"', "Wed, 21 Oct 2015 07:28:00 GMT")
@@ -37,13 +37,13 @@ VALIDATORS = Validators('"a-b-c"', "Wed, 21 Oct 2015 07:28:00 GMT")
     ],
 )
 def test_one_range_is_understood(header: str, span: Span) -> None:
-    assert span_asked(header, 100) == span
+    assert requested_range(header, 100) == span
 
 
 @pytest.mark.parametrize("header", ["bytes=100-", "bytes=100-200", "bytes=5000-", "bytes=-0"])
 def test_a_range_behind_the_end_cannot_be_satisfied(header: str) -> None:
     with pytest.raises(Unsatisfiable):
-        span_asked(header, 100)
+        requested_range(header, 100)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_range_behind_the_end_cannot_be_satisfied(header: str) -> None:
     ],
 )
 def test_anything_else_is_as_if_nothing_had_been_asked(header: str | None) -> None:
-    assert span_asked(header, 100) is None
+    assert requested_range(header, 100) is None
 
 
 @given(st.integers(0, 300), st.integers(0, 300), st.integers(1, 200))
@@ -73,7 +73,7 @@ def test_a_span_lies_within_the_file_and_begins_where_it_was_asked_to(
     first: int, last: int, size: int
 ) -> None:
     try:
-        span = span_asked(f"bytes={first}-{last}", size)
+        span = requested_range(f"bytes={first}-{last}", size)
     except Unsatisfiable:
         assert first >= size
         return
@@ -87,7 +87,7 @@ def test_a_span_lies_within_the_file_and_begins_where_it_was_asked_to(
 @given(st.one_of(st.text(max_size=40), st.text("bytes=-0123456789, ", max_size=30)))
 def test_no_header_breaks_it(header: str) -> None:
     try:
-        span = span_asked(header, 50)
+        span = requested_range(header, 50)
     except Unsatisfiable:
         return
     assert span is None or 0 <= span.first <= span.last < 50
@@ -96,7 +96,7 @@ def test_no_header_breaks_it(header: str) -> None:
 def test_an_empty_file_satisfies_no_range() -> None:
     for header in ("bytes=0-", "bytes=-5"):
         with pytest.raises(Unsatisfiable):
-            span_asked(header, 0)
+            requested_range(header, 0)
 
 
 @pytest.mark.parametrize(

@@ -92,8 +92,8 @@ def test_the_page_of_jobs_and_the_first_page_say_which_queue_is_missing(client: 
 
 def test_a_worker_is_in_the_list_from_its_first_sign_of_life_to_its_end() -> None:
     owner = uuid4()
-    assert workers.worker_seen(owner=owner, queues=["cpu"])
-    assert workers.worker_seen(owner=owner, queues=["cpu"])
+    assert workers.record_heartbeat(owner=owner, queues=["cpu"])
+    assert workers.record_heartbeat(owner=owner, queues=["cpu"])
     assert workers.served().with_folder == {"cpu"}
     running("gpu", silent_s=2 * 24 * 3600)
     workers.worker_ended(owner=owner)
@@ -115,7 +115,7 @@ def test_a_worker_with_another_folder_takes_only_what_needs_none(toy: Toy, setti
     assert services.claim(queue="cpu", owner=uuid4()) is None, "nobody has said yet which folder it is"
     workers.lab_folder_named()
     settings.EVA_LAB_ID = "another"  # type: ignore[attr-defined]
-    workers.worker_seen(owner=uuid4(), queues=["cpu", "station"])
+    workers.record_heartbeat(owner=uuid4(), queues=["cpu", "station"])
     assert (workers.served().queues, workers.served().with_folder) == ({"cpu", "station"}, frozenset())
     enqueue("preflight", "p")
     assert services.claim(queue="cpu", owner=uuid4()) is None

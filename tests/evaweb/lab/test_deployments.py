@@ -45,7 +45,7 @@ def test_a_simulated_station_of_every_robot_is_one_that_the_lab_brings(robot):
     resolved = kept.resolved()
     assert deployments.is_simulated(resolved)
     assert (resolved.deployment.station, resolved.deployment.robot) == ("bench-2", robot)
-    assert deployments.kept() == [kept]
+    assert deployments.stored_deployments() == [kept]
 
 
 def test_a_draft_has_what_was_chosen_and_its_command():
@@ -87,7 +87,7 @@ def test_what_the_runtime_could_not_load_is_refused_and_nothing_is_left(data, pa
 def test_what_this_machine_would_run_is_written_by_hand(transport, said):
     with pytest.raises(EvaError, match=said):
         draft(transport=transport)
-    assert deployments.kept() == []
+    assert deployments.stored_deployments() == []
     assert not draft("real-2", transport={"kind": "zmq", "simulated": "no"}).chosen
 
 
@@ -112,7 +112,7 @@ def test_names_and_robots_that_cannot_be_are_refused():
     for name in ("", "../x", "a b", ".hidden"):
         with pytest.raises(EvaError, match="allowed: letters, digits"):
             deployments.write_simulated(name=name, robot="ur5e")
-        assert deployments.kept_of(name) is None
+        assert deployments.stored_deployment(name) is None
     with pytest.raises(EvaError, match="robot = 'r2d2'; allowed: agibot_g2"):
         deployments.write_simulated(name="a", robot="r2d2")
 
@@ -168,7 +168,7 @@ def test_cameras_that_the_robots_node_names_are_exchanged_there():
 def test_what_the_lab_says_of_a_deployment_is_what_the_page_reads():
     draft()
     assert deployments.standing_of("real-1") == Standing()
-    deployments.tell("real-1", Standing(failed="no room"))
+    deployments.write_status("real-1", Standing(failed="no room"))
     assert deployments.standing_of("real-1") == Standing(failed="no room")
 
 
@@ -188,7 +188,7 @@ def test_a_station_that_was_used_is_switched_off_when_its_deployment_is_removed(
     deployments.remove(name="real-1")
     station.refresh_from_db()
     assert not station.active
-    assert deployments.kept() == []
+    assert deployments.stored_deployments() == []
     with pytest.raises(NotFound, match="'real-1' has no deployment"):
         deployments.remove(name="real-1")
 
@@ -211,7 +211,7 @@ def test_a_station_is_not_removed_under_an_open_trial(data, status):
     Trial.objects.filter(pk=trial.pk).update(status=status)
     with pytest.raises(Conflict, match=rf"trial {trial.pk} of .* is {status.label}: end or abandon it first"):
         deployments.remove(name=bench.station.name)
-    assert len(deployments.kept()) == 1
+    assert len(deployments.stored_deployments()) == 1
     assert Station.objects.get().active
 
 
@@ -233,7 +233,7 @@ def test_a_station_that_somebody_has_is_not_removed(monkeypatch):
 
     monkeypatch.setattr(deployments, "connection_to", gone)
     deployments.remove(name="real-1")
-    assert deployments.kept() == []
+    assert deployments.stored_deployments() == []
 
 
 def test_a_lab_is_seen_as_long_as_it_runs(data):

@@ -97,15 +97,15 @@ def test_a_simulated_station_is_one_press_and_the_page_goes_on_with_it(lea):
     answer = lea.post("/first-steps/simulated", {"station": "bench-1", "robot": "ur5e"})
     assert answer["Location"] == "/first-steps/?station=bench-1"
     assert "No lab is watching this data folder" in page(lea, answer["Location"])
-    assert deployments.is_simulated(deployments.kept_of("bench-1").resolved())
+    assert deployments.is_simulated(deployments.stored_deployment("bench-1").resolved())
 
 
 def test_what_the_lab_says_is_shown_and_a_start_that_failed_is_tried_again(lea, monkeypatch):
     monkeypatch.setattr(deployments, "lab_runs", lambda: True)
     kept = deployments.write_simulated(name="bench-1", robot="ur5e")
-    deployments.tell("bench-1", Standing(doing="the simulated bench"))
+    deployments.write_status("bench-1", Standing(doing="the simulated bench"))
     assert "The lab is starting the simulated bench" in page(lea)
-    deployments.tell("bench-1", Standing(failed="no room <here>"))
+    deployments.write_status("bench-1", Standing(failed="no room <here>"))
     assert "no room &lt;here&gt;" in page(lea)
     before = kept.changed_ns
     assert lea.post("/first-steps/bench-1/again").status_code == 302
@@ -145,11 +145,14 @@ def test_a_draft_is_written_registered_and_given_with_its_command(lea):
     answer = lea.post("/first-steps/draft", DRAFT)
     assert answer["Location"] == "/first-steps/?station=real-1"
     station = Station.objects.get(name="real-1")
-    assert (station.simulated, station.deployment) == (False, str(deployments.kept_of("real-1").path))
+    assert (station.simulated, station.deployment) == (
+        False,
+        str(deployments.stored_deployment("real-1").path),
+    )
     told = page(lea, answer["Location"])
     assert f"-m runtime {station.deployment}" in told
     given = b"".join(lea.get("/first-steps/real-1/deployment.toml").streaming_content)
-    assert given == deployments.kept_of("real-1").path.read_bytes()
+    assert given == deployments.stored_deployment("real-1").path.read_bytes()
 
 
 def test_a_draft_that_the_runtime_could_not_load_comes_back_as_it_was_typed(lea):
@@ -185,7 +188,7 @@ def test_what_is_written_by_hand_has_no_field_and_is_refused_when_it_is_sent(lea
         assert answer.status_code == 400
         assert f"{key} = &#x27;{value}&#x27;; allowed here: " in told
         assert f'name="{key}"' not in told
-    assert deployments.kept() == []
+    assert deployments.stored_deployments() == []
 
 
 def test_a_robot_or_a_kind_that_there_is_not_is_refused_and_never_another_one_taken(lea):
@@ -193,7 +196,7 @@ def test_a_robot_or_a_kind_that_there_is_not_is_refused_and_never_another_one_ta
         answer = lea.post("/first-steps/draft", DRAFT | wrong)
         assert answer.status_code == 400
         assert said in answer.content.decode()
-    assert deployments.kept() == []
+    assert deployments.stored_deployments() == []
 
 
 def test_a_camera_that_has_another_ones_name_is_exchanged_in_the_deployment(lea, monkeypatch):
@@ -205,7 +208,9 @@ def test_a_camera_that_has_another_ones_name_is_exchanged_in_the_deployment(lea,
     shown = {"shows.cam_high": "cam_left_wrist", "shows.cam_left_wrist": "cam_high"}
     answer = lea.post("/first-steps/real-1/cameras", shown, follow=True)
     assert "start real-1 anew" in answer.content.decode()
-    assert deployments.kept_of("real-1").resolved().deployment.cameras["cam_left_wrist"].kind == "v4l2"
+    assert (
+        deployments.stored_deployment("real-1").resolved().deployment.cameras["cam_left_wrist"].kind == "v4l2"
+    )
     refused = lea.post("/first-steps/real-1/cameras", {"shows.cam_high": "cam_right_wrist"})
     assert "each camera once" in refused.content.decode()
 
@@ -224,7 +229,7 @@ def test_the_page_is_told_to_load_again_once_something_went_on(lea):
     mark = re.search(r"mark=(\w+)", page(lea))[1]
     asked = {"station": "bench-1", "mark": mark}
     assert "HX-Refresh" not in lea.get("/first-steps/news", asked)
-    deployments.tell("bench-1", Standing(up=True))
+    deployments.write_status("bench-1", Standing(up=True))
     assert lea.get("/first-steps/news", asked)["HX-Refresh"] == "true"
 
 

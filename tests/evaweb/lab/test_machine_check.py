@@ -15,7 +15,9 @@ from evaweb.stations.models import Station
 def said(monkeypatch):
     """What programs of the machine say, by their names; others are not there."""
     words = {}
-    monkeypatch.setattr(machine_check, "_told", lambda arguments: words.get(arguments[0].rpartition("/")[2]))
+    monkeypatch.setattr(
+        machine_check, "_output", lambda arguments: words.get(arguments[0].rpartition("/")[2])
+    )
     return words
 
 

@@ -155,7 +155,7 @@ def test_what_is_simulated_by_hand_is_not_started_without_a_person(lab):
     for task in ("", f'task = "# {deployments._CHOSEN}"'):
         kept_task = [line for line in own if not (task and line.startswith("task"))]
         path.write_text("\n".join(["# by hand", task, *kept_task, *camera]))
-        assert deployments.is_simulated(deployments.kept_of("bench-2").resolved())
+        assert deployments.is_simulated(deployments.stored_deployment("bench-2").resolved())
         looks(found)
         assert started.programs == []
     assert deployments.standing_of("bench-2") == Standing()
@@ -164,7 +164,7 @@ def test_what_is_simulated_by_hand_is_not_started_without_a_person(lab):
 def test_exchanged_cameras_leave_a_simulated_station_the_labs(lab):
     deployments.write_simulated(name="bench-2", robot="ur5e")
     deployments.cameras_exchanged(name="bench-2", shown={"cam_high": "cam_high"})
-    assert deployments.kept_of("bench-2").chosen
+    assert deployments.stored_deployment("bench-2").chosen
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_whatever_goes_wrong_ends_no_other_station(lab, monkeypatch, caplog):
     looks(found)
     assert deployments.standing_of("bench-2").failed.startswith("ZeroDivisionError: division by zero")
     assert "bench-bench-2" not in started.pids()
-    monkeypatch.setattr(deployments, "kept", lambda: {}["odd"])
+    monkeypatch.setattr(deployments, "stored_deployments", lambda: {}["odd"])
     looks(found)
     assert caplog.text.count("the folder of deployments cannot be looked at") == 1
 

@@ -8,7 +8,7 @@ import pytest
 
 from evaweb.lab import programs
 from evaweb.lab.processes import ChildProcesses, LabError, ProgramSpec, processor_s
-from evaweb.serving.listeners import PortTaken, open_listener
+from evaweb.serving.listeners import PortInUseError, open_listener
 from tests.processes import PATIENCE_S, alive, eventually
 
 ANSWERS = """
@@ -60,7 +60,7 @@ def test_a_port_of_ours_is_never_free_and_who_calls_is_answered_by_the_next_proc
         before = processes.pids()["one"]
         os.kill(before, signal.SIGKILL)
         eventually(lambda: not alive(before), "its end")
-        with pytest.raises(PortTaken, match="cannot listen"):
+        with pytest.raises(PortInUseError, match="cannot listen"):
             open_listener(*address)
         with socket.create_connection(address, PATIENCE_S) as caller:
             processes.watch()

@@ -5,7 +5,7 @@ import pytest
 from evaweb.core.errors import Conflict, EvaError
 from evaweb.plans import services as plans
 from evaweb.plans.allocation import allocate_trial
-from evaweb.plans.design import counted_now, current_pairs, kept_blocks
+from evaweb.plans.design import counted_now, current_pairs, stored_blocks
 from evaweb.plans.models import Plan, PlanState
 from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
 from evaweb.trials import services, voids
@@ -64,7 +64,7 @@ def require_whole(plan):
     later = Score.objects.filter(trial__evaluation=plan.evaluation_id, scored_at__gt=plan.revealed_at)
     if later.exists():
         assert all(row.reason for row in later)
-        assert kept_blocks(plan) == current_pairs(plan).at_first
+        assert stored_blocks(plan) == current_pairs(plan).at_first
     else:
         assert {name: plan.at_reveal[name] for name in ("blocks", "arms")} == counted_now(plan)
 

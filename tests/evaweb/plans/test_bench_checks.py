@@ -90,7 +90,7 @@ def test_a_bench_that_does_not_match_needs_a_reason_and_both_pictures_are_kept(b
     looking.confirm_cameras(user=bench.operator, station=bench.station, first=True)
     trial = looking.allocate_checked_trial(user=bench.operator, station=bench.station, plan=plan).trial
     assert {row.match for row in looking.record_layout(user=bench.operator, trial=trial)} == {None}
-    looking.take_references(user=bench.operator, station=bench.station, position=trial.position)
+    looking.record_references(user=bench.operator, station=bench.station, position=trial.position)
     shown["cam_high"] = jpeg(77)
     with pytest.raises(Conflict, match=r"cam_high -?0\.\d\d, wanted 0\.80"):
         looking.record_layout(user=bench.operator, trial=trial)
@@ -116,7 +116,7 @@ def test_after_the_reveal_nothing_is_voided(bench, plan, owner, shown):
 def test_a_look_that_is_old_is_made_again_before_the_run(bench, plan, shown):
     looking.confirm_cameras(user=bench.operator, station=bench.station, first=True)
     trial = looking.allocate_checked_trial(user=bench.operator, station=bench.station, plan=plan).trial
-    looking.take_references(user=bench.operator, station=bench.station, position=trial.position)
+    looking.record_references(user=bench.operator, station=bench.station, position=trial.position)
     looking.record_layout(user=bench.operator, trial=trial)
     shown["cam_high"] = jpeg(77)
     trials.run_checks("run", trial, bench.operator)  # seen a moment ago
@@ -139,7 +139,7 @@ def laid(bench, plan, shown):
     """A trial that is prepared at a position with references, and the newest of them by camera."""
     looking.confirm_cameras(user=bench.operator, station=bench.station, first=True)
     trial = looking.allocate_checked_trial(user=bench.operator, station=bench.station, plan=plan).trial
-    looking.take_references(user=bench.operator, station=bench.station, position=trial.position)
+    looking.record_references(user=bench.operator, station=bench.station, position=trial.position)
     return trial
 
 
@@ -189,7 +189,7 @@ def test_regions_are_another_reference_and_stay_with_the_next_picture(bench, lai
     assert (first.regions, drawn.regions, drawn.picture) == ([], [CORNER], first.picture)
     with pytest.raises(Conflict, match="cam_high has a newer reference here, by ann"):
         looking.save_regions(user=bench.operator, reference=first, drawn=[])
-    looking.take_references(user=bench.operator, station=bench.station, position=laid.position)
+    looking.record_references(user=bench.operator, station=bench.station, position=laid.position)
     assert high(laid).pk > drawn.pk
     assert high(laid).regions == [CORNER]
     looking.save_regions(user=bench.operator, reference=high(laid), drawn=[])
@@ -204,7 +204,7 @@ def test_neither_picture_nor_regions_change_under_a_running_plan_that_has_judged
     with pytest.raises(Conflict, match="is running and has judged trials by the reference of cam_high here"):
         looking.save_regions(user=bench.operator, reference=before, drawn=[CORNER])
     with pytest.raises(Conflict, match="is running and has judged trials by the reference of cam_"):
-        looking.take_references(user=bench.operator, station=bench.station, position=laid.position)
+        looking.record_references(user=bench.operator, station=bench.station, position=laid.position)
     assert high(laid) == before
     builders.finished_trial(laid)
     trials.score_trial(user=bench.operator, trial=laid, milestones=bench.ticks(True, True, True))

@@ -365,7 +365,7 @@ def test_who_runs_trials_does_not_look_and_who_looked_runs_none(bench, plan, own
     record_unblinding(plan, owner)
     record_unblinding(plan, owner)
     assert not is_sealed_for(plan, owner)
-    assert visibility_for_user(owner).sees_everything
+    assert visibility_for_user(owner).hides_nothing
     assert plan.events.filter(what="looked", by=owner).count() == 1
     assert Look.objects.filter(plan=plan, user=owner).count() == 1
     with pytest.raises(NotAllowed, match="you have seen results"):

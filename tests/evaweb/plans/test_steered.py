@@ -10,7 +10,7 @@ from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.blinding_rules import record_unblinding
 from evaweb.plans.counting import ended_by
 from evaweb.plans.models import CountsAs, Plan
-from evaweb.plans.selectors import plans_beside
+from evaweb.plans.selectors import overlapping_plans
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
 from evaweb.preflights.services import start_preflight
 from evaweb.results.analysis.caching import cached_analysis
@@ -194,7 +194,7 @@ def test_copies_of_checkpoints_make_a_plan_of_the_same(bench, plan, owner):
     weights = copied("a2", of=WORSE, policy=elsewhere)
     frozen("again", weights, copied("b2", of="pi0-new"))
     frozen("of one alone", weights, copied("c2", of=WORSE))
-    assert [row.name for row in plans_beside(plan)] == ["again"]
+    assert [row.name for row in overlapping_plans(plan)] == ["again"]
 
 
 def test_a_plan_without_a_comparison_keeps_what_counts_at_its_reveal(bench, draft, owner):
@@ -207,7 +207,7 @@ def test_a_plan_without_a_comparison_keeps_what_counts_at_its_reveal(bench, draf
     plan.refresh_from_db()
     assert sum(row["n"] for row in plan.at_reveal["arms"]) == 2
     assert {"record", "measured", "judged", "conduct", "setting", "digest"} <= plan.at_reveal.keys()
-    assert visibility_for_user(bench.operator).sees_everything
+    assert visibility_for_user(bench.operator).hides_nothing
 
 
 def test_a_first_score_after_the_reveal_makes_no_doubt_about_before(bench, plan, owner):

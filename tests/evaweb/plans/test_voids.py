@@ -9,7 +9,7 @@ from django.utils import timezone
 from evaweb.core.errors import Conflict, EvaError, NotAllowed
 from evaweb.plans.allocation import allocate_trial, plan_progress
 from evaweb.plans.blinding_rules import record_unblinding
-from evaweb.plans.design import current_pairs, kept_blocks
+from evaweb.plans.design import current_pairs, stored_blocks
 from evaweb.plans.selectors import remaining
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
 from evaweb.trials import services, voids
@@ -124,7 +124,7 @@ def test_without_an_answer_it_counts_at_the_reveal(bench, plan, owner, made, ask
     again.refresh_from_db()
     assert (asked.status, again.status) == ("scored", "voided")
     plan.refresh_from_db()
-    assert kept_blocks(plan) == before.at_first == current_pairs(plan).counted
+    assert stored_blocks(plan) == before.at_first == current_pairs(plan).counted
     with pytest.raises(EvaError, match="with the result in view"):
         voids.void_trial(user=bench.operator, trial=asked, reason=WHY)
 

@@ -16,8 +16,8 @@ from evaweb.serving import computations
 from evaweb.serving.computations import (
     AT_ONCE_S,
     REFILLED,
-    Beside,
     Busy,
+    ComputeProcess,
     Questions,
 )
 from evaweb.statistics import (
@@ -57,11 +57,11 @@ def test_an_answer_is_computed_once_also_for_those_who_ask_meanwhile():
     played = Played()
     questions = Questions(played.run, patience_s=PATIENCE_S)
     with ThreadPoolExecutor(2) as people:
-        coming = [people.submit(questions.ask, who, divmod, 7, 2) for who in ("ann", "bob")]
+        coming = [people.submit(questions.result, who, divmod, 7, 2) for who in ("ann", "bob")]
         assert played.begun.acquire(timeout=PATIENCE_S)
         played.free.set()
         assert [one.result(PATIENCE_S) for one in coming] == [(3, 1)] * 2
-    assert questions.ask("cid", divmod, 7, 2) == (3, 1)
+    assert questions.result("cid", divmod, 7, 2) == (3, 1)
     assert played.asked == [(7, 2)]
 
 
@@ -69,20 +69,20 @@ def test_who_has_spent_their_computing_waits_for_it_and_nobody_else_does():
     now, played = [NOW_S], Played(AT_ONCE_S)
     played.free.set()
     questions = Questions(played.run, clock=lambda: now[0], patience_s=PATIENCE_S)
-    assert questions.ask("ann", divmod, 7, 2) == (3, 1)
+    assert questions.result("ann", divmod, 7, 2) == (3, 1)
     with pytest.raises(
         Busy, match=r"have taken 30 s of computing; allowed: 30 s at once\. Try again in 1 s"
     ) as busy:
-        questions.ask("ann", divmod, 8, 2)
-    assert questions.ask("bob", divmod, 9, 2) == (4, 1)
-    assert questions.ask("ann", divmod, 9, 2) == (4, 1)  # what is known costs nothing
+        questions.result("ann", divmod, 8, 2)
+    assert questions.result("bob", divmod, 9, 2) == (4, 1)
+    assert questions.result("ann", divmod, 9, 2) == (4, 1)  # what is known costs nothing
     now[0] += busy.value.retry_after_s
-    assert questions.ask("ann", divmod, 8, 2) == (4, 0)
+    assert questions.result("ann", divmod, 8, 2) == (4, 0)
     now[0] += AT_ONCE_S / REFILLED / 2
     with pytest.raises(Busy) as busy:
-        questions.ask("bob", divmod, 10, 2) and questions.ask("bob", divmod, 11, 2)
+        questions.result("bob", divmod, 10, 2) and questions.result("bob", divmod, 11, 2)
     now[0] += busy.value.retry_after_s
-    assert questions.ask("bob", divmod, 11, 2) == (5, 1)
+    assert questions.result("bob", divmod, 11, 2) == (5, 1)
 
 
 def test_a_person_has_one_question_at_a_time_and_few_requests_wait(monkeypatch):
@@ -90,32 +90,32 @@ def test_a_person_has_one_question_at_a_time_and_few_requests_wait(monkeypatch):
     played = Played()
     questions = Questions(played.run, patience_s=PATIENCE_S)
     with ThreadPoolExecutor(2) as people:
-        coming = [people.submit(questions.ask, "ann", divmod, 7, 2)]
+        coming = [people.submit(questions.result, "ann", divmod, 7, 2)]
         assert played.begun.acquire(timeout=PATIENCE_S)
         with pytest.raises(Busy, match="one at a time"):
-            questions.ask("ann", divmod, 8, 2)
-        coming.append(people.submit(questions.ask, "bob", divmod, 7, 2))
+            questions.result("ann", divmod, 8, 2)
+        coming.append(people.submit(questions.result, "bob", divmod, 7, 2))
         while questions._waiting < 2:
             threading.Event().wait(0.01)
         with pytest.raises(Busy, match="too many questions"):
-            questions.ask("cid", divmod, 8, 2)
+            questions.result("cid", divmod, 8, 2)
         played.free.set()
         assert [one.result(PATIENCE_S) for one in coming] == [(3, 1)] * 2
-    assert questions.ask("ann", divmod, 8, 2) == (4, 0)
+    assert questions.result("ann", divmod, 8, 2) == (4, 0)
 
 
 def test_what_takes_longer_than_a_request_waits_is_known_when_it_is_asked_again():
     played = Played()
     questions = Questions(played.run, patience_s=0)
     with pytest.raises(Busy, match="is being computed"):
-        questions.ask("ann", divmod, 7, 2)
+        questions.result("ann", divmod, 7, 2)
     played.free.set()
     assert questions.compute("drafts", divmod, 9, 2) == (4, 1)  # after it: there is one process
-    assert questions.ask("ann", divmod, 7, 2) == (3, 1)
+    assert questions.result("ann", divmod, 7, 2) == (3, 1)
 
 
 def test_the_process_beside_computes_says_what_fails_and_is_started_anew():
-    beside = Beside()
+    beside = ComputeProcess()
     try:
         assert beside.run(os.getpid)[0] not in (os.getpid(), None)
         assert beside.run(os.nice, 0)[0] == 19
@@ -132,7 +132,7 @@ def test_the_process_beside_computes_says_what_fails_and_is_started_anew():
 
 
 def test_a_process_beside_whose_web_is_gone_ends_in_the_middle_of_its_question():
-    beside = Beside()
+    beside = ComputeProcess()
     beside.run(divmod, 7, 2)
     beside._wire.send((signal.sigwait, ((signal.SIGUSR1,),)))
     beside._wire.close()

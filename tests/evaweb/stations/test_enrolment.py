@@ -157,7 +157,7 @@ def test_who_may_connect_is_kept_for_a_gate_that_starts_without_a_database(
         raise OperationalError("the database is away")
 
     monkeypatch.setattr(gate, "keys_allowed", away)
-    keys.look()
+    keys.poll()
     assert keys.list.now.may_be(KEY, "bench-7")
     assert gate.Keys(tmp_path).list.now.may_be(KEY, "bench-7")
 

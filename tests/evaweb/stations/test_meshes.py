@@ -35,9 +35,9 @@ def meshed(tmp_path, monkeypatch):
     (shapes / "secret.stl").write_bytes(stl(CORNERS, CORNERS))
     monkeypatch.setenv("EVA_ROBOTS", str(tmp_path / "robots"))
     monkeypatch.setenv("EVA_ROBOT_MESHES", str(tmp_path / "meshes"))
-    looks._looks.cache_clear()
+    looks._drawn_robot.cache_clear()
     yield shapes
-    looks._looks.cache_clear()
+    looks._drawn_robot.cache_clear()
 
 
 def shown(name="meshed"):

@@ -9,7 +9,7 @@ import runtime
 from evaweb.blinding import station_messages as reasons
 from evaweb.blinding.visibility import COVERED, COVERED_AT_REST, FULL_VISIBILITY
 from evaweb.stations import redaction
-from runtime.core.sentences import Pattern, identity, known, plain, within
+from runtime.core.sentences import Pattern, declared_patterns, identity, plain, within
 from runtime.processes.coordinator import operations
 
 LOST = Pattern("test.redaction.lost", "{url} did not answer")(url="ws://alder:8000")
@@ -141,7 +141,7 @@ def test_what_is_covered_by_its_id_is_no_other_sentence_that_is_shown():
         simulated = module.name.startswith(("runtime.simulation", "runtime.standins"))
         if not simulated and not module.name.endswith("__main__"):
             importlib.import_module(module.name)
-    ids = {pattern.id for pattern in known()}
+    ids = {pattern.id for pattern in declared_patterns()}
     assert reasons._NOT | reasons._ALSO | {*reasons._LIMITS, *reasons._IN_A_ROW, reasons._BY_A_PERSON} <= ids
     kinds = {id.partition(".")[0] for id in ids}
     assert {*reasons._OF_THE_ROBOT, *reasons._OF_THE_STATION} <= kinds

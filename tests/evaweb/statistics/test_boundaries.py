@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.boundaries import SHAPES, Boundary, Look, boundary, extremeness_of, pair_counts
+from evaweb.statistics.boundaries import (
+    SHAPES,
+    Boundary,
+    StoppingTable,
+    boundary,
+    extremeness_of,
+    pair_counts,
+)
 from evaweb.statistics.planning import exact_power
 from tests.examples import some
 
@@ -163,7 +170,7 @@ def test_a_design_that_cannot_be_is_an_error_in_words(looks, options, words):
 
 
 def test_where_nothing_may_stop_nothing_does():
-    found = Boundary((Look(2, 2, None), Look(3, 3, (0, 3))), 0.05)
+    found = Boundary((StoppingTable(2, 2, None), StoppingTable(3, 3, (0, 3))), 0.05)
     assert found.winner(0, 0, 2) is None
     assert found.winner(1, 3, 0) == "first"
     with pytest.raises(StatisticsError, match=r"p_first = 1\.2"):

@@ -10,7 +10,7 @@ from evaweb.plans.models import Plan, Reference
 from evaweb.plans.services import freeze_plan
 from evaweb.stations.models import Station
 from evaweb.trials.models import Milestone, Scene
-from evaweb.trials.scene_reading import kept_positions, running_plans, scene_table, seen_of
+from evaweb.trials.scene_reading import protected_positions, running_plans, scene_digest, scene_table
 from evaweb.trials.scene_writing import ChangedMeanwhile, SceneRefused, scene_write
 from tests.evaweb.trials import builders
 
@@ -29,7 +29,7 @@ def write(alma, scene):
     def written(change, user=alma, seen=None):
         table = scene_table(scene)
         change(table)
-        return scene_write(user=user, name=scene.name, given=table, seen=seen or seen_of(scene))
+        return scene_write(user=user, name=scene.name, given=table, seen=seen or scene_digest(scene))
 
     return written
 
@@ -111,7 +111,7 @@ def test_what_a_scene_cannot_be_is_refused_in_a_sentence(write, change, sentence
 
 
 def test_two_people_do_not_write_over_each_other(write, scene, alma):
-    seen = seen_of(scene)
+    seen = scene_digest(scene)
     write(lambda table: table.update(title="hers"))
     with pytest.raises(ChangedMeanwhile) as refused:
         write(lambda table: table.update(title="his"), seen=seen)
@@ -124,7 +124,7 @@ def test_two_people_do_not_write_over_each_other(write, scene, alma):
 
 
 def test_what_was_written_and_whose_answer_was_lost_is_written_once(write, alma, scene):
-    seen = seen_of(scene)
+    seen = scene_digest(scene)
     write(lambda table: table.update(title="another"))
     assert write(lambda table: table.update(title="another"), seen=seen)[0] == scene
     given = {"name": "cups", "title": "Cups", "instruction": "stack", "positions": [{"number": 1}]}
@@ -136,7 +136,7 @@ def test_what_was_written_and_whose_answer_was_lost_is_written_once(write, alma,
 
 
 def test_a_change_in_the_administration_is_seen_too(write, scene):
-    seen = seen_of(scene)
+    seen = scene_digest(scene)
     Milestone.objects.filter(scene=scene, order=1).update(text="gripped")
     with pytest.raises(ChangedMeanwhile):
         write(lambda table: table.update(title="another"), seen=seen)
@@ -155,8 +155,8 @@ def test_only_administrators_write(write, ann):
 def test_a_position_of_a_trial_stays_as_it_is_and_the_others_change(bench, alma):
     bench.prepare(position=1)
     scene = bench.scene
-    assert list(kept_positions(scene).values()) == ["1 trial"]
-    table, seen = scene_table(scene), seen_of(scene)
+    assert list(protected_positions(scene).values()) == ["1 trial"]
+    table, seen = scene_table(scene), scene_digest(scene)
     table["positions"][0]["bench"]["block"][0] += 0.01
     with pytest.raises(SceneRefused, match="position 1 is not changed, because of 1 trial"):
         scene_write(user=alma, name=scene.name, given=table, seen=seen)
@@ -175,7 +175,7 @@ def test_a_text_with_the_line_ends_of_a_form_is_no_change_of_a_position(bench, a
     bench.prepare(position=1)
     table = scene_table(scene)
     table["positions"][0]["description"] = "left\nright"
-    scene_write(user=alma, name=scene.name, given=table, seen=seen_of(scene))
+    scene_write(user=alma, name=scene.name, given=table, seen=scene_digest(scene))
 
 
 def test_positions_of_a_draft_move_and_those_of_a_frozen_plan_do_not(bench, alma):
@@ -183,17 +183,17 @@ def test_positions_of_a_draft_move_and_those_of_a_frozen_plan_do_not(bench, alma
     draft = Plan.objects.create(name="blocks", title="Blocks", owner=bench.operator)
     draft.positions.set(scene.positions.all())
     draft.checkpoints.set([bench.checkpoint])
-    assert kept_positions(scene) == {}
+    assert protected_positions(scene) == {}
     freeze_plan(user=bench.operator, plan=draft)
-    assert set(kept_positions(scene).values()) == {"plan Blocks v1"}
+    assert set(protected_positions(scene).values()) == {"plan Blocks v1"}
     assert running_plans(scene) == ["Blocks v1"]
-    table, seen = scene_table(scene), seen_of(scene)
+    table, seen = scene_table(scene), scene_digest(scene)
     table["instruction"] = "other words"
     _, said = scene_write(user=alma, name=scene.name, given=table, seen=seen)
     assert said == ["This stops Blocks v1 until it is changed back, or the plan is amended."]
     table["positions"][0]["label"] = "left"
     with pytest.raises(SceneRefused, match="position 1 is not changed, because of plan Blocks v1"):
-        scene_write(user=alma, name=scene.name, given=table, seen=seen_of(Scene.objects.get()))
+        scene_write(user=alma, name=scene.name, given=table, seen=scene_digest(Scene.objects.get()))
 
 
 def test_reference_pictures_are_named_where_their_position_moves_or_goes(write, scene, alma):

@@ -82,6 +82,6 @@ def test_what_is_held_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_type_that_the_first_part_states_is_known() -> None:
     finder = Jpegs()
     list(finder.add(b"--eva\r\ncontent-type:  image/png\r\n"))
-    assert (finder.stated, finder.is_single, finder.is_other) == ("image/png", False, False)
+    assert (finder.stated, finder.is_single, finder.is_not_mjpeg) == ("image/png", False, False)
     list(finder.add(bytes(5000)))
-    assert finder.is_other
+    assert finder.is_not_mjpeg

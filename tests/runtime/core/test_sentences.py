@@ -45,13 +45,13 @@ def test_a_sentence_is_its_english_and_knows_what_it_is_made_of():
 
 def test_a_sentence_within_a_sentence_travels_whole():
     said = REFUSED(command="run", why=HELD(holder="ann", seconds=2))
-    there = unpack(pack(sentences.told(said)))
+    there = unpack(pack(sentences.to_wire(said)))
     assert there["arguments"]["why"] == {
         "id": "test.held",
         "arguments": {"holder": "ann", "seconds": 2},
         "text": "ann holds it for 2.0 s",
     }
-    heard = sentences.heard(there["text"], there["id"], there["arguments"])
+    heard = sentences.from_wire(there["text"], there["id"], there["arguments"])
     assert (heard, sentences.identity(heard)) == (said, sentences.identity(said))
 
 
@@ -76,7 +76,7 @@ def test_an_argument_is_what_can_travel(given, told):
 def test_what_is_nested_too_deep_keeps_its_english():
     said = sentences.series([f"part {number}" for number in range(30)])
     assert said == "; ".join(f"part {number}" for number in range(30))
-    assert sentences.heard(str(said), **sentences.identity(said)) == said
+    assert sentences.from_wire(str(said), **sentences.identity(said)) == said
     assert sentences.series([]) == ""
     assert sentences.series([READY]) is READY
 
@@ -111,7 +111,7 @@ def test_an_id_is_one_sentence_and_a_call_says_all_of_it():
 )
 def test_what_another_process_says_is_looked_at(id, arguments):
     with pytest.raises(ValueError, match=r"id = |argument"):
-        sentences.heard("so", id, arguments)
+        sentences.from_wire("so", id, arguments)
     assert sentences.checked({"reason": {"id": id, "arguments": arguments}, "more": 3}) == {}
     assert sentences.checked_row({"number": 1, "id": id, "arguments": arguments}) == {"number": 1}
 
@@ -121,7 +121,7 @@ def test_deep_arguments_of_another_process_are_none():
     for _ in range(12):
         deep = {"id": "a.b", "arguments": {"x": deep}, "text": "so"}
     with pytest.raises(ValueError, match="deep"):
-        sentences.heard("so", deep["id"], deep["arguments"])
+        sentences.from_wire("so", deep["id"], deep["arguments"])
 
 
 def test_the_texts_of_a_map_are_found_by_where_they_stand():

@@ -377,7 +377,7 @@ def test_an_episode_that_lost_a_camera_is_refused_with_its_row_and_why(
 
     monkeypatch.setattr(FragmentedVideo, "encode", failing)
     episode = record(tmp_path / "episodes", frames=9)
-    assert (open_episode(episode).frames, open_episode(episode).shown(CAMERAS[1])) == (9, 4)
+    assert (open_episode(episode).frames, open_episode(episode).frame_count(CAMERAS[1])) == (9, 4)
     with pytest.raises(RecordingError, match=f"the video of {CAMERAS[1]} ends at row 4 of 9: .*out of order"):
         publish(episode, tmp_path / "set")
 

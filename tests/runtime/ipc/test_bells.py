@@ -18,7 +18,7 @@ LAYOUT = SharedStateLayout(dim=2, eef_dim=8, cameras=(), picture_bytes=16)
 @pytest.fixture
 def shared() -> Iterator[SharedState]:
     made, descriptor = SharedState.create(LAYOUT)
-    made.hang([Bell.made() for _ in WOKEN])
+    made.hang([Bell.create() for _ in WOKEN])
     yield made
     for bell in made.bells.values():
         bell.close()
@@ -57,7 +57,7 @@ def test_each_message_wakes_its_reader(
 
 
 def test_what_was_rung_before_the_wait_ends_it_once() -> None:
-    bell = Bell.made()
+    bell = Bell.create()
     bell.ring()
     bell.ring()
     bell.wait(PATIENCE_S)  # or the test does not end
@@ -66,7 +66,7 @@ def test_what_was_rung_before_the_wait_ends_it_once() -> None:
 
 
 def test_an_inherited_bell_is_the_same_one() -> None:
-    first, second = Bell.made(), Bell.made()
+    first, second = Bell.create(), Bell.create()
     _, inherited = bells(f"{first.descriptor},{second.descriptor}")
     inherited.ring()
     second.wait(PATIENCE_S)

@@ -16,7 +16,7 @@ from tests.processes import eventually
 from tests.runtime.link.linked import STATION, allowed
 
 OTHER = "bench-8"
-KEY = key_files.KeyPair.of(bytes(range(1, 33)))
+KEY = key_files.KeyPair.from_secret(bytes(range(1, 33)))
 CHALLENGE = b"c" * 16
 
 

@@ -57,7 +57,7 @@ def test_an_unknown_computer_is_not_let_in_while_no_code_is_open(lab, tmp_path, 
 def test_who_answers_without_the_key_in_the_code_is_told_nothing(lab, tmp_path, key):
     """A man in the middle has another key: the handshake fails before the secret is sent."""
     lab.allowed.now = allowed(enrolling=True)
-    code = codes.Code(key_files.KeyPair.of(bytes(range(32))).public, lab.code(STATION).secret)
+    code = codes.Code(key_files.KeyPair.from_secret(bytes(range(32))).public, lab.code(STATION).secret)
     with pytest.raises(TransportError, match="no answer from a lab with the key in this code"):
         enrol(tmp_path / "robot", address(lab), code, key, 1.0)
     assert lab.asked == []
@@ -98,11 +98,11 @@ def test_who_guesses_keeps_nobody_elsewhere_from_enrolling():
     enrolling = Enrolling(lambda *given: asked.append(given) or "no", lambda: 1000.0)
     said = []
     for number in range(40):
-        said.append(enrolling.ask(b"%d" % number, "10.0.0.66", "66", Enrol(1, "0", b"guess")))
+        said.append(enrolling.request(b"%d" % number, "10.0.0.66", "66", Enrol(1, "0", b"guess")))
         most = min(number + 1, 10)
         eventually(lambda most=most: len(asked) == most, "what is asked")
     assert said == [""] * 10 + ["more than 10 tries to enrol within a minute: wait for a minute"] * 30
-    assert enrolling.ask(b"r", "10.0.0.7", "07", Enrol(1, "0", b"a code")) == ""
+    assert enrolling.request(b"r", "10.0.0.7", "07", Enrol(1, "0", b"a code")) == ""
     enrolling.end()
 
 
@@ -116,7 +116,7 @@ def test_a_code_stays_good_where_the_database_comes_back_too_late_and_an_end_wai
 
     enrolling = Enrolling(enrol_, lambda: now[0])
     for number in range(3):
-        enrolling.ask(b"%d" % number, "10.0.0.7", "07", Enrol(1, "0", b"a code"))
+        enrolling.request(b"%d" % number, "10.0.0.7", "07", Enrol(1, "0", b"a code"))
     eventually(lambda: asked, "the first")
     now[0] += 6.0
     gone.set()

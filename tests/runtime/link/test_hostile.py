@@ -34,7 +34,7 @@ class Hostile:
     """Another station of the lab, with a key that is allowed, that says what it likes."""
 
     def __init__(self, lab, port):
-        self.key = key_files.KeyPair.of(bytes(range(1, 33)))
+        self.key = key_files.KeyPair.from_secret(bytes(range(1, 33)))
         self.context = zmq.Context()
         self.lab, self.port = lab, port
         self.dial()
@@ -64,7 +64,9 @@ class Hostile:
 
 @pytest.fixture
 def hostile(lab, linked):
-    lab.allowed.now = allowed((linked.key, STATION), (key_files.KeyPair.of(bytes(range(1, 33))), OTHER))
+    lab.allowed.now = allowed(
+        (linked.key, STATION), (key_files.KeyPair.from_secret(bytes(range(1, 33))), OTHER)
+    )
     made = Hostile(lab, lab.gate.port)
     yield made
     made.close()
@@ -72,7 +74,9 @@ def hostile(lab, linked):
 
 @pytest.fixture
 def hostile_streams(lab, linked):
-    lab.allowed.now = allowed((linked.key, STATION), (key_files.KeyPair.of(bytes(range(1, 33))), OTHER))
+    lab.allowed.now = allowed(
+        (linked.key, STATION), (key_files.KeyPair.from_secret(bytes(range(1, 33))), OTHER)
+    )
     eventually(lambda: OTHER in lab.gate._streams.places, "the other station")
     made = Hostile(lab, lab.gate.second_port)
     yield made

@@ -66,7 +66,7 @@ def test_a_labs_keys_are_made_once_whoever_asks_first(tmp_path):
 
 
 def test_what_a_station_knows_of_its_lab_comes_back(tmp_path):
-    key_files.keep_lab(tmp_path, LAB)
+    key_files.save_lab(tmp_path, LAB)
     assert key_files.known_lab(tmp_path) == LAB
 
 
@@ -97,7 +97,7 @@ def test_a_station_that_is_not_enrolled_is_told_how(tmp_path):
 
 def test_a_code_is_read_as_it_is_shown_however_it_was_copied():
     code = codes.fresh(bytes(range(32)))
-    shown = code.shown()
+    shown = code.text()
     assert len(shown.split("-")) == 9
     for copied in (shown, shown.lower(), shown.replace("-", " "), f"  {shown}\n", shown.replace("-", "")):
         assert codes.read(copied) == code
@@ -105,7 +105,7 @@ def test_a_code_is_read_as_it_is_shown_however_it_was_copied():
 
 @pytest.mark.parametrize("at", range(0, 72, 5))
 def test_a_letter_that_is_mistyped_is_noticed_before_anything_is_asked(at):
-    letters = codes.fresh(bytes(range(32))).shown().replace("-", "")
+    letters = codes.fresh(bytes(range(32))).text().replace("-", "")
     other = "A" if letters[at] != "A" else "B"
     with pytest.raises(ConfigurationError, match="mistyped"):
         codes.read(letters[:at] + other + letters[at + 1 :])
@@ -129,7 +129,7 @@ def test_of_a_code_the_lab_keeps_a_digest_alone():
 def test_new_and_show_say_fingerprints_and_never_a_secret(tmp_path, capsys):
     assert keys.main(["--data-dir", str(tmp_path), "new"]) == 0
     key = key_files.station_key(tmp_path)
-    key_files.keep_lab(tmp_path / "stations" / "bench-7", LAB)
+    key_files.save_lab(tmp_path / "stations" / "bench-7", LAB)
     assert keys.main(["--data-dir", str(tmp_path), "show"]) == 0
     said = capsys.readouterr().out
     assert said.count(codes.fingerprint(key.public)) == 2
@@ -147,6 +147,6 @@ def test_a_second_key_is_refused_with_a_sentence(tmp_path, capsys):
 @pytest.mark.parametrize("address", ["lab", "lab:", ":8470", "lab:0", "lab:70000", "lab:x"])
 def test_an_address_that_is_none_is_refused_before_anything_is_asked(tmp_path, capsys, address):
     keys.main(["--data-dir", str(tmp_path), "new"])
-    code = codes.fresh(bytes(range(32))).shown()
+    code = codes.fresh(bytes(range(32))).text()
     assert keys.main(["--data-dir", str(tmp_path), "enrol", address, code]) == 1
     assert "allowed: HOST:PORT" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import pytest
 from runtime.core.errors import TransportError
 from runtime.ipc.bus import Endpoints
 from runtime.ipc.messages import Command
-from runtime.ipc.station_lock import Taken, take
+from runtime.ipc.station_lock import StationLockedError, acquire
 from runtime.link import key_files
 from runtime.link.wire import RELEASE, Hello
 from tests.processes import PATIENCE_S, eventually
@@ -120,15 +120,15 @@ def test_a_key_that_is_withdrawn_is_cut_off_and_let_in_no_more(lab, linked):
 
 def _is_free(folder):
     try:
-        take(folder).close()
-    except Taken:
+        acquire(folder).close()
+    except StationLockedError:
         return False
     return True
 
 
 @pytest.mark.exhaustive
 def test_a_name_that_a_station_of_the_labs_computer_has_is_refused(lab, robot):
-    with take(lab.folder()) as lock:
+    with acquire(lab.folder()) as lock:
         robot.dial()
         eventually(lambda: _refusal(lab), "the refusal")
         assert "runs on the lab's own computer" in _refusal(lab)
@@ -172,7 +172,7 @@ def _said(endpoints, word):
 
 
 def test_an_unknown_key_is_let_in_for_nothing_and_its_computer_is_told(lab, robot, caplog):
-    lab.allowed.now = allowed((key_files.KeyPair.of(bytes(range(32))), STATION))
+    lab.allowed.now = allowed((key_files.KeyPair.from_secret(bytes(range(32))), STATION))
     robot.dial()
     eventually(lambda: "the lab knows no such key" in caplog.text, "the refusal")
     assert lab.gate.linked() == set()

@@ -31,7 +31,7 @@ from runtime.link.wire import (
 from tests.processes import PATIENCE_MS, eventually
 
 STATION = "bench-7"
-LAB, ROBOT = KeyPair.of(bytes(range(32))), KeyPair.of(bytes(range(1, 33)))
+LAB, ROBOT = KeyPair.from_secret(bytes(range(32))), KeyPair.from_secret(bytes(range(1, 33)))
 ALLOWED = Allowed(MappingProxyType({ROBOT.public.hex(): frozenset({STATION})}))
 
 

@@ -228,7 +228,7 @@ def test_a_bucket_lets_through_its_rate_and_no_more(clock):
     for _ in range(1000):
         clock.now += 0.01
         while not bucket.wait_s():
-            bucket.take(64)
+            bucket.consume(64)
             sent += 64
     assert 10_000 <= sent <= 10_000 + 500 + 64
 

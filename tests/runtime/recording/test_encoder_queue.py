@@ -51,7 +51,7 @@ class Simulated:
 
     def _work(self, until: float) -> None:
         while self._free <= until and self._queue.waiting():
-            entry = self._queue.take()
+            entry = self._queue.get()
             frames = 1 if isinstance(entry, Picture) else entry
             coded = 1 if isinstance(entry, Picture) else encode_count(frames)
             took = coded * self._cost(self._free)
@@ -121,7 +121,7 @@ def test_the_queue_holds_a_bounded_number_of_pictures_and_counts_repeats() -> No
     assert queue.put(None) is False
     assert queue.waiting() == 6
     queue.close()
-    entries = [queue.take() for _ in range(4)]
+    entries = [queue.get() for _ in range(4)]
     assert [entry if isinstance(entry, int) else "picture" for entry in entries[:3]] == [
         "picture",
         "picture",
@@ -134,7 +134,7 @@ def test_a_place_is_free_again_once_a_picture_was_taken() -> None:
     queue = PictureQueue(places=1)
     assert queue.put(numbered(0))
     assert not queue.put(numbered(1))
-    queue.take()
+    queue.get()
     assert queue.put(numbered(2))
 
 
@@ -143,7 +143,7 @@ def test_what_would_wait_too_long_is_not_taken_and_an_empty_queue_takes_anything
     queue.report_encoded(1, 0.2)
     assert [queue.put(PICTURE) for _ in range(4)] == [True, True, False, False]
     for _ in range(3):
-        queue.take()
+        queue.get()
     queue.report_encoded(1, 60.0)
     assert queue.put(PICTURE)
     assert not queue.put(PICTURE)
@@ -154,7 +154,7 @@ def test_a_patient_caller_waits_for_a_place_however_slow_the_encoder_is() -> Non
     queue.report_encoded(1, 60.0)
     assert queue.put(numbered(0), patience=60.0)
     assert queue.put(numbered(1), patience=60.0)
-    taker = threading.Thread(target=queue.take)
+    taker = threading.Thread(target=queue.get)
     taker.start()
     assert queue.put(numbered(2), patience=60.0)
     taker.join()

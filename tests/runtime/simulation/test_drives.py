@@ -48,7 +48,7 @@ def test_of_endless_faults_the_newest_are_kept():
     ],
 )
 def test_words_are_read(word, fields, switch):
-    assert drives.parse_word(word, fields) == switch
+    assert drives.parse_switch(word, fields) == switch
 
 
 def test_a_word_is_said_once_the_node_listens():

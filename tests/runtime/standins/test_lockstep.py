@@ -115,7 +115,9 @@ def courses(
     """Trials of (policy, seed, seconds), at a bench whose policies may take longer than they say."""
     clock = VirtualClock()
     lines = [LINE.format(1, 80), LINE.format(14, 250) + " --failure-rate 0.4"]
-    servers: list[Any] = [serve.made(serve.parser().parse_args(shlex.split(line)), clock) for line in lines]
+    servers: list[Any] = [
+        serve.build_server(serve.parser().parse_args(shlex.split(line)), clock) for line in lines
+    ]
     for server in servers:
         reply = server.reply
 
@@ -188,4 +190,4 @@ def test_a_station_without_a_declared_bench_is_refused(tmp_path: Path) -> None:
 def test_only_a_server_that_can_declare_its_times_is_served() -> None:
     given = serve.parser().parse_args(["gr00t", "--robot", "agilex_piper"])
     with pytest.raises(SetupError, match="gr00t with --behaviour gesture in lockstep; allowed: openpi with"):
-        serve.made(given, VirtualClock())
+        serve.build_server(given, VirtualClock())

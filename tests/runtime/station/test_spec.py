@@ -93,7 +93,7 @@ def test_a_process_joins_with_what_the_supervisor_hands_over(resolved, tmp_path,
         "--shared",
         str(descriptor),
         "--bells",
-        ",".join(str(Bell.made().descriptor) for _ in WOKEN),
+        ",".join(str(Bell.create().descriptor) for _ in WOKEN),
         "--boot",
         "b",
     ]

@@ -32,7 +32,7 @@ class Command(BaseCommand):
         from evaweb.console.event_ingest import EventIngest
         from evaweb.core.errors import EvaError
         from evaweb.jobs.workers import lab_folder_named
-        from evaweb.serving.listeners import PortTaken, open_listener
+        from evaweb.serving.listeners import PortInUseError, open_listener
 
         try:
             listener = open_listener(host, port)
@@ -41,6 +41,6 @@ class Command(BaseCommand):
             log.warning(
                 "the database does not answer; workers know the lab's data folder as it was: %s", error
             )
-        except (PortTaken, EvaError) as error:
+        except (PortInUseError, EvaError) as error:
             raise CommandError(str(error)) from None
         server.serve(application, listener, beside=EventIngest(), lifeline=lifeline, nice=nice)

@@ -43,7 +43,7 @@ class Command(BaseCommand):
         from evaweb.api.stop_gateway import stop_application  # imported here, after the models are loaded
         from evaweb.console import server
         from evaweb.console.connection_limits import StopRequest
-        from evaweb.serving.listeners import PortTaken, open_listener
+        from evaweb.serving.listeners import PortInUseError, open_listener
         from evaweb.serving.stop_port import StopPort
 
         beside = None
@@ -53,7 +53,7 @@ class Command(BaseCommand):
             else:
                 listener = open_listener(host, port)
                 beside = StopPort(listener.getsockname()[1], web_port)
-        except PortTaken as error:
+        except PortInUseError as error:
             raise CommandError(str(error)) from None
         except OSError as error:
             raise CommandError(f"--descriptor {descriptor}: {error.strerror}; allowed: a socket's") from None

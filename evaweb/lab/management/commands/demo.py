@@ -217,7 +217,7 @@ class Command(BaseCommand):
         result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
         if options["json"]:
             options["json"].write_text(json.dumps(to_json_value(result), indent=1), "utf-8")
-        for line in (*told(found), result["headline"]):
+        for line in (*result_lines(found), result["headline"]):
             self.stdout.write(line)
 
     def _once(self, url: str, operator: DemoLogin, options: dict[str, Any]) -> None:
@@ -233,7 +233,7 @@ class Command(BaseCommand):
         self.stdout.write(text)
 
 
-def told(found: Analysis) -> Iterator[str]:
+def result_lines(found: Analysis) -> Iterator[str]:
     """Yield each rate with n and interval, and differences with intervals; the conclusion is the headline's."""
     for arm in found.arms:
         yield f"{arm.checkpoint}: {arm.success.successes}/{arm.success.n} {_percent(arm.success.interval)}"

@@ -30,7 +30,7 @@ class Command(BaseCommand):
 
     def handle(self, *args: Any, **options: Any) -> None:
         path = options["out"].expanduser().absolute()
-        sight = FULL_VISIBILITY if options["unblinded"] else bundle.sight_for(AnonymousUser())
+        sight = FULL_VISIBILITY if options["unblinded"] else bundle.visibility_for(AnonymousUser())
         try:
             notes = bundle.write(path, sight, lambda part: self.stderr.write(f"gathering {part}"))
         except OSError as error:

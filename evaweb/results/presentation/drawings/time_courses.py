@@ -26,7 +26,7 @@ from evaweb.results.presentation.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import evidence_words, rate_words
+from evaweb.results.presentation.wording import evidence_text, rate_words
 from evaweb.statistics.proportions import wilson
 from evaweb.statistics.sequential import Evidence
 
@@ -176,7 +176,7 @@ def draw_evidence(
         parts.append(line([(x(found.stop), 14), (x(found.stop), 230)], "stop"))
         parts.append(words(x(found.stop) + 5, 24, f"pair {found.stop}", class_="tick"))
     parts += _names([*labels, (y(wanted), -1, "")], x(end), 262)
-    said = f"Evidence {evidence_words(found)}"
+    said = f"Evidence {evidence_text(found)}"
     return drawing(
         WIDTH, 276, "Evidence (e-value) after each pair of trials", said, *parts, kind="evidence",
         columns=("pair", "better", "e_value_log10"),

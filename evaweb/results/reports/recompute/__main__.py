@@ -16,10 +16,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from .designs import error, kept_blocks, kept_faults, planned, planned_letters, share_of
-from .judged import agreement, by_words, calibration, on_milestone, preferences, score_alpha
+from .designs import error, planned, planned_letters, record_contradictions, recorded_blocks, share_of
+from .judged import agreement, by_text, calibration, on_milestone, preferences, score_alpha
 from .numbers import Drawn, Trial, numbers
-from .page import read, said_faults
+from .page import page_contradictions, read
 from .record import changes, gaps
 from .scenes import ending_faults, scene_faults
 from .sealed import faults
@@ -60,11 +60,11 @@ def main() -> int:
     wrong = [
         *hidden,
         *(f"data/{name} is no part of a report" for name in sorted(_names(data) - _FILES)),
-        *said_faults(page, seal, plan, shown),
+        *page_contradictions(page, seal, plan, shown),
         *faults(seal, plan, rows),
         *gaps(rows, scores, record),
         *changes(rows, scores, judged, seal, record),
-        *kept_faults(rows, scores, plan, seal["at_reveal"]),
+        *record_contradictions(rows, scores, plan, seal["at_reveal"]),
         *_boundary(plan),
     ]
     found = {}
@@ -74,7 +74,7 @@ def main() -> int:
         people = Counter(map(_of, preferred))
         said = planned(trials, plan, seal["at_reveal"])
         if seal["at_reveal"]:
-            blocks, told = kept_blocks(seal["at_reveal"]), seal["at_reveal"].get("headline", ())
+            blocks, told = recorded_blocks(seal["at_reveal"]), seal["at_reveal"].get("headline", ())
             wrong += headline_faults(said, blocks, plan, told)
         wrong += page_faults(page, shown, trials, _later(scores, seal["at_reveal"]))
         found = numbers(trials, plan, said)
@@ -214,14 +214,14 @@ def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, s
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
     """Return the agreement of second raters with the scores of that time, for trials that count."""
-    given = _given(rows, scores)
+    given = _scores_by_trial(rows, scores)
     pairs = [(_stood(given[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in given]
     if not pairs:
         return None
     milestones: dict[str, list[tuple[bool, bool]]] = {}
     for one, other in pairs:
-        again = by_words(json.loads(other["milestones"]))
-        for text, reached in by_words(json.loads(one["milestones"])).items():
+        again = by_text(json.loads(other["milestones"]))
+        for text, reached in by_text(json.loads(one["milestones"])).items():
             if text in again:
                 milestones.setdefault(text, []).append((reached, again[text]))
     return {
@@ -234,7 +234,7 @@ def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None
     }
 
 
-def _given(rows: Rows, scores: Rows) -> dict[str, Rows]:
+def _scores_by_trial(rows: Rows, scores: Rows) -> dict[str, Rows]:
     """Return the scores of each trial that counts."""
     given: dict[str, Rows] = {row["trial"]: [] for row in rows if row["status"] == "scored"}
     for score in scores:
@@ -246,7 +246,7 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
     """Return the agreement of each version of each automatic judge with the scores of that time, for trials
     that count.
     """
-    given = _given(rows, scores)
+    given = _scores_by_trial(rows, scores)
     judges: dict[tuple[str, str], Rows] = {}
     for row in judgements:
         if row["trial"] in given:
@@ -255,9 +255,9 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
     for (judge, version), said in sorted(judges.items()):
         words: dict[str, list[tuple[bool, bool | None, float | None]]] = {}
         for row in said:
-            own = by_words((text, word) for text, *word in json.loads(row["milestones"]))
+            own = by_text((text, word) for text, *word in json.loads(row["milestones"]))
             stood = _stood(given[row["trial"]], row["at"])
-            for text, scored in by_words(json.loads(stood["milestones"])).items():
+            for text, scored in by_text(json.loads(stood["milestones"])).items():
                 if text in own:
                     words.setdefault(text, []).append((scored, *own[text]))
         reasons = [row["reason"] for row in said if row["reason"]]

@@ -34,7 +34,7 @@ def planned(
     trials: Sequence[Row], plan: Mapping[str, Any], at_reveal: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
     """Return the conclusion of each comparison, from the blocks recorded at the reveal if there was one."""
-    return conclusions(kept_blocks(at_reveal) if at_reveal else blocks_of(trials, plan), plan)
+    return conclusions(recorded_blocks(at_reveal) if at_reveal else blocks_of(trials, plan), plan)
 
 
 def planned_letters(
@@ -52,7 +52,7 @@ def planned_letters(
         or any(one["at"] is None for one in said)
     ):
         return None
-    blocks = kept_blocks(at_reveal) if at_reveal else blocks_of(trials, plan)
+    blocks = recorded_blocks(at_reveal) if at_reveal else blocks_of(trials, plan)
     rates = {}
     for number, name in enumerate(arms):
         values = [value for block in blocks for arm, value in block if arm == number]
@@ -73,7 +73,7 @@ def arms_of(plan: Mapping[str, Any]) -> list[str]:
     return list(dict.fromkeys(name for names in comparisons_of(plan) for name in names))
 
 
-def kept_blocks(at_reveal: Mapping[str, Any]) -> list[Block]:
+def recorded_blocks(at_reveal: Mapping[str, Any]) -> list[Block]:
     """Return the blocks recorded at a reveal; early reveals recorded pairs."""
     if "blocks" in at_reveal:
         return [[(arm, float(value)) for arm, value in block] for block in at_reveal["blocks"]]
@@ -93,7 +93,7 @@ def blocks_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Block]:
     return list(whole[:used])
 
 
-def kept_faults(
+def record_contradictions(
     rows: Sequence[Mapping[str, str]],
     scores: Sequence[Mapping[str, str]],
     plan: Mapping[str, Any],
@@ -118,7 +118,7 @@ def kept_faults(
             found.append(f"trial {row['trial']} is said to be {said}, its newest score is {kept}")
     if at_reveal is not None and not found:
         stood = [_stood(row, given, at_reveal["at"]) for row in rows]
-        kept, given_then = kept_blocks(at_reveal), blocks_of(stood, plan)
+        kept, given_then = recorded_blocks(at_reveal), blocks_of(stood, plan)
         # Compared without the order within a block: reveals that recorded pairs did not record it.
         if [sorted(block) for block in kept] != [sorted(block) for block in given_then]:
             found.append("the blocks of the reveal are not those of the scores that stood then")
@@ -244,7 +244,7 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
     """Return the conclusion of one comparison; `winner` is 0 or 1."""
     said = plan["stopping"]
     foreseen, alpha, margin = _foreseen(plan), share_of(plan), said.get("margin")
-    given = _made(blocks, said.get("counts"), sides)
+    given = _complete_blocks(blocks, said.get("counts"), sides)
     at, winner, p = len(given) if len(given) == foreseen else None, None, None
     found = None
     if said.get("boundary"):
@@ -271,7 +271,7 @@ def _conclusion(blocks: Sequence[Block], plan: Mapping[str, Any], sides: tuple[i
     return {"blocks": len(given), "at": at, "winner": winner, "p": p, "estimate": found and list(found)}
 
 
-def _made(
+def _complete_blocks(
     blocks: Sequence[Block], counts: Sequence[Sequence[int]] | None, sides: tuple[int, int]
 ) -> list[tuple[list[float], list[float]]]:
     """Return the outcomes of both sides by block, up to the first incomplete block."""

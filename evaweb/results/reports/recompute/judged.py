@@ -72,7 +72,7 @@ def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
     return 1 - observed / expected if expected else None
 
 
-def by_words(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:

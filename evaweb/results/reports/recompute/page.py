@@ -169,7 +169,7 @@ def _hiding(styles: str) -> set[str]:
     return found
 
 
-def said_faults(
+def page_contradictions(
     root: Node, seal: Mapping[str, Any], plan: Mapping[str, Any], shown: Mapping[str, Any]
 ) -> list[str]:
     """Return differences between the page's statements and the reveal, the plan and numbers.json."""

@@ -66,7 +66,7 @@ class Mixture:
 
         The inverse of the conversion of such a chunk to joints. Binary grippers are those of `newest`.
         """
-        robot, qpos = self._known, np.asarray(observation.qpos, np.float64)
+        robot, qpos = self._loaded_robot, np.asarray(observation.qpos, np.float64)
         before = qpos if like.mode == "relative" else np.concatenate([qpos[None], joints[:-1]])
         moved = difference(joints, before, self._dims.wrapping)
         still = [*robot.gripper_dims, *robot.speed_dims]  # absolute in every mode
@@ -100,21 +100,21 @@ class Mixture:
         """Return the columns of binary grippers in a row."""
         if like.space == "joint":
             return list(self._dims.switched)
-        binary = self._known.binary_dims
+        binary = self._loaded_robot.binary_dims
         return [place for place, dim in self._layout_of(like).commanded if dim in binary]
 
     def _layout_of(self, like: ActionChunk) -> PoseRows:
         wanted = CANONICAL if like.pose is None else like.pose
         if self._layout is None or self._layout.pose != wanted:
-            self._layout = PoseRows(wanted, self._known)
+            self._layout = PoseRows(wanted, self._loaded_robot)
         return self._layout
 
     @cached_property
     def _end_effectors(self) -> EndEffectors:
-        return EndEffectors(self._known, ChainForward(self._known))
+        return EndEffectors(self._loaded_robot, ChainForward(self._loaded_robot))
 
     @property
-    def _known(self) -> Robot:
+    def _loaded_robot(self) -> Robot:
         assert self._robot is not None, "rows of poses need the robot whose they are"
         return self._robot
 

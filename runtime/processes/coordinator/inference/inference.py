@@ -289,7 +289,7 @@ class Inference:
             flight, self._flight = self._flight, None
             return self._on_response(flight.result())
         # A late response of an earlier run may occupy the policy: a request would grow old in the queue.
-        if not self.runner.busy and self._should_request() and self._try_to_ask():
+        if not self.runner.busy and self._should_request() and self._try_request():
             return self._pump()
         return None
 
@@ -313,7 +313,7 @@ class Inference:
         remaining = int(self._shared_state.control.read()["remaining"])
         return Progress(remaining, bool(self._unmerged), self._clock.now() - self._asked_at)
 
-    def _try_to_ask(self) -> bool:
+    def _try_request(self) -> bool:
         """Send a request; return True if its response is available at once.
 
         Control judges gaps in the observations action by action. But while a strategy waits for this response there

@@ -115,7 +115,7 @@ class RtcPrefix:
         if generation is None or generation == self.generation:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
             pace = (chunk.rate or self._control_rate) / self._control_rate
-            made = len(rows) if commands is None else _made_of(len(commands), pace)
+            made = len(rows) if commands is None else _source_row_count(len(commands), pace)
             self._on_the_way[chunk_id] = _PendingChunk(chunk, observation_step, waited, rows, made)
 
     def on_merged(self, merged: ChunkMerged) -> None:
@@ -205,7 +205,7 @@ class RtcPrefix:
         known = [shares for shares in made if shares is not None and self._same_kind(held, shares)]
         if len(known) < len(made):
             return None
-        whole = _held_on(held.rows, held.usable)  # without refused rows
+        whole = _repeat_last_row(held.rows, held.usable)  # without refused rows
         exact = abs((steps[0] - held.anchor) * held.pace - max(0, passed)) < _HAIR
         alone = {max(self._merged): 1.0}
         mixed = [place for place, shares in enumerate(known) if not exact or shares != alone]
@@ -238,7 +238,7 @@ class RtcPrefix:
         joints = self._mixture.joints(self._parts(steps, known, lambda one: (one.commands, 1.0)))
         newest = rows[places].astype(np.float64)
         rows[places] = self._mixture.relative(joints, newest, held.chunk, observation)
-        return _held_on(rows, int(places[-1]) + 1)
+        return _repeat_last_row(rows, int(places[-1]) + 1)
 
     def _same_kind(self, held: _CommittedChunk, shares: Shares) -> bool:
         """Return True if all these chunks have the number format of `held`."""
@@ -310,12 +310,12 @@ class RtcPrefix:
             self.warning = _DELAY_BEYOND_PLAN(steps=delay, left=left)
 
 
-def _made_of(commands: int, pace: float) -> int:
+def _source_row_count(commands: int, pace: float) -> int:
     """Return the number of a policy's rows from which so many commands were made."""
     return math.ceil((commands - 1) * pace - _HAIR) + 1
 
 
-def _held_on(rows: Float32, count: int) -> Float32:
+def _repeat_last_row(rows: Float32, count: int) -> Float32:
     """Return the first `count` rows [T, W], the last repeated to the original length, which servers may require."""
     return (
         rows

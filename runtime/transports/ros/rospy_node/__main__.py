@@ -79,7 +79,7 @@ class Parent:
         """Send a message; waits while the parent is behind, so that nothing accumulates here."""
         self._send(HEAD.pack(MESSAGE, index, len(payload)), payload)
 
-    def word(self, **fields: Any) -> None:
+    def send_word(self, **fields: Any) -> None:
         payload = json.dumps(fields).encode()
         self._send(HEAD.pack(WORD, 0, len(payload)), payload)
 
@@ -105,7 +105,7 @@ class WarningForwarder(logging.Handler):
         line = (text[-1] if "Traceback" in " ".join(text) else " ".join(text))[:LONGEST_SAYING]
         if line and line not in self._said and len(self._said) < SAYINGS_KEPT:
             self._said.add(line)
-            self._parent.word(log=line)
+            self._parent.send_word(log=line)
 
 
 class Topics:
@@ -191,7 +191,7 @@ class PeerMonitor:
             if now >= why_at:
                 why_at = now + WHY_S
                 self._explain()
-            self._tell()
+            self._report_changes()
             time.sleep(LOOK_S)
 
     def _who(self) -> list[Any]:
@@ -208,7 +208,7 @@ class PeerMonitor:
             return
         self._trouble = ""
         if who != self._identity or uri != self._uri:
-            self._parent.word(
+            self._parent.send_word(
                 anew=f"the ROS master at {self._master} is another than before, and does not know us"
             )
             os._exit(0)
@@ -257,7 +257,7 @@ class PeerMonitor:
             f"have the same definition of {made._type}"
         )
 
-    def _tell(self) -> None:
+    def _report_changes(self) -> None:
         """Report the status to the parent if it has changed."""
         found = {
             str(index): [self._topics.peers(index), self._refused.get(index, "")]
@@ -266,7 +266,7 @@ class PeerMonitor:
         status = {"peers": found, "trouble": self._trouble, "stale": self._topics.stale}
         if status != self._told:
             self._told = status
-            self._parent.word(**status)
+            self._parent.send_word(**status)
 
 
 def run_commands(parent: Parent, topics: Topics, life: float) -> None:
@@ -281,7 +281,7 @@ def run_commands(parent: Parent, topics: Topics, life: float) -> None:
             try:
                 act(**asked)
             except Exception as error:  # exceptions of rospy for a bad name or definition
-                parent.word(unopened=[asked["index"], f"{asked['name']} cannot be opened: {error}"])
+                parent.send_word(unopened=[asked["index"], f"{asked['name']} cannot be opened: {error}"])
             continue
         _, index, made = COMMAND.unpack_from(packet)
         if time.monotonic() - made > life:
@@ -296,7 +296,7 @@ def start_node(options: dict[str, Any], parent: Parent) -> None:
     try:
         call_xmlrpc(master, "getPid")  # init_node would wait for a master for ever
     except NoXmlRpcAnswer as error:
-        parent.word(failed=str(error))
+        parent.send_word(failed=str(error))
         sys.exit(1)
     import rospy
 
@@ -337,9 +337,9 @@ def main() -> None:
     try:
         watch = PeerMonitor(parent, topics, options["master"], options["address"])
     except NoXmlRpcAnswer as error:
-        parent.word(failed=str(error))
+        parent.send_word(failed=str(error))
         os._exit(1)
-    parent.word(ready=True)
+    parent.send_word(ready=True)
     threading.Thread(target=watch.run, name="watch", daemon=True).start()
     run_commands(parent, topics, options["life"])
     shut_down()

@@ -34,7 +34,7 @@ def data(tmp_path):
 def copies(data, target, before=None, without=()):
     target.mkdir(parents=True)
     made = FileCopies(data, target, before, without)
-    return made, list(made.made())
+    return made, list(made.copy())
 
 
 def test_every_file_is_copied_and_listed_but_what_one_machine_makes_anew(data, tmp_path, monkeypatch):

@@ -116,7 +116,7 @@ def test_a_lab_whose_database_is_gone_still_has_a_bundle_and_a_blind_one(lab, mo
     monkeypatch.setattr(bundle, "visibility_for_user", gone)
     monkeypatch.setattr(contents, "database", gone)
     monkeypatch.setattr(contents, "station_parts", gone)
-    notes, texts = made(lab, bundle.sight_for(AnonymousUser()))
+    notes, texts = made(lab, bundle.visibility_for(AnonymousUser()))
     assert "who is blind cannot be read (no such table)" in notes[0]
     assert "the database as far as it could not be read: no such table" in notes
     assert {"versions.json", "machine.json", "deployments/bench-1.json"} <= texts.keys()
@@ -136,7 +136,7 @@ def test_the_command_is_as_blind_as_who_has_looked_behind_nothing(lab, monkeypat
     monkeypatch.setattr(
         bundle, "write", lambda path, sight, tell: seen.append(sight) or path.write_bytes(b"") or []
     )
-    monkeypatch.setattr(bundle, "sight_for", lambda user: user)
+    monkeypatch.setattr(bundle, "visibility_for", lambda user: user)
     call_command("diagnose", out=tmp_path / "a.zip")
     call_command("diagnose", out=tmp_path / "b.zip", unblinded=True)
     assert seen == [AnonymousUser(), FULL_VISIBILITY]

@@ -10,7 +10,7 @@ from django.test import Client
 from evaweb.api.tokens import create_token
 from evaweb.plans.models import Plan
 from evaweb.plans.services import close_plan, freeze_plan
-from evaweb.results.analysis.simulated import is_simulated, set_beside, simulated_plans
+from evaweb.results.analysis.simulated import compare_with_real, is_simulated, simulated_plans
 from evaweb.stations.models import Station
 from tests.evaweb.results.conftest import _carried_out
 
@@ -39,7 +39,7 @@ def test_rates_orders_and_differences_stand_side_by_side(revealed, played):
     assert (is_simulated(revealed), is_simulated(played)) == (False, True)
     assert simulated_plans(revealed) == [played]
     assert simulated_plans(played) == []
-    found = set_beside(revealed, played)
+    found = compare_with_real(revealed, played)
     assert [(name, real.n, simulated.n) for name, real, simulated in found["rates"]] == [
         ("pi0-block", 8, 8),
         ("pi0-new", 8, 8),

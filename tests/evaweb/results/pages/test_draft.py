@@ -298,25 +298,25 @@ def test_the_power_of_scores_is_that_of_their_own_test_and_says_what_is_assumed_
 def test_what_nobody_asks_for_any_more_is_given_up(monkeypatch):
     desk, began, superseded = power._Desk(), [], Event()
     question = power.Question(rate=0.2, better=0.9)
-    one = power.Asked("none", 6, 0.05, None, (), question, True)
-    other = power.Asked("none", 7, 0.05, None, (), question, True)
+    one = power.PowerRequest("none", 6, 0.05, None, (), question, True)
+    other = power.PowerRequest("none", 7, 0.05, None, (), question, True)
 
     def step(asked):
         def run(so_far):
             began.append(asked.pairs)
             if asked is one:
-                desk.ask("ann", other, 0)
+                desk.query("ann", other, 0)
                 superseded.set()
             return so_far
 
         return run
 
     monkeypatch.setattr(power, "_steps", lambda asked: [step(asked) for _ in range(3)])
-    desk.ask("ann", one, 0)
+    desk.query("ann", one, 0)
     assert superseded.wait(PATIENCE_S)
-    assert desk.ask("ann", other, 60).whole
+    assert desk.query("ann", other, 60).whole
     assert began == [6, 7, 7, 7]
-    assert desk.ask("bob", one, 60).whole
+    assert desk.query("bob", one, 60).whole
     assert began == [6, 7, 7, 7, 6, 6]
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from evaweb.plans.models import Plan
 from evaweb.results.presentation.headline import _counts, best_of
-from evaweb.results.presentation.integrity import too_few_words
+from evaweb.results.presentation.integrity import too_few_text
 from evaweb.statistics.designs import design, evaluate_design, in_blocks
 
 SCORES = in_blocks([(0.75, 0.5)] * 10)
@@ -61,6 +61,6 @@ def test_a_plan_of_before_it_was_said_keeps_its_words():
 )
 def test_pairs_that_no_test_of_delays_could_tell_apart_are_said_to_be_too_few(pairs, said):
     test = {"pairs": pairs, "p": 1.0 if pairs else None}
-    found = too_few_words({"delays": {"alpha": 0.05, "rows": [{"tests": [test]}]}})
+    found = too_few_text({"delays": {"alpha": 0.05, "rows": [{"tests": [test]}]}})
     assert found.startswith(said)
     assert bool(found) == bool(said)

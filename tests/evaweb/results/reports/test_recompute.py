@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from evaweb.results.analysis.agreement import agreement, by_words
+from evaweb.results.analysis.agreement import agreement, by_text
 from evaweb.results.analysis.analysis import Verdict, analyse
 from evaweb.results.analysis.outcomes import Interruption, Outcome
 from evaweb.results.reports.document import analysis_document
@@ -180,9 +180,7 @@ def test_neither_takes_one_word_for_agreement():
 def test_milestones_of_the_same_words_are_told_apart_by_both():
     said = [("held", 1), ("held (2)", 2), ("held", 3), ("on the plate", 4)]
     assert (
-        by_words(said)
-        == judged.by_words(said)
-        == {"held": 1, "held (2)": 2, "held (3)": 3, "on the plate": 4}
+        by_text(said) == judged.by_text(said) == {"held": 1, "held (2)": 2, "held (3)": 3, "on the plate": 4}
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runtime.clients.panel.watch import shown
+from runtime.clients.panel.watch import displayed_state
 from runtime.core.sentences import Pattern, fixed, within
 from runtime.ipc.session_state import complete_state_meaning
 
@@ -15,7 +15,7 @@ _SILENT = Pattern("policy.of_this_test", "the policy at {url} is silent")
 
 def said(reason, **more):
     snapshot = {"state": "running", "reason": reason, "allowed": ["stop", "halt", "estop"], **more}
-    return shown(complete_state_meaning(snapshot | {"sentences": within(snapshot)}))
+    return displayed_state(complete_state_meaning(snapshot | {"sentences": within(snapshot)}))
 
 
 def test_it_says_what_goes_on_and_who_commands():

@@ -93,9 +93,9 @@ def test_what_nobody_looks_at_is_not_made_and_who_begins_to_look_sees_it_at_once
     with monkeypatch.context() as broken:
         broken.delattr(simplejpeg, "encode_jpeg")
         assert looking.seen(1.0, 1.0) == []
-        assert not looking.previews.wanted()
+        assert not looking.previews.is_requested()
     looking.begun = ["camera/cam_high"]
-    assert looking.previews.wanted()
+    assert looking.previews.is_requested()
     assert len(looking.seen(1.001, 1.0)) == 1
 
 
