@@ -15,9 +15,10 @@ from PIL import Image
 
 from evaweb.episodes.folders import THUMBNAIL, sheet_name
 from evaweb.episodes.sheets import sheet
+from runtime.core.durable_files import sync_folder
 from runtime.datasets.remux import remux
 from runtime.datasets.video_frames import VideoFrames
-from runtime.recording.files import RecordingError, disk_error, sync_folder, write_atomic
+from runtime.recording.files import RecordingError, disk_error, write_atomic
 from runtime.recording.reader import Episode, open_episode
 
 WIDTH = 320  # width of the thumbnail [px]

@@ -6,13 +6,11 @@ A picture is stored in DATA/pictures under the SHA-256 of its bytes: it never ch
 from __future__ import annotations
 
 import hashlib
-import os
 import time
 from collections.abc import Iterable
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import simplejpeg
@@ -22,6 +20,7 @@ from django.conf import settings
 from evaweb.core.errors import Conflict, EvaError, NotFound
 from evaweb.stations.models import Station
 from evaweb.stations.runtime_client import connection_to
+from runtime.core.durable_files import write_durably
 from runtime.core.picture_bounds import MOST_PIXELS, require_scans
 from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
@@ -86,12 +85,7 @@ def store_image(jpeg: bytes) -> str:
     path = _path(name)
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        draft = path.with_suffix(f".{uuid4().hex}")
-        with draft.open("wb") as file:
-            file.write(jpeg)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
+        write_durably(path, jpeg)
     return name
 
 

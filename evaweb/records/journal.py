@@ -9,13 +9,11 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum
 from functools import cache
-from io import FileIO
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, TypeVar, Union
 from uuid import UUID
@@ -34,6 +32,7 @@ from pydantic import (
 
 from evaweb.accounts.roles import get_or_create_person
 from evaweb.core.errors import EvaError
+from runtime.core.durable_files import AppendError, append_durably
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
@@ -267,49 +266,11 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab+", buffering=0) as file:
-            before = file.seek(0, os.SEEK_END)
-            try:
-                _written(file, text.encode() + b"\n")
-            except OSError:
-                done = _truncate_back(file, before)
-                raise
+            append_durably(file, text.encode() + b"\n")
     except OSError as error:
+        if isinstance(error, AppendError) and not error.is_restored:
+            done = "what was written could not be taken back: the next reconcile may take it for said"
         raise NotWritten(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
-
-
-def _written(file: FileIO, payload: bytes) -> None:
-    new = file.tell() == 0
-    if not new:
-        file.seek(
-            -1, os.SEEK_END
-        )  # a crash may have torn the last line: end it, so that only that one is lost
-        payload = payload if file.read(1) == b"\n" else b"\n" + payload
-    while payload:
-        payload = payload[file.write(payload) :]
-    os.fsync(file.fileno())
-    if new:
-        folder = Path(file.name).parent
-        _sync_folder(folder)
-        _sync_folder(folder.parent)
-
-
-def _truncate_back(file: FileIO, before: int) -> str:
-    """Restore the file's length; return the fate of the line as text for the error message."""
-    try:
-        file.truncate(before)
-        os.fsync(file.fileno())
-    except OSError:
-        log.exception("%s could not be made as long as it was", file.name)
-        return "what was written could not be taken back: the next reconcile may take it for said"
-    return "nothing was changed"
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def read_numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.assemble import ProgressCallback, ignore_progress
@@ -26,7 +27,7 @@ from runtime.datasets.rows import is_list
 from runtime.datasets.staging import lock_dataset
 from runtime.datasets.video_frames import StoredImages, VideoFrames, VideoSegment
 from runtime.recording.base import IMPORTED
-from runtime.recording.files import disk_error, sync_folder, write_atomic
+from runtime.recording.files import disk_error, write_atomic
 
 _PLACES = ("index", "episode_index", "task_index")  # of a dataset, not of the episode
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 import robots
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.core.types import Float32
 from runtime.datasets import layout
@@ -27,7 +28,7 @@ from runtime.datasets.reader import Dataset, RecordedEpisode
 from runtime.datasets.video_frames import ImageSequence
 from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
-from runtime.recording.files import disk_error, sync_folder
+from runtime.recording.files import disk_error
 from runtime.recording.scrub import require_intact
 from runtime.recording.settings import RecordingSettings
 

@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.datasets import layout
 from runtime.datasets.catalog import Catalog
-from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
+from runtime.recording.files import disk_error, read_json, write_atomic
 
 FOLDER = layout.PUBLISHING
 LOCK = ".lock"

@@ -8,6 +8,8 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from runtime.core.durable_files import sync_folder
+
 
 @dataclass(frozen=True, slots=True)
 class Latched:
@@ -41,17 +43,10 @@ class Latch:
             json.dump(asdict(latched), file)
             file.flush()
             os.fsync(file.fileno())
-        self._sync_folder()
+        sync_folder(self._path.parent)
         return latched
 
     def clear(self) -> None:
         """Remove the latch."""
         self._path.unlink(missing_ok=True)
-        self._sync_folder()
-
-    def _sync_folder(self) -> None:
-        folder = os.open(self._path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(self._path.parent)

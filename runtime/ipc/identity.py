@@ -10,10 +10,10 @@ import hmac
 import os
 import secrets
 import stat
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from runtime.core.durable_files import create_durably
 from runtime.core.errors import ConfigurationError
 from runtime.core.sentences import Pattern, fixed
 from runtime.ipc.endpoints import account_name
@@ -102,17 +102,9 @@ class Key:
 
     def _make(self) -> bytes:
         """Create the key, whichever of station and web comes first; the link makes it appear complete."""
-        draft = self.path.with_name(f".bus.key.{secrets.token_hex(4)}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with open(handle, "wb") as file:
-                file.write(secrets.token_bytes(_KEY_BYTES))
-                file.flush()
-                os.fsync(file.fileno())
-            with suppress(FileExistsError):
-                os.link(draft, self.path)
-            draft.unlink()
+            create_durably(self.path, secrets.token_bytes(_KEY_BYTES), 0o600)
             return self._read()
         except OSError as error:
             raise ConfigurationError(f"the key {self.path} cannot be made: {error.strerror}") from None

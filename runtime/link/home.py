@@ -16,9 +16,10 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.link.contents import MANIFEST, OUTCOME, Contents, is_episode
-from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
+from runtime.recording.files import disk_error, read_json, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)

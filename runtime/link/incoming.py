@@ -23,11 +23,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty, SimpleQueue
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import CodecError, RecordingError
 from runtime.link.contents import MANIFEST, Contents, File, contents_of, is_episode, unpacked
 from runtime.link.wire import PIECE, Arrived, Declined, Labels, Message, Offer, Piece, Want
 from runtime.link.yielding import lower_priority
-from runtime.recording.files import disk_error, read_json, sync_folder, write_atomic
+from runtime.recording.files import disk_error, read_json, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)

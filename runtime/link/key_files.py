@@ -8,11 +8,11 @@ DATA/stations/NAME/lab.json of a station that is enrolled: where its lab is, and
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import secrets
 import stat
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from typing import Any
 import zmq
 import zmq.utils.z85
 
+from runtime.core.durable_files import create_durably, write_durably
 from runtime.core.errors import ConfigurationError
 from runtime.ipc.endpoints import account_name
 
@@ -167,28 +168,13 @@ def _read(path: Path) -> bytes:
 def _load_or_create(path: Path, secret: bytes) -> bytes:
     """The key in that file, which is `secret` where there was none; nobody ever sees a part of it."""
     if not path.exists():
-        draft = _draft(path, secret)
-        try:
-            with contextlib.suppress(FileExistsError):
-                os.link(draft, path)
-        finally:
-            draft.unlink()
+        _write(path, secret, create_durably)
     return _read(path)
 
 
-def _write(path: Path, content: bytes) -> None:
-    _draft(path, content).replace(path)
-
-
-def _draft(path: Path, content: bytes) -> Path:
-    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+def _write(path: Path, content: bytes, write: Callable[[Path, bytes, int], None] = write_durably) -> None:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with open(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+        write(path, content, 0o600)
     except OSError as error:
         raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from None
-    return draft

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
 from runtime.recording.base import (
@@ -32,7 +33,6 @@ from runtime.recording.files import (
     UnclosedError,
     disk_error,
     require_room,
-    sync_folder,
     to_json,
     write_atomic,
 )

@@ -11,10 +11,10 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
+from runtime.core.durable_files import write_durably
 from runtime.core.errors import RecordingError
 from runtime.recording.digests import Digest, FileDigest
 
@@ -120,45 +120,11 @@ def require_room(folder: Path, wanted: int) -> None:
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that, even after a power cut, either the old or the whole new file is there.
-
-    Any number of processes may do so at once; the last one wins.
-    """
-    draft = path.with_name(f".{path.name}.draft")
+    """Call `write_durably`. Raises RecordingError or DiskFullError."""
     try:
-        with _drafted(draft) as file:
-            try:
-                # Content, then name, then folder entry: in this order a power cut leaves the old or the whole new file.
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-                os.replace(draft, path)
-            except OSError:
-                draft.unlink(missing_ok=True)
-                raise
-        sync_folder(path.parent)
+        write_durably(path, data)
     except OSError as error:
         raise disk_error("writing", path, error) from error
-
-
-@contextmanager
-def _drafted(draft: Path) -> Iterator[BinaryIO]:
-    """Yield the draft file, empty and locked; a draft left by a kill is reused."""
-    while True:
-        with open(draft, "ab") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            if _is_at(file, draft):  # else another writer has renamed it between our open and our lock
-                file.truncate(0)
-                yield file
-                return
-
-
-def _is_at(file: BinaryIO, path: Path) -> bool:
-    """Return True if `path` still names this file: another writer may have replaced it."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
-    except FileNotFoundError:
-        return False
 
 
 @contextmanager
@@ -175,15 +141,6 @@ def exclusive(folder: Path) -> Iterator[None]:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
-    finally:
-        os.close(descriptor)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the names in `folder` durable."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
     finally:
         os.close(descriptor)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import uuid
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+from runtime.core.durable_files import append_durably
 from runtime.core.errors import RecordingError
 from runtime.core.types import Result
 
@@ -50,17 +50,7 @@ def append_label(data: Path, episode: str, label: Label) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a+b", buffering=0) as file:
-            end = file.seek(0, os.SEEK_END)
-            if end:
-                file.seek(end - 1)
-                line = line if file.read(1) == b"\n" else b"\n" + line
-            try:
-                if file.write(line) != len(line):
-                    raise OSError("the disk took only a part of the line")
-                os.fsync(file.fileno())
-            except OSError:
-                file.truncate(end)
-                raise
+            append_durably(file, line)
     except OSError as error:
         raise RecordingError(f"the label of {episode} is not on disk: {error}") from error
 

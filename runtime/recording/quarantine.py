@@ -7,8 +7,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from runtime.core.durable_files import sync_folder
 from runtime.recording.damage_marks import data_of, mark_file, read_mark
-from runtime.recording.files import disk_error, exclusive, sync_folder, to_json, write_atomic
+from runtime.recording.files import disk_error, exclusive, to_json, write_atomic
 from runtime.recording.integrity import IntegrityCheck
 from runtime.recording.scrub import verify_episode
 

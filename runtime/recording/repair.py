@@ -9,12 +9,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.recording.base import VIDEO_LOST
 from runtime.recording.damage_marks import data_of
 from runtime.recording.episode import lock_folder
 from runtime.recording.export import export_path
-from runtime.recording.files import disk_error, read_json, sync_folder, to_json, write_atomic
+from runtime.recording.files import disk_error, read_json, to_json, write_atomic
 from runtime.recording.fragments import count_frames, whole_bytes
 from runtime.recording.integrity import IntegrityCheck
 from runtime.recording.layout import Layout

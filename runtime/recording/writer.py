@@ -9,9 +9,10 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
 from runtime.recording.digests import FileDigest
-from runtime.recording.files import AppendFile, DiskFullError, require_room, sync_folder
+from runtime.recording.files import AppendFile, DiskFullError, require_room
 from runtime.recording.layout import Layout
 from runtime.recording.settings import RecordingSettings
 from runtime.recording.tables import SCHEMAS, TableWriter

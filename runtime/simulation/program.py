@@ -10,6 +10,8 @@ import threading
 from collections.abc import Mapping
 from pathlib import Path
 
+from runtime.core.durable_files import write_durably
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options that all stand-ins share."""
@@ -28,9 +30,7 @@ def announce_ready(ready: Mapping[str, object], path: Path | None) -> None:
     """Write the addresses to `path`, whole or not at all, then print them as one JSON line."""
     line = json.dumps(dict(ready))
     if path is not None:
-        draft = path.with_name(f"{path.name}.{os.getpid()}")
-        draft.write_text(line + "\n")
-        draft.replace(path)
+        write_durably(path, f"{line}\n".encode())
     print(line, flush=True)
 
 

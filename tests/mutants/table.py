@@ -39,6 +39,7 @@ _FILTER = "runtime/safety/filter.py"
 _LEASE = "runtime/processes/coordinator/lease.py"
 _LEASES = "evaweb/stations/leases.py"
 _JOURNAL = "evaweb/records/journal.py"
+_DURABLE = "runtime/core/durable_files.py"
 
 _OF_TIMELINE = ("tests/runtime/motion/test_timeline.py",)
 _OF_STRATEGIES = ("tests/runtime/strategies/test_base.py",)
@@ -247,23 +248,23 @@ MUTANTS = (
     # --- what is on the disk -------------------------------------------------------------------------------
     Mutant(
         "journal/half-a-line-stays",
-        _JOURNAL,
-        "        file.truncate(before)\n",
+        _DURABLE,
+        "        file.truncate(end)\n",
         "",
         _OF_JOURNAL,
     ),
     Mutant(
         "journal/not-on-the-disk-yet",
-        _JOURNAL,
-        "    os.fsync(file.fileno())\n    if new:",
-        "    if new:",
+        _DURABLE,
+        "        (sync or os.fsync)(file.fileno())\n",
+        "",
         _OF_JOURNAL,
     ),
     Mutant(
         "journal/torn-line-takes-the-next",
-        _JOURNAL,
-        'payload if file.read(1) == b"\\n" else',
-        "payload if file.read(1) else",
+        _DURABLE,
+        'lines if file.read(1) == b"\\n" else',
+        "lines if file.read(1) else",
         _OF_SCORES,
     ),
     Mutant(

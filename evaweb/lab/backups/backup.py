@@ -24,7 +24,7 @@ from evaweb.core.file_checks import RESTORING
 from evaweb.lab.backups import databases
 from evaweb.lab.backups.errors import BackupError
 from evaweb.lab.backups.file_copies import FileCopies, Listed, copied, digest_of, read_list, write_list
-from runtime.recording.files import sync_folder
+from runtime.core.durable_files import sync_folder
 
 FORMAT = 1
 ABOUT, LIST, FILES = "backup.json", "files.jsonl", "files"

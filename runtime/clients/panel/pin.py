@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-import os
 import secrets
 import stat
 import time
@@ -14,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from runtime.core.durable_files import write_durably
 from runtime.core.errors import ConfigurationError
 
 SHORTEST, LONGEST = 6, 64
@@ -40,12 +40,7 @@ class PinFile:
         salt = secrets.token_bytes(16)
         kept = {**_COST, "salt": salt.hex(), "hash": _hashed(pin, salt, **_COST).hex()}
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        draft = self.path.with_name(f".panel.pin.{secrets.token_hex(4)}")
-        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            json.dump(kept, file)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(self.path)
+        write_durably(self.path, json.dumps(kept).encode(), 0o600)
 
     @property
     def version(self) -> tuple[int, int]:

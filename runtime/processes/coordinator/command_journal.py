@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from runtime.core.durable_files import append_durably
 from runtime.ipc.messages import Ack, Command
 
 log = logging.getLogger(__name__)
@@ -56,23 +57,12 @@ class CommandJournal:
             return ""
         lines = [json.dumps(_row(*one), default=str).encode() + b"\n" for one in answered]
         try:
-            self._write(b"".join(lines))
+            append_durably(self._file, b"".join(lines), os.fdatasync)
         except OSError as error:
             kinds = ", ".join(sorted({command.kind for command, _ in answered}))
             log.error("the answer to %s is not on disk: %s", kinds, error)
             return f"not on disk ({error}): after a restart {kinds} could be given twice"
         return ""
-
-    def _write(self, line: bytes) -> None:
-        # A partial line would corrupt the next one, so a failed write is truncated.
-        end = self._file.seek(0, os.SEEK_END)
-        try:
-            if self._file.write(line) != len(line):
-                raise OSError("the disk took only a part of the lines")
-            os.fdatasync(self._file.fileno())
-        except OSError:
-            self._file.truncate(end)
-            raise
 
     def close(self) -> None:
         """Close the file."""

@@ -31,7 +31,7 @@ for k in range(10_000):
     journal.append(row(k))
     for step in range(3 * k, 3 * k + 3):
         journal.append(tick(step))
-    journal.mark({"row": k})
+    journal.append_event({"row": k})
     print(k, flush=True)
 """
 

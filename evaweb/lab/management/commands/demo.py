@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from argparse import ArgumentParser
 from collections.abc import Iterator, Mapping
@@ -32,6 +31,7 @@ from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.caching import cached_analysis
 from evaweb.results.presentation.headline import headline
 from evaweb.trials.models import Checkpoint
+from runtime.core.durable_files import write_durably
 
 _DEPLOYMENTS = settings.BASE_DIR / "deployments"
 _MOST = 2000  # limit of --evaluate: more than a day
@@ -280,10 +280,6 @@ def _deployment(robot: str) -> Path:
 
 def _announce(path: Path, url: str, logins: list[DemoLogin], pids: Mapping[str, int]) -> None:
     """Write address, passwords and process ids atomically, readable only by this account."""
-    draft = path.with_name(f"{path.name}.{os.getpid()}")
     passwords = {login.username: login.password for login in logins}
-    with os.fdopen(
-        os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
-    ) as file:
-        json.dump({"url": url, "passwords": passwords, "pids": dict(pids)}, file)
-    draft.replace(path)
+    ready = {"url": url, "passwords": passwords, "pids": dict(pids)}
+    write_durably(path, json.dumps(ready).encode(), 0o600)

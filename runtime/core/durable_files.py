@@ -1,0 +1,123 @@
+"""Files that are on the disk, whole or not at all, when a function returns."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
+from pathlib import Path
+from typing import BinaryIO
+
+
+class AppendError(OSError):
+    """Bytes could not be appended; `is_restored` says whether the file is as long as it was before."""
+
+    def __init__(self, error: OSError, is_restored: bool) -> None:
+        super().__init__(*error.args)
+        self.is_restored = is_restored
+
+
+def write_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Write a file so that, even after a power cut, either the old or the whole new one is there.
+
+    Any number of processes may do so at once; the last one wins. Raises: OSError.
+    """
+    draft = _draft_path(path)
+    with _open_draft(draft, mode) as file:
+        try:
+            # Content, then name, then folder entry: in this order a power cut leaves the old or the whole new file.
+            _fill(file, content)
+            os.replace(draft, path)
+        except OSError:
+            draft.unlink(missing_ok=True)
+            raise
+    sync_folder(path.parent)
+
+
+def create_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Write a file that does not exist yet; an existing one stays as it is, also one that appears meanwhile.
+
+    Raises: OSError.
+    """
+    draft = _draft_path(path)
+    with _open_draft(draft, mode) as file:
+        try:
+            _fill(file, content)
+            with suppress(FileExistsError):
+                os.link(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def append_durably(file: FileIO, lines: bytes, sync: Callable[[int], None] | None = None) -> None:
+    """Append whole lines to a file opened with "a+b" and no buffer; a line that a crash has torn is ended first.
+
+    `sync` is os.fsync by default. A failed append is undone, because a partial line would corrupt the next one.
+
+    Raises: AppendError.
+    """
+    end = file.seek(0, os.SEEK_END)
+    try:
+        if end:
+            file.seek(end - 1)
+            lines = lines if file.read(1) == b"\n" else b"\n" + lines
+        while lines:
+            lines = lines[file.write(lines) :]
+        (sync or os.fsync)(file.fileno())
+        if not end:  # the names of a new file, and of its folder
+            folder = Path(os.fsdecode(file.name)).parent
+            sync_folder(folder)
+            sync_folder(folder.parent)
+    except OSError as error:
+        raise AppendError(error, _truncate(file, end)) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in `folder` durable."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _draft_path(path: Path) -> Path:
+    return path.with_name(f".{path.name}.draft")
+
+
+@contextmanager
+def _open_draft(draft: Path, mode: int) -> Iterator[BinaryIO]:
+    """Yield the draft file, empty and locked; a draft left by a kill is reused."""
+    while True:
+        with open(draft, "ab", opener=lambda path, flags: os.open(path, flags, mode)) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if _is_at(file, draft):  # else another writer has renamed it between our open and our lock
+                file.truncate(0)
+                yield file
+                return
+
+
+def _is_at(file: BinaryIO, path: Path) -> bool:
+    """Return True if `path` still names this file: another writer may have replaced it."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _fill(file: BinaryIO, content: bytes) -> None:
+    file.write(content)
+    file.flush()
+    os.fsync(file.fileno())
+
+
+def _truncate(file: FileIO, end: int) -> bool:
+    try:
+        file.truncate(end)
+        os.fsync(file.fileno())
+    except OSError:
+        return False
+    return True
