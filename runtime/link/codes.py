@@ -1,7 +1,7 @@
 """One-time code for enrolment: the public key of the lab's gate, and a secret.
 
 The code contains the whole key, so nothing has to be fetched from an unverified address: a computer that answers there
-without the lab's secret key cannot read what the station sends.
+without the lab's secret key cannot read the station's messages.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""List of an episode's files with sizes and SHA-256: defines what is sent and when it is complete.
+"""List of an episode's files with sizes and SHA-256, which defines the content to send and when it is complete.
 
 Folders with the same list have the same digest. Files whose names start with a dot do not belong to an episode.
 """
@@ -59,7 +59,7 @@ class Contents:
 
 
 def unpacked(sent: bytes) -> Contents:
-    """Parse and check a list that was sent. Raises: CodecError, which names what an episode cannot have."""
+    """Parse and check a list that was sent. Raises: CodecError, naming the entry that an episode cannot have."""
     try:
         rows = json.loads(sent) if len(sent) <= LARGEST_LIST else None
     except (ValueError, RecursionError):

@@ -48,7 +48,7 @@ from runtime.link.wire import (
 )
 
 log = logging.getLogger(__name__)
-RATE = 8e6  # bytes a second that one connection may send
+RATE = 8e6  # greatest rate of one connection [bytes/s]
 _POLL_MS = 50
 _LOOK_S = 0.05
 _TRY_S = 2.0  # between two tries to lock the folder of a station
@@ -156,7 +156,7 @@ class Gate:
                 poller.register(remote.mirror.commands.socket, zmq.POLLIN)
         poller.poll(wait_ms)
 
-    # --- what the lab's programs say ---------------------------------------------------------------------------
+    # --- from the lab's programs --------------------------------------------------------------------------------
 
     def _press(self, remote: Remote) -> None:
         """Pass on all messages of the e-stop socket; hold presses for which there is no connection."""
@@ -236,7 +236,7 @@ class Gate:
             ask = Ask(self._number, *place, stops, line.challenge, serial, signature)
         return self._number if self._door.send(line.route, ask, payload) else 0
 
-    # --- what stations say -------------------------------------------------------------------------------------
+    # --- from stations -----------------------------------------------------------------------------------------
 
     def _heard(self, arrival: Arrival) -> str:
         """Call `_hear`; after an unforeseen error cut off the sender, so that no other station is affected."""
@@ -322,7 +322,7 @@ class Gate:
         self._door.send(route, told)
         log.info("%s is enrolled", answer.station)
 
-    # --- what changes ------------------------------------------------------------------------------------------
+    # --- changes -----------------------------------------------------------------------------------------------
 
     def _look(self, now: float) -> None:
         """Check admissions, connections, held presses and pending commands."""
@@ -360,7 +360,7 @@ class Gate:
             self._streams.serve(remote.name, remote.mirror.station_dir)
 
     def _mirrored(self, remote: Remote) -> bool:
-        """Have the folder of the station; False where another process has it."""
+        """Create the station's mirror and publish its streams; return False, with `refusal` set, if that fails."""
         remote.tried_at = self._clock()
         try:
             remote.mirror = Mirror(self._context, self._stations / remote.name)
@@ -507,7 +507,7 @@ def _not_sent(remote: Remote, command: Command, sent: bool = False) -> Ack:
 
 
 def _failed(remote: Remote, command: Command, reason: str) -> Ack:
-    """Return the answer in the station's place; that of a failed press says what to do instead."""
+    """Return the answer in the station's place; that of a failed press demands the hardware stop."""
     if command.kind == "estop":
         return Ack(command.uuid, "failed", f"USE THE HARDWARE STOP: {reason}", data={"station": remote.name})
     return Ack(command.uuid, "failed" if command.kind in STOPPING else "refused", reason, kind=command.kind)

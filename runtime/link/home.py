@@ -123,7 +123,7 @@ class Home:
         """Do not offer an episode, or labels named "labels UUID", for so many `seconds`."""
         self._put_off[what] = self._clock() + seconds
 
-    # --- what there is -------------------------------------------------------------------------------------------
+    # --- scan ---------------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
         now = self._clock()

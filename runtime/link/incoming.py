@@ -31,7 +31,7 @@ from runtime.recording.files import disk_error, read_json, sync_folder, write_at
 from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)
-RESERVE = 5 << 30  # bytes of the disk that stay free for everything else
+RESERVE = 5 << 30  # free space of the disk that episodes may not use [bytes]
 LARGEST_LABELS = 1 << 20  # bytes
 ARRIVING, ARRIVALS = ".arriving", "arrivals"
 _WINDOW = 8  # pieces requested at once
@@ -40,7 +40,7 @@ _MOST_DECLINED = 64  # refusals per station that are stored for the pages
 _MOST_TRIES = 3  # per file whose content differs from the list
 _SOON_S, _LATER_S, _NEVER_S = 60.0, 600.0, 86400.0  # [s], until the station may offer it again
 Owner = Callable[[str], str]
-"""Asked with an episode's uuid; returns its station's name, "" if unknown. Raises: OSError if it cannot tell now."""
+"""Called with an episode's uuid; returns its station's name, "" if unknown. Raises: OSError if the lookup fails."""
 
 
 @dataclass(frozen=True, slots=True)

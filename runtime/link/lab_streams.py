@@ -45,7 +45,7 @@ from runtime.link.wire import (
 )
 
 log = logging.getLogger(__name__)
-RATE = 64e6  # bytes a second that one connection may send
+RATE = 64e6  # greatest rate of one connection [bytes/s]
 _POLL_MS = 50
 _WINDOW = {STATE: 4, PICTURES: 2}  # bundles in transit
 _SLACK = 16  # bundles tolerated beyond the credit, because our count may lag behind the station's
@@ -117,7 +117,7 @@ class LabStreams:
         return self._door.port
 
     def start(self) -> None:
-        """Begin in a thread of its own."""
+        """Start the thread."""
         self._thread.start()
 
     def end(self) -> None:

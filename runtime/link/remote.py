@@ -32,7 +32,7 @@ class Pending:
 
 @dataclass(slots=True)
 class Held:
-    """Press of the e-stop that is not answered yet; `told`: its sender has already received an answer."""
+    """Press of the e-stop that waits for the link; `told`: its sender has an answer already, but it is still sent."""
 
     call: IncomingMessage
     command: Command
