@@ -133,5 +133,5 @@ class RequestWorker:
         self._kept = time.monotonic()
         try:
             self._keep()
-        except Exception:  # a lease that is not renewed ends, and the robot holds
+        except Exception:  # a lease that is not renewed expires, and the robot holds
             log.exception("what is due beside messages was not done")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from runtime.clients.channel.verb_commands import CommandSequence, Step, VerbContext
 
 STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake waiting messages
-_STOPPING_INTENTS = ("accept", "cancel")  # of operator_action
+_STOPPING_INTENTS = ("accept", "cancel")  # intents of operator_action that stop
 _MODES = {"real": "continuous", "sim": "sim", "step": "preview", "preview": "preview", "manual": "manual"}
 _TABS = "there are no tabs here: nothing is done"
 
@@ -114,7 +114,7 @@ def _tab(scene: VerbContext) -> CommandSequence:
     return CommandSequence(told={"tab": tab, "armed": armed and tab == "collect"}, note=_TABS)
 
 
-# --- what is selected ----------------------------------------------------------------------------------------
+# --- selections ---------------------------------------------------------------------------------------------
 
 
 def _task(scene: VerbContext) -> CommandSequence:
@@ -143,7 +143,7 @@ def _parameters(scene: VerbContext) -> CommandSequence:
     return CommandSequence((("tune", {"strategy": parameters}),), chosen={"strategy": parameters})
 
 
-# --- what a person does --------------------------------------------------------------------------------------
+# --- manual control -----------------------------------------------------------------------------------------
 
 
 def _target(scene: VerbContext) -> CommandSequence:

@@ -46,7 +46,7 @@ def _tick_figures(status: Mapping[str, Any]) -> list[str]:
     parts = [f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed"]
     rates = [rate for name, rate in status["link"]["rates"].items() if name not in ("joints", "eef")]
     if rates:
-        parts.append(f"cameras {min(rates):.0f} Hz")  # the slowest
+        parts.append(f"cameras {min(rates):.0f} Hz")  # slowest camera
     return parts
 
 
