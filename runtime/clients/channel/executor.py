@@ -77,7 +77,7 @@ class CommandExecutor:
         return json_answers.command_answer(message, known, {}, self._state(script, known))
 
     def _state(self, script: Script, outcome: Outcome) -> str | None:
-        """Return the state after a command; None if it did not run or the station no longer answers."""
+        """Return the state after a command; None if it was refused or is unknown, or the station is gone."""
         if outcome.result in ("refused", "unknown"):
             return None
         try:

@@ -29,9 +29,10 @@ def is_long_running(kind: str) -> bool:
 
 @dataclass(slots=True)
 class Outcome:
-    """Outcome of one command: "accepted", "refused", "unknown", "done" or "failed"; "accepted" is followed by another.
+    """Outcome of one command: "accepted", "refused", "unknown", "done" or "failed".
 
-    `said` is the name in the script's message, `kind` the command of EVA Web that it stands for.
+    Only "accepted" changes later: to "done" or "failed", or to "unknown" if the station restarts. `said` is the name in
+    the script's message, `kind` the command of EVA Web that it stands for.
     """
 
     id: str

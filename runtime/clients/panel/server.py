@@ -76,7 +76,7 @@ class PanelServer(ThreadingHTTPServer):
         return f"{self.place.scheme}://{host}:{self.server_address[1]}"
 
     def turn(self) -> None:
-        """Accept a connection or wait a moment for one; cut off connections past their deadline."""
+        """Accept a connection or wait a moment; cut off those past their deadline, except during a press."""
         self.handle_request()
         now = time.monotonic()
         with self._lock:
