@@ -1,4 +1,4 @@
-"""A client of one station: what the terminal, the headless driver and scripts command it with."""
+"""Client of one station, with which the terminal, the headless driver and scripts command it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Refused(RuntimeFault):
 
 
 class StationClient:
-    """Finds the station in its folder, holds a lease where asked to, gives commands.
+    """Client that finds the station in its folder, holds a lease on request and sends commands.
 
-    Every command is decided by the newest status this client has seen; the station refuses it as stale where
-    something has changed since.
+    Each command carries the boot id and sequence number of the newest status that this client has received; the station
+    refuses it as stale if its state has changed since.
     """
 
     def __init__(self, station_dir: Path, holder: str = "") -> None:
@@ -47,7 +47,7 @@ class StationClient:
         self._renewed = 0.0
 
     def status(self, timeout: float = 2.0) -> dict[str, Any]:
-        """The station's snapshot; raises TransportError where it does not answer."""
+        """Return the station's snapshot. Raises: TransportError if the station does not answer."""
         asked = time.monotonic()
         data = complete_state_meaning(self._send(Command(str(uuid.uuid4()), "status"), timeout).data)
         self._boot, self._sequence = data["boot"], data["sequence"]
@@ -55,42 +55,55 @@ class StationClient:
         return data
 
     def events_since(self, number: int) -> list[dict[str, Any]]:
-        """The station's events after `number`."""
+        """Return the station's events after `number`."""
         ack = self._send(Command(str(uuid.uuid4()), "events_since", {"number": number}), 2.0)
         return list(ack.data["events"])
 
     def query(self, kind: str, **arguments: Any) -> Ack:
-        """Ask what changes nothing and needs no lease; raises Refused, or TransportError."""
+        """Send a query, which changes nothing and needs no lease. Raises: Refused, TransportError."""
         return self.query_with(kind, arguments)
 
     def query_with(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
-        """`query` with arguments of any name."""
+        """Do as `query`, with arguments of any name."""
         return _accepted(self._send(self._send_query(kind, arguments), 2.0))
 
     def _send_query(self, kind: str, arguments: Mapping[str, Any]) -> Command:
         return Command(str(uuid.uuid4()), kind, arguments, user=self.holder, holder=self.holder)
 
     def claim(self, epoch: int = 0) -> None:
-        """Take the lease where it is free (or ours); raises Refused with who holds it."""
+        """Claim the lease if it is free or already held by this client.
+
+        Raises:
+            Refused: Another holder has it; the message names the holder.
+            TransportError: The station does not answer.
+        """
         ack = self._command("lease_claim", 2.0, epoch=epoch)
         self._epoch = int(ack.data["epoch"])
         self._renewed = time.monotonic()
 
     def renew(self) -> None:
-        """Keep the lease; cheap to call often, it sends once a second."""
+        """Renew the lease if the last renewal is older than RENEW_S; cheap to call often."""
         if time.monotonic() - self._renewed >= RENEW_S:
             self._command("lease_renew", 2.0, epoch=self._epoch)
             self._renewed = time.monotonic()
 
     def release(self) -> None:
-        """End the lease before its time."""
+        """End the lease before it expires."""
         self._command("lease_give_up", 2.0, epoch=self._epoch)
         self._epoch = 0
 
     def command(self, kind: str, timeout: float = 2.0, identity: str = "", **arguments: Any) -> Ack:
-        """Give one command with its arguments under the lease.
+        """Claim the lease, fetch the status and send one command.
 
-        Raises Refused, or TransportError: outcome unknown.
+        Args:
+            kind: Kind of the command.
+            timeout: Longest wait for the answer [s]; the command expires then too.
+            identity: Uuid of the command; "" for a new one.
+            arguments: Arguments of the command.
+
+        Raises:
+            Refused: The station refuses the lease or the command.
+            TransportError: There is no answer; the outcome is unknown.
         """
         self.claim()
         self.status()
@@ -99,14 +112,20 @@ class StationClient:
     def send_command(
         self, kind: str, arguments: Mapping[str, Any], identity: str = "", timeout: float = 2.0
     ) -> Ack:
-        """Give one command under the lease that was claimed, decided by the status that was seen last.
+        """Send one command under the lease that was claimed, based on the status that was received last.
 
-        Raises Refused, or TransportError: outcome unknown.
+        Raises:
+            Refused: The station refuses the command.
+            TransportError: There is no answer; the outcome is unknown.
         """
         return self._command(kind, timeout, self._epoch, identity, arguments)
 
     def estop(self, why: str) -> Ack:
-        """Press the software e-stop at the guard, which needs neither lease nor the coordinator."""
+        """Press the software e-stop at the guard, which needs neither a lease nor the coordinator.
+
+        Raises:
+            TransportError: The guard does not answer; the message demands the hardware stop.
+        """
         try:
             command = self._send_query("estop", {"why": sanitize_text(why)})
             return send_urgent(self._context, self._endpoints, ("guard", "estop"), command, 2.0)
@@ -114,11 +133,15 @@ class StationClient:
             raise TransportError(f"USE THE HARDWARE STOP: {error}") from None
 
     def subscribe(self, *streams: str) -> Subscriber:
-        """The station's live streams: state, joints, event."""
+        """Subscribe to live streams of the station: state, joints, event. Raises: TransportError."""
         return Subscriber(self._context, self._endpoints.read("coordinator")["state"], *streams)
 
     def wait(self, reached: Callable[[dict[str, Any]], bool], timeout: float) -> dict[str, Any]:
-        """The first status that satisfies `reached`, keeping a lease that is held; raises TransportError."""
+        """Return the first status that satisfies `reached`; a lease that is held is renewed meanwhile.
+
+        Raises:
+            TransportError: The condition is not met within `timeout` [s], or the station does not answer.
+        """
         deadline = time.monotonic() + timeout
         while True:
             status = self.status()

@@ -1,4 +1,4 @@
-"""Drives a station without anybody at it: set up, one run, stop, publish, report."""
+"""Headless driver of a station, without a person: set-up, one run, stop, publication, report."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _SETUP_S = 240.0
 _CLOSE_S = 30.0
 _SHOWN_EVERY_S = 2.0
 _POLL_S = 0.05
-MODES = ("continuous", "sim")  # the others need a person
-# Events that a person who gave no command does not need to read; states are shown as they change.
+MODES = ("continuous", "sim")  # all other modes need a person
+# Events of no interest without a person who commands; changes of state are printed anyway.
 _SILENT = frozenset(
     {"command", "setup", "tuned", "locked", "motion_done", "episode_opened", "episode_closed"}
 )
@@ -33,7 +33,14 @@ RESULT_NAME = "headless.json"
 
 
 def run_headless(settings: Deployment, client: StationClient) -> dict[str, Any]:
-    """One run from start to published dataset; returns what came of it. Raises RuntimeFault with the reason."""
+    """Execute one run from start to publication.
+
+    Returns:
+        The result: end of the run, episode, figures, and paths of exports and dataset.
+
+    Raises:
+        RuntimeFault: Any step failed, or the run did not end well; the message is the reason.
+    """
     check(settings)
     attended = LeasedStation(client)
     attended.begin()
@@ -47,7 +54,7 @@ def run_headless(settings: Deployment, client: StationClient) -> dict[str, Any]:
         well = well and status["last_run"].get("status", "finished") == "finished"
         if result["episode_path"]:
             result |= _export_and_publish(settings, Path(result["episode_path"]), well)
-    except RuntimeFault as fault:  # on top of why the run ended
+    except RuntimeFault as fault:  # report this fault together with the reason of the run's end
         raise RuntimeFault(f"the run ended ({how}), but then: {fault}") from None
     print("\n".join(summary(result)), flush=True)
     if not well:
@@ -56,7 +63,7 @@ def run_headless(settings: Deployment, client: StationClient) -> dict[str, Any]:
 
 
 def check(settings: Deployment) -> None:
-    """Raise SetupError for a mode that needs a person."""
+    """Check that the mode needs no person. Raises: SetupError."""
     mode, station = settings.run.mode, settings.station
     if mode not in MODES:
         raise SetupError(
@@ -66,18 +73,18 @@ def check(settings: Deployment) -> None:
 
 
 class LeasedStation:
-    """A station under a lease that is kept, its events told as they come."""
+    """Station under a lease that is renewed at each poll; its events are printed as they arrive."""
 
     def __init__(self, client: StationClient) -> None:
         self._client = client
         self._boot = ""
         self._heard = 0  # number of the newest event
         self._shown = -math.inf
-        self.opened = self.closed = False  # an episode, on this drive
-        self.seconds = 0.0  # the run's time, when it was last seen
+        self.opened = self.closed = False  # whether an episode was opened and closed in this session
+        self.seconds = 0.0  # duration of the run at the last poll [s]
 
     def begin(self) -> None:
-        """Wait for the station, claim it, set it up; raises RuntimeFault with the reason where it is not ready."""
+        """Wait for the station, claim it and set it up. Raises: RuntimeFault if it does not become ready."""
         self._wait_for_start()
         self._client.claim()
         self.wait_for(lambda s: s["state_is"]["connected"], _START_S, "the first observation")
@@ -87,12 +94,12 @@ class LeasedStation:
             raise RuntimeFault(f"set-up failed: {status['reason']}")
 
     def run(self) -> dict[str, Any]:
-        """One run to its end, however it ends; returns the status then."""
+        """Start a run and wait for its end, successful or not; return the status then."""
         self._client.command("run")
         return self.wait_for(lambda s: not s["state_is"]["going"], math.inf, "the end of the run")
 
     def wait_until_closed(self) -> dict[str, Any]:
-        """Wait until what was recorded, if anything was, is on disk; returns the status then."""
+        """Wait until the recording, if there is one, is on disk; return the status then."""
         status = self.poll_status()
         if self.opened:
             status = self.wait_for(lambda _: self.closed, _CLOSE_S, "the end of the recording")
@@ -101,7 +108,7 @@ class LeasedStation:
     def wait_for(
         self, reached: Callable[[dict[str, Any]], bool], seconds: float, what: str
     ) -> dict[str, Any]:
-        """Look until `reached`, showing figures now and then; raises RuntimeFault after `seconds`."""
+        """Poll until `reached`, printing a status line at times. Raises: RuntimeFault after `seconds`."""
         deadline = time.monotonic() + seconds
         while not reached(status := self.poll_status()):
             if time.monotonic() > deadline:
@@ -113,10 +120,10 @@ class LeasedStation:
         return status
 
     def poll_status(self) -> dict[str, Any]:
-        """The status, once its events were told."""
+        """Renew the lease, print new events and return the status."""
         self._client.renew()
         status = self._client.status()
-        if status["boot"] != self._boot:  # another coordinator counts its events anew
+        if status["boot"] != self._boot:  # a restarted coordinator numbers its events from 1
             self._boot, self._heard = status["boot"], 0
         if status["newest_event"] > self._heard:
             for event in self._client.events_since(self._heard):
@@ -162,7 +169,7 @@ def _result(status: dict[str, Any], how: str, seconds: float) -> dict[str, Any]:
 
 
 def _episode_figures(path: Path) -> dict[str, Any]:
-    """Figures from its files: how long it is, and of its ticks how many safety refused or limited."""
+    """Return figures from the episode's files: duration [s], and numbers of refused and limited ticks."""
     from runtime.recording.reader import open_episode
 
     episode = open_episode(path)
@@ -176,7 +183,7 @@ def _episode_figures(path: Path) -> dict[str, Any]:
 
 
 def _export_and_publish(settings: Deployment, episode: Path, well: bool) -> dict[str, Any]:
-    """Export the streams of any run; publish what ended well and moved a robot. Raises RuntimeFault."""
+    """Export the streams of any run; publish a run that ended well and moved a robot. Raises: RuntimeFault."""
     from runtime.recording.export import write_export
 
     result: dict[str, Any] = {"export_path": str(write_export(episode, settings.data))}
@@ -198,7 +205,7 @@ def _publish(settings: Deployment, episode: Path) -> dict[str, Any]:
 
 
 def summary(result: dict[str, Any]) -> list[str]:
-    """Summary of a run in lines, for the operator."""
+    """Return the summary of a run for the operator, as lines."""
     policy, control = result["policy"], result["control"]
     rows = [("ended", f"{result['ended']}, after {result['run_seconds']:.1f} s")]
     if "duration_s" in result:
@@ -227,7 +234,7 @@ def summary(result: dict[str, Any]) -> list[str]:
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Drive, print, leave the result in the station's folder; exit code 0 where all went well."""
+    """Run headless and write the result into the station's folder; return 0 if all went well, else 1."""
     parser = argparse.ArgumentParser(prog="runtime.clients.headless", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
     parser.add_argument("--boot", required=True)

@@ -1,4 +1,4 @@
-"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push: what is done to LeRobot datasets."""
+"""python -m runtime.datasets publish|convert|merge|split|delete|repair|check|push: operations on LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from runtime.datasets.publishing import publish
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """0 where all is well, 1 where a check found something or what was asked for was refused."""
+    """Run one command; return 0 if all is well, 1 if a check found a problem or the command was refused."""
     options = _parser().parse_args(arguments)
     try:
         return int(options.run(options))
@@ -34,14 +34,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-MOST = 100_000  # episodes that an order names
-Folder = Callable[[str], Path]  # of what a person calls a dataset, or an episode
+MOST = 100_000  # greatest number of episodes in one command
+Folder = Callable[[str], Path]  # converts the name of a dataset or an episode to its folder
 
 
 def add_commands(
     commands: Any, dataset: Folder = Path, episode: Folder = Path, publishing: bool = True
 ) -> None:
-    """Put all commands into a parser's `commands`; each leaves what does it in `run`, which returns the exit code."""
+    """Add all commands to `commands`, the subparsers of a parser.
+
+    Each sets `run` to its function, which returns the exit code. `dataset` and `episode` convert names given by a
+    person to folders.
+    """
     if publishing:
         _add_publish(
             commands.add_parser("publish", help="publish a finished episode into a dataset"), dataset, episode
@@ -152,7 +156,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def renamed(pairs: Sequence[str]) -> dict[str, str]:
-    """New names of features by their old ones, from OLD=NEW each."""
+    """Parse OLD=NEW pairs into new names by old names. Raises: RecordingError."""
     found = [pair.partition("=") for pair in pairs]
     for old, sign, new in found:
         if not (old and sign and new):
@@ -201,21 +205,25 @@ def _push(options: argparse.Namespace) -> int:
 
 
 def episodes(text: str, most: int = MOST) -> list[int]:
-    """Indices of at most so many episodes from "3", "0:4" (without 4) or several of them with commas between."""
+    """Parse indices of episodes from "3", "0:4" (without 4) or several of them separated by commas.
+
+    Raises:
+        RecordingError: The text is invalid or names more than `most` episodes.
+    """
     found: list[int] = []
     for part in text.split(","):
         first, colon, end = part.partition(":")
         if not is_index(first) or (colon and not (is_index(end) and int(first) < int(end))):
             raise RecordingError(f"{text!r:.80} names no episodes: expected 3, or 0:4 (without 4), or 0:4,7")
         some = range(int(first), int(end)) if colon else [int(first)]
-        if len(found) + len(some) > most:  # a typing error, which would fill the memory
+        if len(found) + len(some) > most:  # probably a typing error, which would exhaust the memory
             raise RecordingError(f"{text!r:.80} names too many episodes: at most {MOST:,} in one order")
         found += some
     return found
 
 
 def is_index(text: str) -> bool:
-    """True if the text is an index of an episode."""
+    """Return True if the text is an index of an episode."""
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
@@ -238,7 +246,7 @@ def _report(dataset: Path, problems: list[str]) -> int:
 
 
 def _describe_features(info: layout.Info) -> list[str]:
-    """Inputs and outputs of a policy as training code takes them: LeRobot goes by how names begin."""
+    """Return lines with the inputs and outputs of a policy, which LeRobot identifies by the prefixes of names."""
     names = {
         "inputs": [key for key in info["features"] if key.startswith("observation")],
         "outputs": [key for key in info["features"] if key.startswith("action")],

@@ -1,4 +1,4 @@
-"""Makes a new dataset of episodes of others, in either version: convert, merge, split and delete all do that."""
+"""Assembly of a new dataset from episodes of others, in either version: for convert, merge, split and delete."""
 
 from __future__ import annotations
 
@@ -49,25 +49,23 @@ from runtime.recording.files import disk_error
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_PLACED = ("episode_index", "index", "task_index")  # columns that depend on where an episode is
-_ROUNDED, _LOST = 2.0**-23, 1e-3  # of a number, by float32; of what a column spans
+_PLACED = ("episode_index", "index", "task_index")  # columns that depend on the position of an episode
+_ROUNDED, _LOST = 2.0**-23, 1e-3  # tolerated change: relative to a number (float32), and to a column's range
 _OURS = {layout.INFO, layout.EPISODES, layout.TASKS, layout.EPISODES_STATS, layout.STATS, layout.TASKS_V30}
 _OURS |= {layout.EVA_EPISODES}
-SUBTASKS = "meta/subtasks.parquet"  # of LeRobot 0.6: what subtask_index numbers
-COPIED_FROM = (
-    "copied_from"  # in our line about an episode: the dataset it was copied from, absent where published
-)
+SUBTASKS = "meta/subtasks.parquet"  # LeRobot 0.6: subtasks by subtask_index
+COPIED_FROM = "copied_from"  # key of our line about an episode: source of a copy; absent if published
 
-ProgressCallback = Callable[[str], None]  # hears how far it is
+ProgressCallback = Callable[[str], None]  # receives the progress as text
 
 
 def ignore_progress(progress: str) -> None:
-    """For those who do not want to know."""
+    """Ignore the progress."""
 
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRef:
-    """One episode of a source."""
+    """One episode of a source dataset."""
 
     source: SourceDataset
     index: int
@@ -75,18 +73,18 @@ class EpisodeRef:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceDataset:
-    """A dataset that episodes are taken from, with what its metadata say beside the list of episodes."""
+    """Dataset whose episodes are copied, with its metadata besides the list of episodes."""
 
     dataset: Dataset
     names: ColumnRenaming
-    tasks: tuple[str, ...]  # in the order of their numbers
-    lines: Mapping[int, Line]  # of the list of episodes, what the format does not know
+    tasks: tuple[str, ...]  # ordered by task index
+    lines: Mapping[int, Line]  # keys of the list of episodes beyond the format
     statistics: Mapping[int, Mapping[str, Statistic]]
     eva: Mapping[int, Line]
 
     @classmethod
     def open(cls, root: Path, names: ColumnRenaming | None = None) -> SourceDataset:
-        """Raises RecordingError where there is no dataset, or it cannot be renamed so."""
+        """Open a dataset. Raises: RecordingError if there is none or the renaming does not fit."""
         dataset = open_dataset(root)
         names = names or ColumnRenaming({})
         names.require(dataset.features)
@@ -104,11 +102,11 @@ class SourceDataset:
 
     @property
     def features(self) -> Mapping[str, Mapping[str, Any]]:
-        """The features under their new names."""
+        """Features under their new names."""
         return self.names.rename_keys(self.dataset.features)
 
     def episode_refs(self, indices: Sequence[int] | None = None) -> list[EpisodeRef]:
-        """Its episodes, all or those of `indices`; raises RecordingError for one that is not there."""
+        """Return all episodes, or those of `indices`. Raises: RecordingError if one does not exist."""
         if indices is None:
             return [EpisodeRef(self, listed.index) for listed in self.dataset.episodes]
         return [EpisodeRef(self, self.dataset.entry(index).index) for index in indices]
@@ -116,7 +114,7 @@ class SourceDataset:
 
 @dataclass(frozen=True, slots=True)
 class AssemblyResult:
-    """Result. `encoded` are videos whose pictures were coded again, `left_out` is what was not taken on."""
+    """Result of an assembly. `encoded`: videos encoded anew; `left_out`: content that was not copied."""
 
     dataset: Path
     version: str
@@ -135,11 +133,20 @@ def assemble(
     replacing: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> AssemblyResult:
-    """Write the dataset `target` with `parts` as its episodes 0, 1, ...; it appears whole or not at all.
+    """Write the dataset `target` with `parts` as its episodes 0, 1, ...; it appears complete or not at all.
 
-    Rows, statistics and tasks are those of the sources; coded pictures are copied, one video per episode. Where they
-    cannot be, `reencode` allows to code them again. `replacing`: in place of the dataset that is there. Raises
-    RecordingError where the parts do not belong together.
+    Rows, statistics and tasks are those of the sources. Encoded images are copied, one video per episode.
+
+    Args:
+        target: Folder of the new dataset.
+        version: Version of the format to write.
+        parts: Episodes, in their new order.
+        reencode: Allow images to be encoded anew if they cannot be copied.
+        replacing: Replace the dataset that exists at `target`.
+        tell: Receives the progress.
+
+    Raises:
+        RecordingError: The parts do not belong together or cannot be written.
     """
     if version not in layout.WRITABLE_VERSIONS:
         raise RecordingError(f"version is {version!r}, written are {layout.WRITABLE_VERSIONS}")
@@ -184,7 +191,7 @@ def _require_same(parts: Sequence[EpisodeRef]) -> None:
 
 
 def _bytes(dataset: Dataset, name: str) -> bytes | None:
-    """A file of the dataset, None where it has none."""
+    """Return the content of a file of the dataset, None if it does not exist."""
     path = dataset.root / name
     return path.read_bytes() if path.is_file() else None
 
@@ -199,7 +206,7 @@ def _sources(parts: Sequence[EpisodeRef]) -> list[SourceDataset]:
 
 
 class _Assembly:
-    """One new dataset on its way into the folder `root`."""
+    """One new dataset that is being written into the folder `root`."""
 
     def __init__(
         self, root: Path, version: str, parts: Sequence[EpisodeRef], reencode: bool, copying: bool
@@ -210,7 +217,7 @@ class _Assembly:
         self._reencode = reencode
         self._sources = _sources(parts)
         first = self._sources[0]
-        self._left_out: dict[str, None] = {}  # in order, each once
+        self._left_out: dict[str, None] = {}  # ordered set
         self._features = {
             key: dict(feature) | ({} if list(feature["shape"]) else {"shape": [1]})
             for key, feature in first.features.items()
@@ -228,7 +235,7 @@ class _Assembly:
         self._encoded: list[str] = []
 
     def _common(self) -> dict[str, Any]:
-        """What info.json of all sources says alike; what else they say is left out, with a word."""
+        """Return the keys of info.json on which all sources agree; others are reported as left out."""
         said = [source.dataset.info for source in self._sources]
         for info, source in zip(said, self._sources, strict=True):
             for key in sorted(set(info) - layout.INFO_KEYS):
@@ -239,7 +246,7 @@ class _Assembly:
         return {key: value for key, value in said[0].items() if all(one.get(key) == value for one in said)}
 
     def _splits(self) -> dict[str, str]:
-        """The sources' splits with the new indices; without any all is for training."""
+        """Return the sources' splits with the new indices; without any, all episodes are for training."""
         found: dict[str, list[int]] = {}
         for source in self._sources:
             named, given = {}, source.dataset.info.get("splits") or {}
@@ -249,7 +256,7 @@ class _Assembly:
                 except RecordingError as error:
                     self._left_out[f"{source.dataset.root}: {error}"] = None
             there = [listed.index for listed in source.dataset.episodes]
-            # Where numbers have gaps, splits that name 0 to the last of so many count places, as LeRobot does.
+            # If indices have gaps, splits that cover 0 to count - 1 refer to positions, as in LeRobot.
             counted = set().union(*named.values()) == set(range(len(there)))
             for place, part in enumerate(self._parts):
                 if part.source is source:
@@ -260,7 +267,7 @@ class _Assembly:
         return written(found)
 
     def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
-        """The lines of the list of episodes, with those of the sources' own keys that can be written."""
+        """Return the lines of the list of episodes, with those own keys of the sources that can be written."""
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]
         kept: list[Line] = [{} for _ in owns]
@@ -322,7 +329,7 @@ class _Assembly:
         return single_file_line(self._info, index, list(listed.tasks), listed.length, first)
 
     def _episode(self, part: EpisodeRef, line: Line, first: int) -> dict[str, Statistic]:
-        """Write rows and videos of one episode; its statistics."""
+        """Write rows and videos of one episode; return its statistics."""
         placed = entry(self._root, self._info, line)
         table = self._table(part, line, first)
         placed.data.parent.mkdir(parents=True, exist_ok=True)
@@ -348,7 +355,7 @@ class _Assembly:
         return [*layout.video_keys(self._features), *layout.image_keys(self._features)]
 
     def _source_statistics(self, part: EpisodeRef) -> dict[str, Statistic]:
-        """The source's statistics of an episode, but for those that are made anew."""
+        """Return the source's statistics of an episode, except those that are computed anew."""
         found = {}
         for key, statistic in part.source.statistics.get(part.index, {}).items():
             if key not in self._features or key in _PLACED:
@@ -372,7 +379,7 @@ class _Assembly:
         return column_statistics(columns, {key: self._features[key] for key in columns})
 
     def _table(self, part: EpisodeRef, line: Line, first: int) -> pa.Table:
-        """The rows of an episode in their new place, exactly the declared columns."""
+        """Return the rows of an episode with its new indices: exactly the declared columns."""
         import pyarrow as pa
 
         source, index = part.source, part.index
@@ -462,7 +469,10 @@ class _Assembly:
             shutil.copyfile(path, target)
 
     def _copy_other_files(self) -> None:
-        """Take along files of no episode and not of the format, from a single source only; report others."""
+        """Copy files beyond the format and the episodes if there is a single source; report them otherwise.
+
+        Lists of subtasks are always copied, modality.json from the first source unless features are renamed.
+        """
         for source in self._sources:
             root = source.dataset.root
             for path in sorted([*root.glob("*"), *(root / "meta").glob("*")]):
@@ -480,7 +490,7 @@ class _Assembly:
                     self._left_out[str(path)] = None
 
     def _carry(self, source: SourceDataset) -> None:
-        """Take along everything in the folder that is replaced but the format's own files and those of episodes."""
+        """Copy everything of the replaced folder except the format's own files and those of episodes."""
         root = source.dataset.root
         listed = source.dataset.episodes
         known = {root / name for name in _OURS} | {root / LOCK}
@@ -504,7 +514,7 @@ class _Assembly:
 
 
 def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
-    """Our lines by the episode that each is about; RecordingError where two are about one."""
+    """Return our lines by episode. Raises: RecordingError if two lines are about the same episode."""
     found = {line["episode_index"]: line for line in lines}
     if len(found) < len(lines):
         counts = Counter(line["episode_index"] for line in lines)
@@ -516,14 +526,14 @@ def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
 
 
 def _is_its_own(path: Path, root: Path) -> bool:
-    """Whether a link leads into the dataset, or to where the cache of a hub keeps the files of a snapshot."""
+    """Return True if a link leads into the dataset, or into the cache in which a hub keeps a snapshot's files."""
     here = root.resolve()
     places = (here, here.parent.parent / "blobs")
     return any(path.resolve().is_relative_to(place) for place in places)
 
 
 def _changed(given: pa.Array, made: pa.Array) -> str:
-    """The value that another type changed most, in words; "" where it changed none by more than float32 rounds."""
+    """Describe the first value that a cast changed by more than float32 rounds; "" if there is none."""
     before, after = (np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (given, made))
     if before.dtype == after.dtype or not all(
         np.issubdtype(one.dtype, np.number) or one.dtype == bool for one in (before, after)
@@ -551,7 +561,7 @@ def _leaves(array: pa.Array) -> pa.Array:
 
 
 def _without_nan(value: Any) -> Any:
-    """Pandas' word for what is not said is null."""
+    """Replace NaN, which pandas uses for missing values, by None."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
@@ -563,7 +573,7 @@ def _is_json(values: Sequence[Any]) -> bool:
 
 
 def _folders(source: SourceDataset) -> set[str]:
-    """The folders of a dataset whose contents belong to episodes."""
+    """Return the folders of a dataset whose contents belong to episodes."""
     root = source.dataset.root
     listed = source.dataset.episodes
     files = [path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))]
@@ -571,7 +581,7 @@ def _folders(source: SourceDataset) -> set[str]:
 
 
 def _of_three(statistic: Statistic) -> Statistic:
-    """The figures of one channel for three: what reads v2.1 refuses any other number of them."""
+    """Repeat the figures of a single channel three times: readers of v2.1 refuse any other number."""
     figures = (name for name in statistic if name != "count")
     return statistic | {name: (statistic[name] * 3)[:3] for name in figures}
 
@@ -579,5 +589,5 @@ def _of_three(statistic: Statistic) -> Statistic:
 def _fill_statistics(
     given: Mapping[str, Statistic], computed: Mapping[str, Statistic]
 ) -> dict[str, Statistic]:
-    """The figures that are given, and of each column those that are not."""
+    """Return the given figures, completed from those computed for each column."""
     return {key: {**statistic, **given.get(key, {})} for key, statistic in computed.items()}

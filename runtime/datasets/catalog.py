@@ -1,4 +1,4 @@
-"""The metadata of a dataset as it is published: what is committed, and what one more episode makes of it."""
+"""Metadata of a dataset under publication: the committed state, and the state with one more episode."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from runtime.datasets.stats import Statistic, aggregate_statistics, fault
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """info.json and the lines beside it, without anything that info.json does not yet count.
+    """info.json and the lists of the metadata, without entries that info.json does not count yet.
 
-    info.json is written last, so `total_episodes` in it is what makes an episode part of the dataset.
+    info.json is written last, so its `total_episodes` decides which episodes belong to the dataset.
     """
 
     root: Path
-    info: Mapping[str, Any]  # {} in a folder that holds no dataset yet
+    info: Mapping[str, Any]  # {} if the folder has no dataset yet
     episodes: tuple[Line, ...]
     tasks: tuple[Line, ...]
     statistics: tuple[Line, ...]
@@ -40,7 +40,7 @@ class Catalog:
 
     @classmethod
     def read(cls, root: Path) -> Catalog:
-        """Catalog committed in `root`; RecordingError if not whole, or of a version not written here."""
+        """Read the catalog committed in `root`. Raises: RecordingError if incomplete or of a read-only version."""
         if not (root / layout.INFO).exists():
             return cls(root, {}, (), (), (), ())
         info = layout.read_info(root)
@@ -86,32 +86,32 @@ class Catalog:
 
     @property
     def features(self) -> Mapping[str, Mapping[str, Any]]:
-        """The declared features, {} where the dataset is yet to be created."""
+        """Declared features, {} if the dataset does not exist yet."""
         features: Mapping[str, Mapping[str, Any]] = self.info.get("features", {})
         return features
 
     @property
     def version(self) -> str:
-        """The version of the format, "" where the dataset is yet to be created."""
+        """Version of the format, "" if the dataset does not exist yet."""
         return str(self.info.get("codebase_version", ""))
 
     def index_of(self, uuid: str) -> int | None:
-        """Index of the published episode `uuid`; None where it is not published."""
+        """Return the index of the published episode `uuid`; None if it is not published."""
         return next((int(line["episode_index"]) for line in self.eva if line["uuid"] == uuid), None)
 
     def first_index(self, episode_index: int) -> int:
-        """The global index of the first row of an episode."""
+        """Return the global index of the first row of an episode."""
         return sum(line["length"] for line in self.episodes[:episode_index])
 
     def task_index(self, task: str) -> int:
-        """The number of `task`, a new one where the dataset does not have it."""
+        """Return the index of `task`, a new one if the dataset does not have the task."""
         for line in self.tasks:
             if line["task"] == task:
                 return int(line["task_index"])
         return max((int(line["task_index"]) for line in self.tasks), default=-1) + 1
 
     def require_same(self, robot: str, fps: float, features: Features) -> None:
-        """Raise RecordingError with every difference where such an episode does not belong here."""
+        """Check that such an episode fits. Raises: RecordingError with every difference."""
         if not self.info:
             return
         found = [
@@ -127,13 +127,13 @@ class Catalog:
             raise RecordingError(f"{self.root} holds other data: {'; '.join(found)}. Publish elsewhere")
 
     def with_info(self, robot: str, fps: float, features: Features, version: str) -> Catalog:
-        """The catalog with an info.json, as it was or for the first time."""
+        """Return the catalog with an info.json: the existing one, or a new one."""
         if self.info:
             return self
         return replace(self, info=new_info({}, robot=robot, fps=fps, features=features, version=version))
 
     def line(self, index: int, tasks: Sequence[str], length: int) -> Line:
-        """Line of episode `index` in the list of episodes: where it is, or will be, and what it holds."""
+        """Return the line of episode `index` in the list of episodes: its files and its content."""
         if index < len(self.episodes):
             return self.episodes[index] | {"tasks": list(tasks), "length": length}
         last = self.episodes[-1] if self.episodes else {}
@@ -142,7 +142,7 @@ class Catalog:
         return made | {"episode_index": index} | (lists if self.version == layout.V30 else {})
 
     def _next_file(self) -> int:
-        """The number of the next file: in v3.0 beyond all that there are, in v2.1 that of the episode."""
+        """Return the number of the next file: in v3.0 after all existing files, in v2.1 that of the episode."""
         size = int(self.info.get("chunks_size") or layout.CHUNKS_SIZE)
         taken = [
             int(line[name]) * size + int(line[name.replace("chunk_index", "file_index")])
@@ -153,7 +153,7 @@ class Catalog:
         return max(taken, default=len(self.episodes) - 1) + 1
 
     def entry(self, line: Line) -> EpisodeEntry:
-        """The files of an episode; raises RecordingError where others are in them too: they are not rewritten."""
+        """Return the files of an episode. Raises: RecordingError if they hold others too, as those stay unchanged."""
         made = entry(self.root, self.info, line)
         if not made.shared or made.index == len(self.episodes):
             return made
@@ -171,7 +171,7 @@ class Catalog:
         return made
 
     def with_episode(self, line: Line, statistics: Mapping[str, Statistic], eva: Line | None) -> Catalog:
-        """The catalog with the episode of `line` added or replaced, and the totals that follow."""
+        """Return the catalog with the episode of `line` added or replaced, and updated totals."""
         index = int(line["episode_index"])
         tasks = self.tasks
         for task in line["tasks"]:
@@ -188,7 +188,7 @@ class Catalog:
         return replace(changed, info={**self.info, **changed.totals()})
 
     def totals(self) -> dict[str, Any]:
-        """Counts in info.json."""
+        """Return the counts of info.json."""
         count = len(self.episodes)
         totals = {
             "total_episodes": count,
@@ -204,7 +204,7 @@ class Catalog:
         }
 
     def documents_before_data(self) -> dict[str, bytes]:
-        """Files that may name more than there is; an existing modality.json stays, it may be edited."""
+        """Return files that may name more than exists; an existing modality.json is kept, as users may edit it."""
         v30 = self.version == layout.V30
         documents = (
             {layout.TASKS_V30: parquet_lists.tasks_file(self.tasks)}
@@ -217,9 +217,10 @@ class Catalog:
         return documents
 
     def documents_after_data(self) -> dict[str, bytes]:
-        """Files that say what there is, in the order in which they are written; info.json is the last.
+        """Return files that declare the content, in the order of writing; info.json is the last.
 
-        RecordingError names the episode and the feature of statistics that cannot be written, or summed up.
+        Raises:
+            RecordingError: Statistics cannot be written or aggregated; names the episode and the feature.
         """
         try:
             return self._documents()
@@ -250,7 +251,7 @@ class Catalog:
 
 
 def single_file_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
-    """Line of episode `number` in the list of episodes; its files are its own, its rows begin at `first`."""
+    """Return the line of episode `number` in files of its own; its rows start at `first`."""
     line: Line = {"episode_index": number, "tasks": list(tasks), "length": length}
     if info["codebase_version"] != layout.V30:
         return line
@@ -279,7 +280,7 @@ def new_info(
     features: Mapping[str, Mapping[str, Any]],
     version: str,
 ) -> dict[str, Any]:
-    """info.json of a dataset without episodes; keys of `given` that the format does not know go along."""
+    """Return info.json of a dataset without episodes; keys of `given` beyond the format are added."""
     v30 = version == layout.V30
     info: dict[str, Any] = {
         "codebase_version": version,
@@ -305,9 +306,9 @@ def new_info(
 
 
 def modality(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """GR00T's meta/modality.json: the parts of state and action by actuator group, the cameras, the task.
+    """Return GR00T's meta/modality.json: parts of state and action by actuator group, cameras, task.
 
-    {} where the dataset has no state or action of these names, or their entries have none.
+    {} if the dataset has no state or action under the usual names, or their dimensions have no names.
     """
     names = {key: features.get(key, {}).get("names") for key in ("observation.state", "action")}
     if not all(isinstance(entries, list) for entries in names.values()):
@@ -322,7 +323,7 @@ def modality(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _groups(names: list[str]) -> dict[str, dict[str, int]]:
-    """Slices of a vector by the part of its entries' names before the last dot."""
+    """Return slices of a vector, grouped by the part of the dimensions' names before the last dot."""
     groups: dict[str, dict[str, int]] = {}
     for position, name in enumerate(names):
         group = groups.setdefault(name.rpartition(".")[0] or "robot", {"start": position, "end": position})

@@ -1,4 +1,4 @@
-"""New names for the columns of a dataset of other people, so that training code finds what it looks for."""
+"""New names for the columns of a foreign dataset, so that training code finds the columns that it expects."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, slots=True)
 class ColumnRenaming:
-    """New name by old one; whatever is not in it keeps its name."""
+    """New name by old name; columns that are not in it keep their names."""
 
     new_by_old: Mapping[str, str]
 
     @property
     def empty(self) -> bool:
-        """True if everything keeps its name."""
+        """True if every column keeps its name."""
         return not self.new_by_old
 
     def new_name(self, old: str) -> str:
-        """The new name of `old`."""
+        """Return the new name of `old`."""
         return self.new_by_old.get(old, old)
 
     def old_name(self, new: str) -> str:
-        """The name that `new` had."""
+        """Return the previous name of `new`."""
         return next((old for old, name in self.new_by_old.items() if name == new), new)
 
     def rename_keys(self, mapping: Mapping[str, Value]) -> dict[str, Value]:
-        """`mapping` under the new names, in its order."""
+        """Return `mapping` with renamed keys, in its order."""
         return {self.new_name(key): value for key, value in mapping.items()}
 
     def require(self, features: Mapping[str, object]) -> None:
-        """Raise RecordingError where such features cannot be renamed so."""
+        """Check that such features can be renamed. Raises: RecordingError."""
         for old, new in self.new_by_old.items():
             if old not in features:
                 raise RecordingError(f"there is no feature {old!r} to rename, there are {sorted(features)}")

@@ -1,4 +1,4 @@
-"""From the rows of a journal to the columns of a dataset: names, types, and what is derived from the grid."""
+"""Columns of a dataset from the rows of a journal: names, types, and values derived from the grid."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 Columns = dict[str, NDArray[Any]]
 
-# Beyond the state and the action no name starts with `observation` or `action`: LeRobot would take any such
-# column as an input or an output of the policy.
+# Besides state and action, no name may start with `observation` or `action`: LeRobot would use such a column as an
+# input or an output of the policy.
 EXTRA_VECTORS = {
     "eef_state": "eef",
     "eef_action": "eef_action",
@@ -36,13 +36,15 @@ EXTRA_VECTORS = {
     "joint_effort": "effort",
 }
 NOT_FINITE = "not_finite"
-# Flags that datasets have had only since the recorder says them; what ends with a dot stands for one per camera.
+# Flags that older recorders did not write, and older datasets lack; a trailing dot stands for one flag per camera.
 LATER_FLAGS = ("skewed", NOT_FINITE, "lost.", "stale.")
-TIMESTAMP_TOLERANCE = 1e-4  # of LeRobot: distance of neighbouring timestamps from 1 / fps [s]
+TIMESTAMP_TOLERANCE = (
+    1e-4  # LeRobot's tolerance for the difference of neighbouring timestamps from 1 / fps [s]
+)
 
 
 def column_features(journal: FinishedEpisode, with_success: bool) -> Features:
-    """The declared features of the episode's columns, without its videos."""
+    """Return the declared features of the episode's columns, without its videos."""
     robot = journal.manifest["robot"]
     features: Features = {
         "observation.state": vector(robot["joint_names"]),
@@ -76,7 +78,7 @@ def _later(journal: FinishedEpisode) -> list[str]:
 
 
 def without_later(features: Features, known: Collection[str]) -> Features:
-    """`features` as they were before there were the flags of LATER that `known`, those of a dataset, has not."""
+    """Return `features` without those flags of LATER_FLAGS that a dataset with the features `known` lacks."""
     return {
         key: feature
         for key, feature in features.items()
@@ -86,9 +88,12 @@ def without_later(features: Features, known: Collection[str]) -> Features:
 
 
 def recorded_columns(journal: FinishedEpisode, features: Mapping[str, Feature]) -> Columns:
-    """The columns of `features` that the journal holds or that follow from the grid.
+    """Return the columns of `features` that the journal holds or that follow from the grid.
 
-    Numbers that are not finite in what was observed are 0, their rows flagged; in an action they are a RecordingError.
+    Non-finite numbers in observations become 0 and their rows are flagged.
+
+    Raises:
+        RecordingError: An action is not finite, or an observation is not finite and the dataset lacks the flag.
     """
     state, not_finite = journal.observed("qpos")
     columns: Columns = {"observation.state": state, "action": journal.finite_vectors("action")}
@@ -117,7 +122,7 @@ def recorded_columns(journal: FinishedEpisode, features: Mapping[str, Feature]) 
 def position_columns(
     columns: Columns, *, episode_index: int, first_index: int, task_index: int, success: bool | None
 ) -> Columns:
-    """`columns` and those that depend on the episode's place; `success` None: no such column."""
+    """Return `columns` and those that depend on the episode's position; `success` None: without that column."""
     frames = len(columns["frame_index"])
     placed = columns | {
         "episode_index": np.full(frames, episode_index, dtype=np.int64),
@@ -130,9 +135,12 @@ def position_columns(
 
 
 def timestamps(frames: int, fps: float) -> NDArray[np.float32]:
-    """frame / fps as float32 [N]; raises RecordingError where LeRobot would refuse them as uneven.
+    """Return frame / fps as float32 [N].
 
-    float32 gets too coarse for LeRobot's check of neighbouring rows after about 17 minutes.
+    float32 is too coarse for LeRobot's check of neighbouring rows after about 17 minutes.
+
+    Raises:
+        RecordingError: LeRobot would refuse the timestamps as uneven.
     """
     exact = (np.arange(frames) / fps).astype(np.float32)
     if frames > 1 and np.abs(np.diff(exact) - 1 / fps).max() > TIMESTAMP_TOLERANCE:
@@ -144,7 +152,7 @@ def timestamps(frames: int, fps: float) -> NDArray[np.float32]:
 
 
 def table(columns: Columns, features: Mapping[str, Feature]) -> pa.Table:
-    """The parquet table: exactly the stored features, in their order and types."""
+    """Return the parquet table: exactly the stored features, in their order and types."""
     import pyarrow as pa
 
     schema = arrow_schema(features)
@@ -160,10 +168,10 @@ def table(columns: Columns, features: Mapping[str, Feature]) -> pa.Table:
 
 
 def column_statistics(columns: Columns, features: Mapping[str, Feature]) -> dict[str, Statistic]:
-    """Statistics of every stored column that has any.
+    """Return the statistics of every stored column that has any.
 
-    Strings have none. A column whose name contains "image" gets none either: LeRobot takes each such entry
-    for one of pictures and refuses the dataset where its shape is another.
+    Strings have none. A column with "image" in its name gets none either: LeRobot treats such an entry as one of
+    images and refuses the dataset if its shape differs.
     """
     statistics = {}
     for key, feature in stored_features(features).items():

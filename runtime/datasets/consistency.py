@@ -1,4 +1,4 @@
-"""Checks a LeRobot dataset against what its own metadata promises, file by file."""
+"""Check of a LeRobot dataset against its own metadata, file by file."""
 
 from __future__ import annotations
 
@@ -44,29 +44,29 @@ if TYPE_CHECKING:
 
     from runtime.datasets.layout import Line
 
-TOLERANCE = 1e-4  # of LeRobot, between a row and its picture [s]
-_ROUNDING = 2.0**-24  # relative, of one sum in single precision
+TOLERANCE = 1e-4  # LeRobot's tolerance between a row and its image [s]
+_ROUNDING = 2.0**-24  # relative rounding error of single precision
 
 
 class _Remark(str):
-    """Remark on something that damages nothing."""
+    """Remark on a finding that is not damage."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """One sentence each: `problems` contradict the metadata, `remarks` are no damage."""
+    """Findings, one sentence each: `problems` contradict the metadata, `remarks` are not damage."""
 
     problems: list[str]
     remarks: list[str]
 
 
 def check(dataset: Path) -> list[str]:
-    """Everything in `dataset` that contradicts its metadata, one sentence each; [] where it is whole."""
+    """Return all contradictions between the files of `dataset` and its metadata, one sentence each; [] if intact."""
     return check_with_remarks(dataset).problems
 
 
 def check_with_remarks(dataset: Path) -> CheckResult:
-    """As `check`, with what is only to be said."""
+    """Do as `check`, and return remarks as well."""
     said = _problems(Path(dataset))
     return CheckResult(
         [one for one in said if not isinstance(one, _Remark)],
@@ -132,7 +132,7 @@ def _splits(info: layout.Info, listed: set[int]) -> Iterator[str]:
 
 
 def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
-    """Contradictions in v3.0's list of episodes about rows and videos that follow each other."""
+    """Yield contradictions in v3.0's list of episodes, whose rows and videos must follow each other."""
     first = 0
     for line in episodes:
         given = line["dataset_from_index"], line["dataset_to_index"]
@@ -229,7 +229,7 @@ def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
         return
     given = column_array(table, "timestamp").astype(np.float64)[:, :1].reshape(-1)
     expected = np.arange(table.num_rows) / float(info["fps"])
-    allowed = TOLERANCE + np.spacing(np.float32(expected[-1]))  # that of the format's float32
+    allowed = TOLERANCE + np.spacing(np.float32(expected[-1]))  # plus float32's resolution
     near = np.abs(given - expected) <= allowed
     if not near.all():
         row = int(near.argmin())
@@ -237,7 +237,7 @@ def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
 
 
 def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
-    """What no loader makes a number of: null, infinite, something else."""
+    """Yield columns with values that no loader converts to numbers: null, infinite, of another type."""
     for key, feature in stored_features(info["features"]).items():
         if key not in table.column_names or feature["dtype"] in ("image", LANGUAGE):
             continue
@@ -283,7 +283,7 @@ def _rows(marked: np.ndarray[Any, Any]) -> str:
 
 
 def _size_problem(what: str, size: tuple[int, int], feature: Mapping[str, Any]) -> str:
-    """Sentence on pictures of another height and width than declared, "" where they are the same."""
+    """Return a sentence if an image's height or width differs from the declaration, else ""."""
     declared = picture_size(feature)[:2]
     if size == declared:
         return ""
@@ -311,7 +311,7 @@ def _statistics(
     table: pa.Table, info: layout.Info, statistics: Mapping[str, Mapping[str, Any]] | None
 ) -> Iterator[str]:
     if info["codebase_version"] == layout.V20:
-        return  # it has none by episode
+        return  # v2.0 has no statistics per episode
     if not statistics:
         yield f"no statistics in {layout.EPISODES_STATS if info['codebase_version'] == layout.V21 else 'meta'}"
         return
@@ -323,7 +323,7 @@ def _statistics(
         try:
             values = column_array(table, key).astype(np.float64)
         except RecordingError:
-            continue  # `_values` has said it
+            continue  # reported by `_values`
         known = values[finite(values)]
         if key in statistics:
             yield from _column_statistic(key, feature, known, statistics[key])
@@ -336,7 +336,7 @@ def _picture_statistic(key: str, feature: Mapping[str, Any], statistic: Any) -> 
         yield f"{key!r} has no statistics"
     elif why := fault(statistic, figure_shapes(feature)):
         yield f"statistics of {key!r}: {why}"
-    elif not is_depth(feature):  # whose unit is its writer's
+    elif not is_depth(feature):  # the unit of depth is chosen by its writer
         for name in FIGURES:
             value = np.asarray(statistic[name], dtype=np.float64)
             if not ((value >= 0) & (value <= 1)).all():
@@ -372,10 +372,10 @@ def _column_statistic(
 def is_rounding_error(
     name: str, given: np.ndarray[Any, Any], value: np.ndarray[Any, Any], known: np.ndarray[Any, Any]
 ) -> bool:
-    """True if single precision explains it: LeRobot sums float32, and its variance is E[x^2] - E[x]^2.
+    """Return True if single precision explains a difference: LeRobot sums float32, with variance E[x^2] - E[x]^2.
 
-    Source: a sum of n numbers one after the other is off by at most n u sum|x|, u = 2^-24 (Higham, Accuracy and
-    Stability of Numerical Algorithms, 2002, section 4.2); of the variance's three factors each is one such sum.
+    Source: the sum of n numbers in sequence has an error of at most n u sum|x|, u = 2^-24 (Higham, Accuracy and
+    Stability of Numerical Algorithms, 2002, section 4.2). The variance has three such factors.
     """
     share = len(known) * _ROUNDING
     if name == "mean":
@@ -408,7 +408,7 @@ def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str
 
 
 def _uncounted_files(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Iterator[str]:
-    """Data files beyond those that are counted: LeRobot reads every parquet file below data/."""
+    """Yield data files of episodes that are not counted: LeRobot reads every parquet file below data/."""
     cut_off, total = publishing(root), int(info["total_episodes"])
     counted = {listed.data for listed in entries if listed.index != cut_off or listed.index < total}
     for path in sorted((root / "data").rglob("*.parquet")):

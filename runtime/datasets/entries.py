@@ -1,4 +1,4 @@
-"""Episodes and tasks in the metadata of a dataset, whichever version wrote them."""
+"""Episodes and tasks in the metadata of a dataset of any version."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from runtime.datasets.layout import Info, Line
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Place of the pictures of one episode and camera."""
+    """Location of the images of one episode and camera."""
 
     path: Path
-    start: float | None = None  # time of the first one [s]; None: the file holds this episode alone
+    start: float | None = None  # time of the first image [s]; None: the file has only this episode
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,15 +29,17 @@ class EpisodeEntry:
     length: int  # rows
     tasks: tuple[str, ...]
     data: Path  # parquet
-    shared: bool  # `data` holds rows of other episodes too
+    shared: bool  # `data` also has rows of other episodes
     videos: Mapping[str, Span]  # by video key
 
 
 def episode_lines(root: Path, info: Info) -> list[Line]:
-    """The list of episodes as stored, in order of their indices, which may have gaps.
+    """Return the list of episodes as stored, ordered by index; indices may have gaps.
 
-    The one that is just being published, or was when that was cut off, is not among them. RecordingError where the
-    list has others than info.json counts: nothing is left out without a word.
+    An episode whose publication is in progress or was interrupted is excluded.
+
+    Raises:
+        RecordingError: The list has other episodes than info.json counts, so that some would be lost silently.
     """
     v30 = info["codebase_version"] == layout.V30
     path = root / (parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES)
@@ -56,12 +58,14 @@ def episode_lines(root: Path, info: Info) -> list[Line]:
                 f"{path} lists {len(by_index)} episodes ({_brief(sorted(by_index))}), {layout.INFO} counts {total}: "
                 "correct the one that is wrong"
             )
-        by_index = {index: line for index, line in by_index.items() if index < total}  # published meanwhile
+        by_index = {
+            index: line for index, line in by_index.items() if index < total
+        }  # published during the read
     return [by_index[index] for index in sorted(by_index)]
 
 
 def of_episodes(lines: Iterable[Line], episodes: Iterable[Line]) -> list[Line]:
-    """Those of `lines`, each about an episode, that are about one of `episodes`, in order of their indices."""
+    """Return those of `lines` that are about one of `episodes`, ordered by index."""
     listed = {_index(line) for line in episodes}
     return sorted((line for line in lines if _index(line) in listed), key=_index)
 
@@ -71,7 +75,7 @@ def _index(line: Line) -> int:
 
 
 def publishing(root: Path) -> int | None:
-    """The episode whose publication goes on, or was cut off; None where there is none."""
+    """Return the episode whose publication is in progress or was interrupted; None if there is none."""
     path = root / layout.PUBLISHING_PLAN
     try:
         index = layout.read_json(path).get("episode_index")
@@ -88,7 +92,7 @@ def _brief(indices: list[int]) -> str:
 
 
 def task_lines(root: Path, info: Info) -> list[Line]:
-    """The list of tasks as {"task_index", "task"}, as stored."""
+    """Return the list of tasks as {"task_index", "task"}, as stored."""
     if info["codebase_version"] == layout.V30:
         return parquet_lists.read_tasks(root)
     lines = layout.read_lines(root / layout.TASKS)
@@ -99,7 +103,7 @@ def task_lines(root: Path, info: Info) -> list[Line]:
 
 
 def statistic_lines(root: Path, info: Info) -> list[Line]:
-    """Statistics by episode as {"episode_index", "stats"}, as stored; [] for v2.0, which has none."""
+    """Return statistics by episode as {"episode_index", "stats"}, as stored; [] for v2.0, which has none."""
     if info["codebase_version"] == layout.V30:
         return parquet_lists.read_statistics(root)
     path = root / layout.EPISODES_STATS
@@ -113,7 +117,7 @@ def statistic_lines(root: Path, info: Info) -> list[Line]:
 _OF_FORMAT = ("episode_index", "tasks", "length", "dataset_from_index", "dataset_to_index", "file_stem")
 
 
-# Where v3.0 says in which file an episode is, its statistics, and what pandas makes of its index.
+# Keys of v3.0: files of an episode, its statistics, and pandas' index.
 _PLACES = re.compile(
     r"(?:data|meta/episodes)/(?:chunk|file)_index|videos/.+/(?:(?:chunk|file)_index|(?:from|to)_timestamp)"
     r"|stats/.+|__index_level_\d+__",
@@ -122,12 +126,12 @@ _PLACES = re.compile(
 
 
 def own_keys(line: Line) -> Line:
-    """What a line of the list of episodes says beyond the format, which its writer alone knows."""
+    """Return the keys of a line of the list of episodes beyond the format, known only to its writer."""
     return {key: line[key] for key in line if key not in _OF_FORMAT and not _PLACES.fullmatch(key)}
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:
-    """Entry from a line of the list of episodes; raises RecordingError where it lacks anything."""
+    """Return the entry of a line of the list of episodes. Raises: RecordingError if the line is incomplete."""
     v30 = info["codebase_version"] == layout.V30
     try:
         index = int(line["episode_index"])

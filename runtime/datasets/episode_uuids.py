@@ -1,4 +1,4 @@
-"""Episodes of others get a uuid each, by which what is said of them is kept and travels with their dataset."""
+"""Uuids for the episodes of foreign datasets, to which reviews refer and which travel with the dataset."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from runtime.datasets.video_frames import StoredImages, VideoFrames, VideoSegmen
 from runtime.recording.base import IMPORTED
 from runtime.recording.files import disk_error, write_atomic
 
-_PLACES = ("index", "episode_index", "task_index")  # of a dataset, not of the episode
+_PLACES = ("index", "episode_index", "task_index")  # columns that depend on the dataset, not on the episode
 
 
 def copy_with_uuids(
@@ -40,17 +40,27 @@ def copy_with_uuids(
     reencode: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> Dataset:
-    """The dataset at `target`, with a uuid for each episode: a copy, or itself where both are one folder.
+    """Return the dataset at `target`, with a uuid for each episode: a copy, or `dataset` itself if both are one folder.
 
-    What a copy leaves out is told.
+    A copy keeps the version, except that v2.0 becomes v2.1; it appears complete or not at all. An existing `target` is
+    used if its episodes have the same uuids.
 
-    A copy keeps the version, v2.0 becomes v2.1; it appears whole or not at all. One that is there already is taken
-    where its episodes have the same uuids, else RecordingError.
+    Args:
+        dataset: Folder of the dataset.
+        target: Folder of the copy.
+        rename: New names of features.
+        reencode: Allow images to be encoded anew if they cannot be copied.
+        tell: Receives what the copy leaves out.
+
+    Raises:
+        RecordingError: `target` has other episodes, or the dataset cannot be copied.
     """
     if target.resolve() == dataset.resolve():
         if rename:
             raise RecordingError(f"{dataset} keeps its names: import it under another one to rename features")
-        Catalog.read(dataset)  # what our own tools cannot go on with is copied first
+        Catalog.read(
+            dataset
+        )  # raises if our tools cannot continue the dataset in place; it must be copied then
         with lock_dataset(dataset):
             _name(dataset)
     elif target.exists():
@@ -61,14 +71,14 @@ def copy_with_uuids(
 
 
 def uuids_of(dataset: Path) -> dict[int, str]:
-    """The uuid of each episode that has one, by index."""
+    """Return the uuid of each episode that has one, by index."""
     return {int(line["episode_index"]): str(line["uuid"]) for line in _recorded_lines(dataset)}
 
 
 def content_uuid(dataset: Dataset, index: int, place: int | None = None) -> str:
-    """A uuid of what the episode holds: each column by its name, its tasks, its coded pictures; RecordingError.
+    """Return a uuid derived from the episode's content: columns by name, tasks, encoded images. Raises: RecordingError.
 
-    `place`: the index that the episode has in a copy without gaps.
+    `place`: index of the episode in a copy without gaps.
     """
     entry, table = dataset.entry(index), dataset.table(index)
     stored = layout.image_keys(dataset.features)
@@ -110,7 +120,7 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def _identity_of_numbers(dataset: Dataset, index: int, place: int) -> str:
-    """The uuid that earlier versions gave: of the columns of floats alone."""
+    """Return the uuid that earlier versions assigned, derived only from columns of floats."""
     digests = []
     table = dataset.table(index)
     for name in table.column_names:
@@ -132,7 +142,7 @@ def _copy(
     version = str(layout.read_info(dataset)["codebase_version"])
     draft = target.with_name(f".{target.name}.{IMPORTED}")
     try:
-        shutil.rmtree(draft, ignore_errors=True)  # what a crash left
+        shutil.rmtree(draft, ignore_errors=True)  # left by a crash
         made = convert(
             dataset,
             draft,
@@ -153,7 +163,7 @@ def _copy(
 
 
 def _name(root: Path, sources: Mapping[int, tuple[Dataset, int]] | None = None) -> None:
-    """Write a line for each episode that has none; `sources`: the episode that each was copied from."""
+    """Write a line for each episode without one; `sources`: the episode that each was copied from."""
     dataset, told = open_dataset(root), {int(line["episode_index"]): line for line in _recorded_lines(root)}
     lines = []
     for entry in dataset.episodes:
@@ -204,7 +214,7 @@ def _recorded_lines(root: Path) -> list[dict[str, Any]]:
 
 
 def _names_episode(line: Mapping[str, Any]) -> bool:
-    """True if it names an episode by a uuid: that becomes a folder, and the dataset's maker wrote it."""
+    """Return True if the line has a valid uuid: it becomes a folder's name and comes from a foreign dataset."""
     try:
         return "episode_index" in line and str(UUID(line["uuid"])) == line["uuid"]
     except (AttributeError, KeyError, TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Streams of an imported episode beside joints and pictures: velocities, efforts, poses of end effectors."""
+"""Streams of an imported episode besides joints and images: velocities, efforts, end-effector poses."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from runtime.datasets.reader import Dataset
 
 
 class _Kind(NamedTuple):
-    """Origin of a stream of a recording: keys of a mapping and of an episode, and names of columns."""
+    """Origin of a recorded stream: its keys in a mapping and in an episode, and candidate names of its column."""
 
     mapped: str
     read: str
-    columns: tuple[str, ...]  # the first that there is
+    columns: tuple[str, ...]  # the first that exists is used
 
 
 _KINDS: Mapping[str, _Kind] = {
@@ -34,7 +34,7 @@ _POSES = ("eef", "eef_action")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtraStreams:
-    """`vectors` [N, W] by stream, the `columns` they are from, the names of poses; what is left out, and why."""
+    """Vectors [N, W] and columns by stream, the names of poses, and why others are left out."""
 
     vectors: Mapping[str, Float32]
     columns: Mapping[str, str]
@@ -42,13 +42,16 @@ class ExtraStreams:
     left_out: Sequence[str]
 
     def row(self, index: int) -> dict[str, Any]:
-        """The vectors of one row, for a Row; None where nothing of one is known."""
+        """Return the vectors of one row, for a Row; None for a vector without any known value."""
         given = {stream: vectors[index] for stream, vectors in self.vectors.items()}
         return {stream: None if np.isnan(vector).all() else vector for stream, vector in given.items()}
 
 
 def read_extra_streams(dataset: Dataset, index: int, state: str) -> ExtraStreams:
-    """Streams of episode `index` beside the joints in `state`: as many numbers, or poses written as ours."""
+    """Read the streams of episode `index` besides the joints in `state`.
+
+    Velocities and efforts must be as wide as the state; poses must be named like ours. Others are left out.
+    """
     vectors: dict[str, Float32] = {}
     columns: dict[str, str] = {}
     names: Sequence[str] = ()
@@ -69,9 +72,9 @@ def read_extra_streams(dataset: Dataset, index: int, state: str) -> ExtraStreams
 
 
 def dimension_names(feature: Mapping[str, Any]) -> list[str]:
-    """A feature's names of its numbers; [] where it does not say."""
+    """Return the names of a feature's dimensions; [] if it declares none."""
     names = feature.get("names")
-    if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as some have it
+    if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as in some datasets
         names = next(iter(names.values()))
     return [str(name) for name in names] if isinstance(names, list) else []
 
@@ -91,7 +94,7 @@ def _pose_names(dataset: Dataset, column: str, others: Sequence[str]) -> list[st
 
 
 def _read(dataset: Dataset, index: int, state: str, kind: _Kind, column: str, width: int) -> Float32:
-    """The column's rows, as wide as the poses' names or, without any (0), as the state."""
+    """Read the column's rows, as wide as the poses' names or, without names (0), as the state."""
     episode = dataset.episode(
         index,
         ColumnMapping.model_validate({"state": state, "action": None, "videos": {}, kind.mapped: column}),

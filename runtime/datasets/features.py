@@ -1,4 +1,4 @@
-"""Declaration of a column in info.json and its storage in parquet, so that both always say the same."""
+"""Declaration of columns in info.json and their types in parquet, kept consistent in one place."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ INDEX_COLUMNS = {
 }
 
 
-LANGUAGE = "language"  # of LeRobot 0.6: a list of structs per row, of the writer's own fields, may be null
-WORDS = ("string", "image", LANGUAGE)  # of which there are no statistics of numbers
+LANGUAGE = "language"  # LeRobot 0.6: list of structs per row, with fields of the writer's choice; may be null
+WORDS = ("string", "image", LANGUAGE)  # dtypes without numeric statistics
 
 
 def scalar(dtype: str) -> Feature:
-    """One value per row: float32, float64, int64, bool or string."""
+    """Return the feature of one value per row: float32, float64, int64, bool or string."""
     return {"dtype": dtype, "shape": [1], "names": None}
 
 
 def vector(names: Sequence[str]) -> Feature:
-    """One float32 vector per row, its entries named."""
+    """Return the feature of one float32 vector per row, with named dimensions."""
     return {"dtype": "float32", "shape": [len(names)], "names": list(names)}
 
 
 def video(height: int, width: int, fps: float, codec: str, pixels: str) -> Feature:
-    """One RGB picture per row, stored in an mp4 file beside the rows."""
+    """Return the feature of one RGB image per row, stored in an mp4 file."""
     return {
         "dtype": "video",
         "shape": [height, width, 3],
@@ -58,17 +58,21 @@ def video(height: int, width: int, fps: float, codec: str, pixels: str) -> Featu
 
 
 def whole_rate(fps: float) -> int | float:
-    """A whole rate as int, as other readers expect it."""
+    """Return a whole rate as int, which other readers expect."""
     return int(fps) if float(fps).is_integer() else float(fps)
 
 
 def stored_features(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
-    """The features that have a parquet column: all but the videos."""
+    """Return the features with a parquet column: all except videos."""
     return {key: feature for key, feature in features.items() if feature["dtype"] != "video"}
 
 
 def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Declared height, width and channels, whichever order they have; RecordingError where they are not three."""
+    """Return declared height, width and channels, in whichever order they are declared.
+
+    Raises:
+        RecordingError: The shape does not have three axes.
+    """
     shape, names = list(feature.get("shape") or ()), feature.get("names")
     if len(shape) != 3:
         raise RecordingError(f"pictures are declared of shape {shape}, expected height, width and channels")
@@ -83,14 +87,14 @@ def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
 
 
 def is_depth(feature: Mapping[str, Any]) -> bool:
-    """True of pictures that measure distances: LeRobot says so by one channel, or `is_depth_map`."""
+    """Return True if images measure distances: LeRobot declares one channel, or `is_depth_map`."""
     told = {**(feature.get("info") or {}), **(feature.get("video_info") or {})}
     flagged = any(told.get(name) for name in ("is_depth_map", "video.is_depth_map"))
     return flagged or picture_size(feature)[2] == 1
 
 
 def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
-    """Shapes that a feature's minimum, maximum, mean and deviation may have."""
+    """Return the shapes that a feature's minimum, maximum, mean and standard deviation may have."""
     if feature["dtype"] in ("video", "image"):
         return ((3, 1, 1), (1, 1, 1)) if is_depth(feature) else ((3, 1, 1),)
     shape = tuple(feature["shape"]) or (1,)
@@ -98,7 +102,7 @@ def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
 
 
 def shape_problem(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) -> str:
-    """Sentence on rows of several axes that are not as long as declared, "" where they are."""
+    """Return a sentence if rows of several axes differ from the declared shape, else ""."""
     declared = list(feature["shape"])
     if len(declared) < 2 or not found or list(found) == declared:
         return ""
@@ -106,7 +110,7 @@ def shape_problem(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) 
 
 
 def holds_nothing(feature: Mapping[str, Any]) -> bool:
-    """True of a shape with an axis of length 0: no loader reads such a column."""
+    """Return True for a shape with an axis of length 0: no loader reads such a column."""
     return 0 in list(feature["shape"])
 
 
@@ -126,7 +130,7 @@ NUMBERS = (
 
 
 def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
-    """The parquet type of one declared feature; raises RecordingError for one that has none."""
+    """Return the parquet type of a declared feature. Raises: RecordingError if it has none."""
     import pyarrow as pa
 
     dtype, shape = feature["dtype"], list(feature["shape"])
@@ -148,7 +152,7 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
 
 
 def is_language(kind: pa.DataType) -> bool:
-    """True of the type that a column of LeRobot's language annotations has."""
+    """Return True for the type of a column of LeRobot's language annotations."""
     import pyarrow as pa
 
     rows = kind.value_type if pa.types.is_list(kind) or pa.types.is_large_list(kind) else None
@@ -158,9 +162,9 @@ def is_language(kind: pa.DataType) -> bool:
 def arrow_schema(
     features: Mapping[str, Mapping[str, Any]], given: Mapping[str, pa.DataType] | None = None
 ) -> pa.Schema:
-    """The schema of an episode's parquet file, with metadata from which `datasets` knows the features.
+    """Return the schema of an episode's parquet file, with metadata that tell the package `datasets` its features.
 
-    Columns of language have the types that are `given`.
+    Language columns get the types in `given`.
     """
     import pyarrow as pa
 
@@ -190,7 +194,7 @@ def _hugging_face(feature: Mapping[str, Any]) -> dict[str, Any]:
 def feature_differences(
     stated: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]]
 ) -> list[str]:
-    """Differences between the features of a dataset and those of a new episode, one sentence each."""
+    """Return the differences between the features of a dataset and of a new episode, one sentence each."""
     found = [f"the dataset has no {key!r}" for key in new if key not in stated]
     found += [f"the episode has no {key!r}" for key in stated if key not in new]
     for key in stated:

@@ -1,4 +1,4 @@
-"""A recorded episode as publication needs it: finished, and its columns as arrays."""
+"""Closed episode as publication reads it, with its columns as arrays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from runtime.recording.reader import Episode, open_episode
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedEpisode:
-    """A finished episode: what its manifest and outcome say, and its rows column by column."""
+    """Closed episode: its manifest, its outcome, and its rows column by column."""
 
     episode: Episode
     manifest: Mapping[str, Any]
@@ -45,7 +45,7 @@ class FinishedEpisode:
 
     @property
     def frames(self) -> int:
-        """Rows of the dataset grid; each has one picture per camera."""
+        """Rows of the dataset grid; each has one image per camera."""
         return self.episode.frames
 
     @property
@@ -54,11 +54,11 @@ class FinishedEpisode:
         return self.episode.layout.cameras
 
     def has_stream(self, name: str) -> bool:
-        """True if the vector stream `name` was recorded."""
+        """Return True if the vector stream `name` was recorded."""
         return name in self.episode.layout.streams
 
     def vectors(self, name: str) -> Float32:
-        """Column `name` as float32 [N, W], NaN in rows where it is unknown."""
+        """Return column `name` as float32 [N, W], NaN in rows without a value."""
         width = self.episode.layout.width(name)
         column = self._column(name)
         known = np.asarray(column.is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
@@ -67,7 +67,7 @@ class FinishedEpisode:
         return values
 
     def finite_vectors(self, name: str) -> Float32:
-        """Column `name` as float32 [N, W]; raises RecordingError naming the first row that is not finite."""
+        """Return column `name` as float32 [N, W]. Raises: RecordingError naming the first non-finite row."""
         values = self.vectors(name)
         broken = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(broken):
@@ -76,9 +76,9 @@ class FinishedEpisode:
         return values
 
     def observed(self, name: str) -> tuple[Float32, NDArray[np.bool_]]:
-        """Column `name` as float32 [N, W], and the rows [N] in which it held numbers that are not finite: 0 here.
+        """Return column `name` as float32 [N, W], and which rows [N] had non-finite values, replaced by 0.
 
-        NaN in rows where it is not known at all.
+        Rows without a value are NaN and are not marked.
         """
         values = self.vectors(name)
         known = np.asarray(self._column(name).is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
@@ -87,11 +87,11 @@ class FinishedEpisode:
         return values, np.any(broken, axis=1)
 
     def flags(self, name: str) -> NDArray[np.bool_]:
-        """Column `name` as booleans [N]; false in the rows of a recorder that did not have it."""
+        """Return column `name` as booleans [N]; False in rows of older recorders, which did not write it."""
         return np.asarray(self._column(name).fill_null(False).to_numpy(zero_copy_only=False), dtype=np.bool_)
 
     def scalars(self, name: str) -> np.ndarray[Any, Any]:
-        """Column `name` as an array [N]; raises RecordingError where it has gaps."""
+        """Return column `name` as an array [N]. Raises: RecordingError if it has gaps."""
         column = self._column(name)
         if column.null_count:
             raise RecordingError(f"{self.folder}: {name} is missing in {column.null_count} rows")
@@ -102,7 +102,7 @@ class FinishedEpisode:
 
 
 def read_finished_episode(folder: Path) -> FinishedEpisode:
-    """The finished episode in `folder`; raises RecordingError where it is none, or not yet finished."""
+    """Read the closed episode in `folder`. Raises: RecordingError if it is none or still open."""
     episode = open_episode(folder)
     if episode.outcome is None:
         raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")

@@ -1,4 +1,4 @@
-"""Uploads a dataset to the Hugging Face hub, through its own client where that is installed."""
+"""Upload of a dataset to the Hugging Face hub, through its own client if it is installed."""
 
 from __future__ import annotations
 
@@ -12,18 +12,22 @@ from runtime.datasets.consistency import check
 from runtime.datasets.layout import read_info
 from runtime.datasets.staging import LOCK
 
-_REPLACED = ("data", "videos", "images", "meta", "eva")  # there, what is not here any more goes
+_REPLACED = ("data", "videos", "images", "meta", "eva")  # folders on the hub whose surplus files are deleted
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
 
 
 def push(
     dataset: Path, repository: str, *, private: bool = True, tell: ProgressCallback = ignore_progress
 ) -> str:
-    """Upload `dataset` as `repository` ("owner/name"), tagged with the version of the format; its address.
+    """Upload `dataset` as `repository` ("owner/name"), tagged with the version of its format, for which LeRobot looks.
 
-    What the repository had of an older one in the folders of datasets is replaced. The client logs in with what its own
-    login has kept. LeRobot looks for the tag. Raises RecordingError where the client is not installed, the dataset is
-    not whole, or the hub does not take it.
+    Files of an older upload in the folders of a dataset are replaced. The client uses its stored login.
+
+    Returns:
+        Address of the repository.
+
+    Raises:
+        RecordingError: The client is not installed, the dataset is damaged, or the hub refuses the upload.
     """
     if not _REPOSITORY.fullmatch(repository):
         raise RecordingError(
@@ -57,7 +61,7 @@ def push(
             delete_patterns=[f"{folder}/**" for folder in _REPLACED],
         )
         hub.create_tag(repository, tag=version, repo_type="dataset", exist_ok=True)
-    except Exception as error:  # whatever the client raises: of the network, the hub, the login
+    except Exception as error:  # the client raises many types: network, hub, login
         raise RecordingError(
             f"{root} is not pushed to {repository}: {type(error).__name__}: {error}"
         ) from error

@@ -1,6 +1,6 @@
-"""An episode of a dataset as an episode of a lab: the same numbers and pictures in a folder like those of its own.
+"""Import of a dataset's episode into a lab: the same numbers and images in a folder like those of its own episodes.
 
-The dataset stays the authority: its pictures are coded again for the folder, its numbers are copied.
+The dataset stays authoritative: its images are encoded anew for the folder, its numbers are copied.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from runtime.recording.files import disk_error
 from runtime.recording.scrub import require_intact
 from runtime.recording.settings import RecordingSettings
 
-STATES = ("observation.state", "observation.qpos")  # measured joints, the first that there is
+STATES = ("observation.state", "observation.qpos")  # columns of measured joints, by preference
 ACTION = "action"
 
 
 @dataclass(frozen=True, slots=True)
 class SourceRobot:
-    """Facts missing in a dataset: `state`, the column of measured joints; `robot`, whose numbers they are."""
+    """Facts that a dataset lacks: `state`, the column of measured joints; `robot`, the robot they belong to."""
 
     state: str = ""
     robot: str = ""
 
     def names(self, dataset: Dataset) -> list[str]:
-        """Of the numbers of the state; RecordingError where the robot has not as many."""
+        """Return the names of the state's dimensions. Raises: RecordingError if the robot has another number."""
         feature = dataset.features[self.state]
         width = int(feature["shape"][0])
         if self.robot:
@@ -59,7 +59,7 @@ class SourceRobot:
 
 
 def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> SourceRobot:
-    """Checked: the column is there, the robot is known; RecordingError names what there is."""
+    """Check column and robot; find the column if none is given. Raises: RecordingError, naming valid choices."""
     vectors = [name for name, feature in dataset.features.items() if _is_vector(feature)]
     found = state or next((name for name in STATES if name in vectors), "")
     if found not in vectors:
@@ -73,10 +73,20 @@ def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> 
 
 
 def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRobot) -> tuple[str, bool]:
-    """Make the folder of episode `index` in `episodes`; its uuid, and whether it was not there. RecordingError.
+    """Create the folder of episode `index` in `episodes`; it appears complete or not at all.
 
-    It appears whole or not at all; DamagedError where it is there and is not what was imported. The dataset lies in the
-    data folder that `episodes` is in.
+    Args:
+        dataset: Dataset, in the data folder that contains `episodes`.
+        index: Index of the episode in the dataset.
+        episodes: Folder of the lab's episodes.
+        told: Column of measured joints, and robot.
+
+    Returns:
+        Uuid of the episode, and whether its folder is new.
+
+    Raises:
+        RecordingError: The episode cannot be read or written.
+        DamagedError: The folder exists and differs from what was imported.
     """
     uuid = uuids_of(dataset.root)[index]
     folder, drafts = episodes / uuid, episodes.parent / f".{IMPORTED}"
@@ -84,7 +94,7 @@ def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRob
         require_intact(folder)
         return uuid, False
     try:
-        shutil.rmtree(drafts / uuid, ignore_errors=True)  # what a crash left
+        shutil.rmtree(drafts / uuid, ignore_errors=True)  # left by a crash
         made = _recorded(dataset, index, uuid, drafts, told, os.path.relpath(dataset.root, episodes.parent))
         episodes.mkdir(parents=True, exist_ok=True)
         os.rename(made, folder)
@@ -137,7 +147,7 @@ def _manifest(
     return {
         "format": 1,
         "uuid": uuid,
-        "station": IMPORTED,  # nobody can be told to go there
+        "station": IMPORTED,  # no real station
         "kind": IMPORTED,
         "mode": "observe",
         "task": episode.task,
@@ -193,7 +203,7 @@ def _tick(episode: RecordedEpisode, row: int) -> ExecutedTick:
 
 
 def _action(episode: RecordedEpisode, row: int) -> Float32:
-    """NaN where the dataset has none, or one of other numbers than the joints."""
+    """Return the action of a row; NaN if the dataset has none, or one of another width than the joints."""
     if episode.action is None or episode.action.shape != episode.qpos.shape:
         return np.full_like(episode.qpos[row], np.nan)
     return np.asarray(episode.action[row], np.float32)

@@ -1,4 +1,4 @@
-"""The folder of a LeRobot dataset: the names of its files, and how they are read."""
+"""Folder of a LeRobot dataset: names of its files, and how to read them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.core.errors import RecordingError
 V20, V21, V30 = "v2.0", "v2.1", "v3.0"
 READABLE_VERSIONS = (V20, V21, V30)
 WRITABLE_VERSIONS = (V21, V30)
-DEFAULT_VERSION = V21  # openpi, GR00T and StarVLA read it; LeRobot from 0.4 on reads v3.0 alone
+DEFAULT_VERSION = V21  # read by openpi, GR00T and StarVLA; LeRobot reads only v3.0 since 0.4
 
 CHUNKS_SIZE = 1000  # episodes (v2.x) or files (v3.0) per chunk folder
 DATA_PATH = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -29,7 +29,7 @@ TASKS_V30 = "meta/tasks.parquet"
 STATS = "meta/stats.json"
 MODALITY = "meta/modality.json"
 EVA_EPISODES = "meta/eva_episodes.jsonl"
-PUBLISHING = ".publishing"  # hidden: readers that take every file below data/ do not look here
+PUBLISHING = ".publishing"  # hidden, and outside data/, where readers open every file
 PUBLISHING_PLAN = f"{PUBLISHING}/plan.json"
 
 COUNTED = ("total_episodes", "total_frames", "total_tasks", "total_videos", "total_chunks", "splits")
@@ -42,11 +42,11 @@ INFO_KEYS = frozenset(  # of any version
 )
 
 Info = Mapping[str, Any]
-Line = dict[str, Any]  # what a list of the metadata says of one episode or task
+Line = dict[str, Any]  # entry of a metadata list, for one episode or task
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in `path`; raises RecordingError where there is none."""
+    """Return the JSON object in `path`. Raises: RecordingError if there is none."""
     try:
         content = _parse(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -59,7 +59,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a JSON Lines file, [] where it is absent; raises RecordingError naming a broken line."""
+    """Return the objects of a JSON Lines file, [] if it is absent. Raises: RecordingError naming an invalid line."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -81,7 +81,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _parse(text: str) -> Any:
-    """The JSON in `text`; ValueError for a key that is there twice, which readers would take differently."""
+    """Parse JSON. Raises: ValueError for a duplicate key, which readers would resolve differently."""
     try:
         return json.loads(text, object_pairs_hook=_unique)
     except RecursionError:
@@ -97,7 +97,7 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """meta/info.json of a dataset that can be read; raises RecordingError where the folder holds anything else."""
+    """Return meta/info.json of a readable dataset. Raises: RecordingError if the folder has anything else."""
     info = read_json(root / INFO)
     version = info.get("codebase_version")
     if version not in READABLE_VERSIONS:
@@ -130,7 +130,7 @@ def _is_count(value: object, least: int) -> bool:
 
 
 def _declares(feature: object) -> bool:
-    """True of an object that gives a type and the lengths of its axes."""
+    """Return True for an object with a dtype and the lengths of its axes."""
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
         return False
     shape = feature.get("shape")
@@ -138,7 +138,7 @@ def _declares(feature: object) -> bool:
 
 
 def resolve(root: Path, template: str, **fields: Any) -> Path:
-    """The file that a path template of info.json names; raises RecordingError where it is none below `root`."""
+    """Return the file for a path template of info.json. Raises: RecordingError if it is not below `root`."""
     try:
         relative = template.format(**fields)
     except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:
@@ -151,10 +151,10 @@ def resolve(root: Path, template: str, **fields: Any) -> Path:
 
 
 def video_keys(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The keys of all features that are stored as videos."""
+    """Return the keys of all features stored as videos."""
     return [key for key, feature in features.items() if feature.get("dtype") == "video"]
 
 
 def image_keys(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The keys of all features that are stored as pictures in a column."""
+    """Return the keys of all features stored as images in a column."""
     return [key for key, feature in features.items() if feature.get("dtype") == "image"]

@@ -1,4 +1,4 @@
-"""Which column of a LeRobot dataset holds what; datasets of other people name theirs as they please."""
+"""Assignment of a LeRobot dataset's columns to their meaning; foreign datasets use names of their own."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ class ColumnMapping(Settings):
 
 
 def video_key(camera: str) -> str:
-    """The video key that LeRobot's conventions give a camera."""
+    """Return the video key of a camera by LeRobot's convention."""
     return f"observation.images.{camera}"

@@ -1,4 +1,4 @@
-"""Operations on whole datasets: export to the other version, merge, split, delete episodes, repair."""
+"""Operations on whole datasets: conversion to another version, merge, split, deletion of episodes, repair."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def convert(
     reencode: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> AssemblyResult:
-    """Write `dataset` as the new dataset `target` of `version`, v2.1 or v3.0; features may get new names."""
+    """Write `dataset` as the new dataset `target` of `version`, v2.1 or v3.0; `rename`: new names of features."""
     with _locked_datasets([dataset]):
         source = SourceDataset.open(Path(dataset), ColumnRenaming(dict(rename or {})))
         return assemble(target, version, source.episode_refs(), reencode=reencode, tell=tell)
@@ -54,8 +54,15 @@ def merge(
 ) -> AssemblyResult:
     """Write the episodes of `datasets`, in this order, as the new dataset `target`.
 
-    `version` is that of the first, or the one it can be written as, where None. Raises RecordingError with every
-    difference where they do not belong together.
+    Args:
+        datasets: Folders of the datasets.
+        target: Folder of the new dataset.
+        version: Version to write; None: that of the first dataset, v2.1 for v2.0.
+        reencode: Allow images to be encoded anew if they cannot be copied.
+        tell: Receives the progress.
+
+    Raises:
+        RecordingError: The datasets do not belong together; names every difference.
     """
     if not datasets:
         raise RecordingError("no datasets to merge")
@@ -75,7 +82,10 @@ def split(
 ) -> list[AssemblyResult]:
     """Write the episodes with these indices as new datasets; an episode may be in several, or in none.
 
-    Raises RecordingError for a target that is there, or an episode that is not, before anything is written.
+    All targets are written, or none.
+
+    Raises:
+        RecordingError: A target exists or an episode does not; checked before anything is written.
     """
     if not targets:
         raise RecordingError(f"{dataset} is to be split into nothing")
@@ -91,7 +101,7 @@ def split(
             for target, parts in wanted.items():
                 said = partial(_of_part, tell, target.name)
                 done.append(assemble(target, made, parts, reencode=reencode, tell=said))
-        except BaseException:  # all parts or none: one that was left would be in the way of the next try
+        except BaseException:  # all parts or none: a remaining part would block the next try
             for target in list(wanted)[: len(done)]:
                 shutil.rmtree(target)
             raise
@@ -110,12 +120,14 @@ def delete(
     known: str = "",
     tell: ProgressCallback = ignore_progress,
 ) -> AssemblyResult:
-    """Take episodes out of `dataset`; those behind them move up. It is the old one or the new one at any moment.
+    """Delete episodes of `dataset`; later episodes move up. At any moment it is the old or the new dataset.
 
-    With `known`, the `fingerprint` of the dataset that the indices are about, they are never taken from another one.
-    Raises RecordingError where an episode is not there, or none would be left.
+    `known`: `fingerprint` of the dataset to which the indices refer; a changed dataset is then left as it is.
+
+    Raises:
+        RecordingError: An episode does not exist, none would remain, or the dataset has changed.
     """
-    root = Path(dataset).resolve()  # a link to it stays
+    root = Path(dataset).resolve()  # the folder is replaced, not a link to it
     _require_dataset(root)
     with lock_dataset(root):
         recover(root)
@@ -132,7 +144,11 @@ def delete(
 
 
 def fingerprint(dataset: Path) -> str:
-    """Digest that changes with each episode added, deleted or rewritten at another length; RecordingError."""
+    """Return a digest that changes if an episode is added, deleted or written again with another length.
+
+    Raises:
+        RecordingError: The metadata cannot be read.
+    """
     root = Path(dataset)
     info = layout.read_info(root)
     told = [
@@ -144,7 +160,7 @@ def fingerprint(dataset: Path) -> str:
 
 
 def repair(dataset: Path) -> list[str]:
-    """Take back what was cut off by a crash; what `check` then still finds, which cannot be repaired here."""
+    """Undo what a crash left incomplete; return the problems that `check` still finds, which need other means."""
     root = Path(dataset).resolve()
     remove_drafts(root)
     _require_dataset(root)
@@ -159,7 +175,7 @@ def _require_dataset(root: Path) -> None:
 
 
 def _written_version(source: SourceDataset) -> str:
-    """The version of a dataset, or the one that v2.0 is written as."""
+    """Return the version of a dataset, or the default version for v2.0, which cannot be written."""
     version = source.dataset.version
     return version if version in layout.WRITABLE_VERSIONS else layout.DEFAULT_VERSION
 
@@ -173,7 +189,10 @@ def _unique(indices: Sequence[int]) -> Sequence[int]:
 
 @contextmanager
 def _locked_datasets(datasets: Sequence[Path]) -> Iterator[None]:
-    """Keep publishers out of `datasets` meanwhile; one that nobody publishes to has no lock, and gets none."""
+    """Keep publishers out of `datasets` within the block.
+
+    A dataset without a lock file has never been published to, and none is created.
+    """
     with ExitStack() as stack:
         for path in sorted({Path(dataset).absolute() / LOCK for dataset in datasets}):
             if not path.exists():

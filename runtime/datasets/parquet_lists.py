@@ -1,4 +1,4 @@
-"""The lists of a v3.0 dataset: episodes with their statistics, and tasks, as parquet files."""
+"""Lists of a v3.0 dataset as parquet files: episodes with their statistics, and tasks."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 EPISODES_FOLDER = "meta/episodes"
-CHUNK, FILE = "meta/episodes/chunk_index", "meta/episodes/file_index"  # columns: which file the row is in
+CHUNK, FILE = "meta/episodes/chunk_index", "meta/episodes/file_index"  # columns that name the file of the row
 _STATS = "stats/"
 _PANDAS_INDEX = "__index_level_0__"
 
 
 def read_episodes(root: Path) -> list[Line]:
-    """The rows of meta/episodes without the statistics, in the order of the files."""
+    """Return the rows of meta/episodes without the statistics, in the order of the files."""
     lines: list[Line] = []
     for path in _files(root):
         names = [name for name in _schema(path).names if not name.startswith(_STATS)]
@@ -30,7 +30,7 @@ def read_episodes(root: Path) -> list[Line]:
 
 
 def read_statistics(root: Path) -> list[Line]:
-    """{"episode_index", "stats": {feature: {figure: nested list}}} by row of meta/episodes."""
+    """Return {"episode_index", "stats": {feature: {figure: nested list}}} for each row of meta/episodes."""
     lines = []
     for path in _files(root):
         names = [name for name in _schema(path).names if name.startswith(_STATS)]
@@ -45,7 +45,7 @@ def read_statistics(root: Path) -> list[Line]:
 
 
 def read_tasks(root: Path) -> list[Line]:
-    """{"task_index", "task"} by row of meta/tasks.parquet; the task is the index of a pandas frame."""
+    """Return {"task_index", "task"} for each row of meta/tasks.parquet; the task is the index of a pandas frame."""
     path = root / layout.TASKS_V30
     if not path.is_file():
         return []
@@ -60,7 +60,7 @@ def read_tasks(root: Path) -> list[Line]:
 
 
 def episode_files(lines: Sequence[Line], statistics: Sequence[Line]) -> dict[str, bytes]:
-    """The files of meta/episodes by name; `lines` say which file they are in, `statistics` go along."""
+    """Return the files of meta/episodes by name; each of `lines` names its file, `statistics` are added to it."""
     by_index = {line["episode_index"]: line["stats"] for line in statistics}
     files: dict[tuple[int, int], list[Line]] = {}
     for line in lines:
@@ -73,7 +73,7 @@ def episode_files(lines: Sequence[Line], statistics: Sequence[Line]) -> dict[str
 
 
 def is_storable(values: Sequence[Any]) -> bool:
-    """True if one column of a parquet file can hold these values."""
+    """Return True if a column of a parquet file can store these values."""
     import pyarrow as pa
 
     try:
@@ -83,7 +83,7 @@ def is_storable(values: Sequence[Any]) -> bool:
 
 
 def tasks_file(tasks: Iterable[Line]) -> bytes:
-    """meta/tasks.parquet as pandas writes a frame whose index is the task."""
+    """Return meta/tasks.parquet in the form in which pandas writes a frame with the task as index."""
     import json
 
     import pyarrow as pa
@@ -118,7 +118,7 @@ def tasks_file(tasks: Iterable[Line]) -> bytes:
 
 
 def _plain(table: pa.Table) -> pa.Table:
-    """Times that Python has no type for, those of nanoseconds, as text."""
+    """Convert times in nanoseconds, for which Python has no type, to text."""
     import pyarrow as pa
 
     for place, field in enumerate(table.schema):
@@ -164,7 +164,7 @@ def _files(root: Path) -> list[Path]:
 
 
 def _numbers(path: Path) -> Line:
-    """The chunk and file number in the name of a file."""
+    """Return the chunk and file numbers in the name of a file."""
     try:
         return {CHUNK: int(path.parent.name.split("-")[1]), FILE: int(path.stem.split("-")[1])}
     except (IndexError, ValueError):

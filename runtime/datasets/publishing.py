@@ -1,4 +1,4 @@
-"""Publishes a finished episode of the journal into a LeRobot dataset; re-runnable at any time."""
+"""Publication of a finished episode of the journal into a LeRobot dataset; it may be repeated at any time."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SUCCESS = "next.success"
-SIMULATED = "sim"  # the mode, and the control source of its rows
-PIXELS = "yuv420p"  # what our recorder writes
+SIMULATED = "sim"  # name of the mode and of the control source of its rows
+PIXELS = "yuv420p"  # pixel format of our recorder
 
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Place of a published episode."""
+    """Location of a published episode."""
 
     dataset: Path
     episode_index: int
     frames: int
-    created: bool  # False: it was there already and has been written anew at the same index
-    remark: str = ""  # what could not be verified of it
+    created: bool  # False: it existed and was written again at the same index
+    remark: str = ""  # facts that could not be verified
 
 
 def publish(
@@ -63,14 +63,22 @@ def publish(
     version: str | None = None,
     sides: Mapping[str, Path] | None = None,
 ) -> Published:
-    """Publish the episode folder `episode` into the dataset folder `dataset`, created where it is absent.
+    """Publish the episode folder `episode` into the dataset folder `dataset`, which is created if absent.
 
-    `success` None takes the outcome's own word, if it has one, else that of the episode's newest label. An episode
-    that is there already (by its uuid) is written anew at its index. `version` is that of a new dataset, v2.1 where
-    None; one that is there keeps its own. The three action streams go along as a side file, and so does what `sides`
-    names by kind ("annotations", "reviews": JSON Lines). Raises RecordingError where the episode is not finished,
-    discarded, incomplete, or of other features than the dataset, DamagedError where a file of it is not what was
-    recorded.
+    An episode that is there already (by its uuid) is written again at its index. The three action streams are
+    published as a sidecar.
+
+    Args:
+        episode: Folder of the recorded episode.
+        dataset: Folder of the dataset.
+        success: Whether the episode succeeded; None: from its outcome, else from its newest label.
+        include_interrupted: Also publish an episode that did not finish.
+        version: Version of a new dataset, None for v2.1; an existing dataset keeps its own.
+        sides: Further sidecars by kind ("annotations", "reviews": JSON Lines).
+
+    Raises:
+        RecordingError: The episode is unfinished, discarded or incomplete, or has other features than the dataset.
+        DamagedError: A file of the episode differs from what was recorded.
     """
     if version not in (None, *layout.WRITABLE_VERSIONS):
         raise RecordingError(f"version is {version!r}, published are {layout.WRITABLE_VERSIONS}")
@@ -102,7 +110,7 @@ def publish(
 
 
 def never_published(manifest: Mapping[str, object]) -> str:
-    """Why no dataset may ever hold the run of that manifest, to follow its name; "" where one may."""
+    """Return why the run of that manifest may never be published, to follow its name; "" if it may."""
     if manifest.get("kind") == IMPORTED:
         return "was imported: the dataset that it was imported with holds it, and can be converted, merged and split"
     if manifest.get("mode") != SIMULATED:
@@ -114,7 +122,7 @@ def never_published(manifest: Mapping[str, object]) -> str:
 
 
 def _discarded(journal: FinishedEpisode) -> str:
-    """Sentence on the discarding of an episode of a data folder, with its author; "" if not discarded."""
+    """Return a sentence on the discarding of an episode, with its author; "" if it is not discarded."""
     label = latest_label(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
     if label is None or not label.discarded:
         return ""
@@ -183,7 +191,7 @@ def _publish(
 
 
 def _with_success(journal: FinishedEpisode, catalog: Catalog, success: bool | None) -> bool:
-    """True if the episode gets a success column: as the dataset has it, or, in a new one, if it is known."""
+    """Return True if the episode gets a success column: as in the dataset, or in a new one if it is known."""
     if not catalog.info:
         return success is not None
     wanted = SUCCESS in catalog.features
@@ -208,7 +216,11 @@ def _features(journal: FinishedEpisode, with_success: bool) -> declared.Features
 
 
 def _place(journal: FinishedEpisode, catalog: Catalog) -> tuple[int, bool]:
-    """The index of the episode, and whether it is new; refuses a change of length: it would shift others."""
+    """Return the index of the episode, and whether it is new.
+
+    Raises:
+        RecordingError: Its length has changed, which would shift the rows of later episodes.
+    """
     index = catalog.index_of(journal.uuid)
     if index is None:
         return len(catalog.episodes), True
@@ -233,7 +245,7 @@ def _stage_video(journal: FinishedEpisode, camera: str, staged: Path) -> Statist
 def _eva(
     journal: FinishedEpisode, columns: Columns, success: bool | None, result: Result | None
 ) -> dict[str, Any]:
-    """Our own line about the episode: what LeRobot's files have no place for, as that a success was a partial one."""
+    """Return our own line about the episode: facts that LeRobot's files have no field for, e.g. a partial success."""
     manifest = journal.manifest
     told = ("station", "kind", "mode", "strategy", "started_wall", "configuration_hash", "versions")
     return {
@@ -251,7 +263,7 @@ def _eva(
 
 
 def _provenance(columns: Mapping[str, NDArray[np.generic]], flag: str, true: str, false: str) -> str | None:
-    """Source of a pose column in all rows, or "mixed": then the flag column says it row by row."""
+    """Return the source of a pose column in all rows, or "mixed" if its flag column differs by row."""
     if flag not in columns:
         return None
     flags = columns[flag]

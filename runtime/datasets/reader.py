@@ -1,4 +1,4 @@
-"""Reads episodes of LeRobot v2.0, v2.1 and v3.0 datasets, whatever their columns are called."""
+"""Reader of episodes of LeRobot v2.0, v2.1 and v3.0 datasets, with any names of columns."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedEpisode:
-    """One episode in memory, but for its pictures; row k of an array and frame k of a video belong together.
+    """One episode in memory, except its images; row k of an array belongs to frame k of a video.
 
     float32 `qpos`, `qvel`, `effort`, `action` [N, D] and `eef`, `action_eef` [N, 8 * arms] as stored, None
-    where the mapping names no column; `timestamps` float64 [N] s from the episode's start; `captured` capture
+    if the mapping names no column; `timestamps` float64 [N] s from the episode's start; `captured` capture
     times float64 [N] s by stream.
     """
 
@@ -47,20 +47,20 @@ class RecordedEpisode:
     action_eef: Float32 | None
     captured: Mapping[str, Float64]
     videos: Mapping[str, Span]  # by camera key
-    images: Mapping[str, StoredImages]  # by camera key: those that are stored in columns
+    images: Mapping[str, StoredImages]  # by camera key: images stored in columns
 
     @property
     def length(self) -> int:
-        """Rows, and pictures per camera."""
+        """Number of rows, and of images per camera."""
         return len(self.qpos)
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The keys of the cameras that there are pictures of."""
+        """Keys of the cameras with images."""
         return (*self.videos, *self.images)
 
     def pictures(self, camera: str) -> ImageSequence:
-        """The pictures of one camera; raises RecordingError where its video is absent or too short."""
+        """Open the images of one camera. Raises: RecordingError if its video is absent or too short."""
         if camera in self.images:
             return self.images[camera]
         if camera not in self.videos:
@@ -80,7 +80,7 @@ class RecordedEpisode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """An opened dataset: its metadata in memory, its episodes on disk."""
+    """Opened dataset: its metadata in memory, its episodes on disk."""
 
     root: Path
     info: Mapping[str, Any]
@@ -90,17 +90,17 @@ class Dataset:
 
     @property
     def version(self) -> str:
-        """Which version of the format it is written in."""
+        """Version of the format."""
         return str(self.info["codebase_version"])
 
     @property
     def features(self) -> Mapping[str, Mapping[str, Any]]:
-        """The declared features by key."""
+        """Declared features by key."""
         features: Mapping[str, Mapping[str, Any]] = self.info["features"]
         return features
 
     def entry(self, index: int) -> EpisodeEntry:
-        """The entry of episode `index`; raises RecordingError naming the episodes there are."""
+        """Return the entry of episode `index`. Raises: RecordingError naming the existing episodes."""
         for listed in self.episodes:
             if listed.index == index:
                 return listed
@@ -108,7 +108,7 @@ class Dataset:
         raise RecordingError(f"{self.root} has no episode {index}, there are {len(self.episodes)}: {there}")
 
     def episode(self, index: int, mapping: ColumnMapping | None = None) -> RecordedEpisode:
-        """Episode `index` with its columns as `mapping` names them; raises RecordingError."""
+        """Read episode `index`, with its columns as `mapping` names them. Raises: RecordingError."""
         mapping = mapping or ColumnMapping()
         listed = self.entry(index)
         cameras = self._cameras(mapping)
@@ -131,11 +131,11 @@ class Dataset:
         )
 
     def table(self, index: int) -> pa.Table:
-        """All columns of episode `index` as stored; raises RecordingError."""
+        """Return all columns of episode `index` as stored. Raises: RecordingError."""
         return self._table(self.entry(index), set(layout.image_keys(self.features)))
 
     def _table(self, listed: EpisodeEntry, images: set[str]) -> pa.Table:
-        """The rows of an episode, without the image columns that are not in `images`."""
+        """Return the rows of an episode, without the image columns that are not in `images`."""
         left_out = set(layout.image_keys(self.features)) - images
         table = read_rows(listed.data, listed.index if listed.shared else None, left_out)
         if table.num_rows != listed.length or not table.num_rows:
@@ -158,7 +158,7 @@ class Dataset:
         return np.arange(columns.rows, dtype=np.float64) / self.fps
 
     def _cameras(self, mapping: ColumnMapping) -> dict[str, str]:
-        """The feature that holds the pictures of each camera."""
+        """Return the feature with the images of each camera."""
         stored = [*layout.video_keys(self.features), *layout.image_keys(self.features)]
         prefix = video_key("")
         wanted = mapping.videos
@@ -173,7 +173,7 @@ class Dataset:
 
 
 class _Columns:
-    """The columns of one episode's table as arrays; errors name the file and the columns there are."""
+    """Columns of one episode's table as arrays; errors name the file and the existing columns."""
 
     def __init__(self, table: pa.Table, path: Path) -> None:
         self._table = table
@@ -187,20 +187,20 @@ class _Columns:
         return None if name is None else self.vectors(name)
 
     def vectors(self, name: str) -> Float32:
-        """Column `name` as float32 [N, W], read-only."""
+        """Return column `name` as float32 [N, W], read-only."""
         rows = np.ascontiguousarray(self._flat(name), dtype=np.float32).reshape(self.rows, -1)
         rows.flags.writeable = False
         return rows
 
     def scalars(self, name: str) -> Float64:
-        """Column `name` as float64 [N]."""
+        """Return column `name` as float64 [N]."""
         flat = self._flat(name)
         if flat.size != self.rows:
             raise RecordingError(f"{self._path}: column {name!r} holds vectors, expected one number per row")
         return np.asarray(flat, dtype=np.float64)
 
     def images(self, name: str, root: Path) -> StoredImages:
-        """Image column `name`."""
+        """Return the images of column `name`."""
         import pyarrow as pa
 
         if not self.has(name):
@@ -234,7 +234,7 @@ class _Columns:
 
 
 class _Rows(Sequence[Mapping[str, Any] | None]):
-    """An arrow column as a sequence; a row becomes Python when it is asked for."""
+    """Arrow column as a sequence; a row is converted to Python on access."""
 
     def __init__(self, column: pa.Array) -> None:
         self._column = column
@@ -247,7 +247,7 @@ class _Rows(Sequence[Mapping[str, Any] | None]):
 
 
 def open_dataset(root: Path | str) -> Dataset:
-    """Open the LeRobot dataset in `root`; raises RecordingError saying what is there instead."""
+    """Open the LeRobot dataset in `root`. Raises: RecordingError describing the folder's content instead."""
     root = Path(root)
     if not root.is_dir():
         raise RecordingError(f"there is no dataset folder {root}")
@@ -262,7 +262,7 @@ def open_dataset(root: Path | str) -> Dataset:
 
 
 def _numbered(root: Path, lines: Iterable[Mapping[str, Any]]) -> dict[int, str]:
-    """Tasks by their numbers; RecordingError where a number is that of two."""
+    """Return tasks by index. Raises: RecordingError if an index has two tasks."""
     found: dict[int, str] = {}
     for line in lines:
         number, task = line["task_index"], line["task"]

@@ -1,4 +1,4 @@
-"""Turns a recorded video into a dataset's: the same coded pictures in a file that can be sought in."""
+"""Copy of a recorded video into a dataset: the same encoded images in a seekable file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class VideoFacts:
-    """Facts about a video, as its stream says."""
+    """Properties of a video, as its stream declares them."""
 
     height: int
     width: int
@@ -26,7 +26,7 @@ class VideoFacts:
 
 
 def codec_of(video: Path) -> str:
-    """The format of its pictures, "h264" for example; raises RecordingError where it cannot be read."""
+    """Return the codec of a video, e.g. "h264". Raises: RecordingError if it cannot be read."""
     import av
 
     try:
@@ -37,15 +37,18 @@ def codec_of(video: Path) -> str:
 
 
 def copied_stream(container: av.container.OutputContainer, stream: Any) -> Any:
-    """A stream of `container` for the coded pictures of `stream`; needs no encoder, as our AV1 decoder is none."""
+    """Add a stream to `container` for the encoded images of `stream`; works without an encoder, as for AV1."""
     return container.add_stream_from_template(stream, opaque=stream.codec.canonical_name != "h264")
 
 
 def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
-    """Copy the first `frames` coded pictures of `source` to `target`, frame k at k / fps, index at the front.
+    """Copy the first `frames` encoded images of `source` to `target`, frame k at k / fps, index at the front.
 
-    Nothing is re-encoded. Raises RecordingError where the source has fewer frames, does not start with a key
-    frame, or has B-frames (its coded order would not be the order of the rows).
+    Nothing is encoded anew.
+
+    Raises:
+        RecordingError: The source has fewer frames, does not start with a key frame, or has B-frames (its decoding
+            order would differ from the order of the rows).
     """
     import av
 
@@ -75,9 +78,15 @@ def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
 
 
 def cut(source: Path, target: BinaryIO, begin: float, end: float) -> float:
-    """Copy the coded pictures of `source` from `begin` to `end` [s] to `target`; where the copy begins [s].
+    """Copy the encoded images of `source` from `begin` to `end` [s] to `target`.
 
-    Nothing is re-encoded: it begins with the key frame before. RecordingError where there are no pictures then.
+    Nothing is encoded anew, so the copy starts with the key frame before `begin`.
+
+    Returns:
+        Time in `source` at which the copy starts [s].
+
+    Raises:
+        RecordingError: There are no images in this interval, or the source cannot be read.
     """
     import av
 
@@ -111,7 +120,7 @@ def cut(source: Path, target: BinaryIO, begin: float, end: float) -> float:
 
 
 def _in_order(source: Path, recorded: av.container.InputContainer, frames: int) -> Iterator[Any]:
-    """The first `frames` packets of the video; raises where decoding order is not presentation order."""
+    """Yield the first `frames` packets. Raises: RecordingError if decoding order is not presentation order."""
     newest: int | None = None
     taken = 0
     for packet in recorded.demux(recorded.streams.video[0]):

@@ -1,4 +1,4 @@
-"""The parquet files of rows: reads one episode's from a file that may hold many, writes one episode's."""
+"""Parquet files of rows: reading one episode from a file that may hold many, and writing one."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ EPISODE = "episode_index"
 
 
 def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -> pa.Table:
-    """The rows of `episode`, or all (None), without the columns in `left_out`.
+    """Return the rows of `episode`, or all (None), without the columns in `left_out`.
 
-    Only the row groups that may hold the episode are read. Raises RecordingError naming the file.
+    Only row groups that may contain the episode are read. Raises: RecordingError naming the file.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -49,11 +49,15 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
 
 
 def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, Any]:
-    """Column `name` as an array [N, W], whatever lists it is nested in; NaN where it is null.
+    """Return column `name` as an array [N, W], flattening nested lists; NaN if a row is null.
 
-    `width`: W of a column that is null everywhere.
+    Args:
+        table: Rows of an episode.
+        name: Name of the column.
+        width: W if the column is null in all rows.
 
-    Raises RecordingError naming the column where its rows differ in length, or hold no numbers.
+    Raises:
+        RecordingError: Rows differ in length or are not numbers; names the column.
     """
     import pyarrow as pa
 
@@ -79,9 +83,10 @@ def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, 
 
 
 def row_shape(table: pa.Table, name: str) -> tuple[int, ...]:
-    """The lengths of the lists in which each row of column `name` is nested, () of single values.
+    """Return the lengths of the nested lists in each row of column `name`, () for single values.
 
-    Raises RecordingError naming the column where its rows differ.
+    Raises:
+        RecordingError: Rows differ in length; names the column.
     """
     return _flattened(table.column(name).combine_chunks().drop_null(), name)[1]
 
@@ -100,14 +105,14 @@ def _flattened(flat: pa.Array, name: str) -> tuple[pa.Array, tuple[int, ...]]:
 
 
 def is_list(kind: pa.DataType) -> bool:
-    """True of lists of any kind."""
+    """Return True for a list type of any kind."""
     import pyarrow as pa
 
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Write `table` to `path`, with the checksums that the format has for its pages; raises RecordingError."""
+    """Write `table` to `path`, with page checksums. Raises: RecordingError."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -118,7 +123,7 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 
 def _groups(metadata: pq.FileMetaData, episode: int) -> list[int]:
-    """The row groups that may hold rows of the episode, by the statistics that the file keeps."""
+    """Return the row groups that may contain the episode, by the statistics in the file."""
     chosen = []
     for number in range(metadata.num_row_groups):
         group = metadata.row_group(number)

@@ -1,4 +1,4 @@
-"""Files that travel with a dataset and that no loader reads: the action streams, annotations and reviews by episode."""
+"""Sidecars of a dataset, which loaders ignore: action streams, annotations and reviews by episode."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ from runtime.datasets.layout import read_lines
 from runtime.datasets.staging import lock_dataset, recover
 from runtime.recording.files import write_atomic
 
-FOLDER = (
-    "eva"  # beside data, videos and meta: LeRobot takes every parquet file below data/ and meta/episodes/
-)
+FOLDER = "eva"  # outside data/ and meta/episodes/, because LeRobot reads every parquet file there
 STREAMS = "streams"
 SUFFIXES = {STREAMS: ".parquet", "annotations": ".jsonl", "reviews": ".jsonl"}
 
 
 def sidecar_path(root: Path, kind: str, uuid: str) -> Path:
-    """Path of the side file of the episode `uuid`; RecordingError for a kind or a uuid that is none."""
+    """Return the path of a sidecar of the episode `uuid`. Raises: RecordingError for an invalid kind or uuid."""
     if kind not in SUFFIXES:
         raise RecordingError(f"{kind!r} is no kind of side file, there are {sorted(SUFFIXES)}")
     try:
@@ -32,20 +30,21 @@ def sidecar_path(root: Path, kind: str, uuid: str) -> Path:
 
 
 def sidecar_paths(root: Path, uuid: str) -> dict[str, Path]:
-    """The side files of one episode that there are, by kind."""
+    """Return the existing sidecars of one episode, by kind."""
     there = {kind: sidecar_path(root, kind, uuid) for kind in SUFFIXES}
     return {kind: path for kind, path in there.items() if path.is_file()}
 
 
 def read_sidecars(given: Mapping[str, Path]) -> dict[str, bytes]:
-    """Publication's side files of an episode by kind ("annotations", "reviews"); JSON Lines are checked."""
+    """Read sidecars for publication by kind ("annotations", "reviews"); JSON Lines are checked."""
     return {kind: _content(kind, Path(path)) for kind, path in given.items()}
 
 
 def attach_sidecar(dataset: Path, uuid: str, kind: str, source: Path | None) -> Path:
-    """Put the file `source` beside the published episode `uuid`, in place of an older one; None removes it.
+    """Store the file `source` as a sidecar of the published episode `uuid`, replacing an older one; None removes it.
 
-    Raises RecordingError where the episode is not in the dataset, or the file is not JSON Lines.
+    Raises:
+        RecordingError: The episode is not in the dataset, or the file is not JSON Lines.
     """
     root = Path(dataset)
     target = sidecar_path(root, kind, uuid)
@@ -75,7 +74,7 @@ def _content(kind: str, source: Path) -> bytes:
 
 
 def orphaned_sidecars(root: Path, uuids: set[str]) -> Iterator[str]:
-    """Side files of episodes that are not in the dataset, one sentence each."""
+    """Yield a sentence for each sidecar whose episode is not in the dataset."""
     for path in sorted((root / FOLDER).glob("*/*")):
         if path.parent.name in SUFFIXES and path.stem not in uuids and not path.name.startswith("."):
             yield f"{path} is of an episode that is not in the dataset"

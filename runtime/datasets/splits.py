@@ -1,4 +1,4 @@
-"""The splits of info.json: which episodes are for training, which for something else."""
+"""Splits of info.json: which episodes are for training, and which for other purposes."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 
 from runtime.core.errors import RecordingError
 
-TRAIN = "train"  # where LeRobot, and we, put every episode of which nobody says anything else
+TRAIN = "train"  # default split of every episode, as in LeRobot
 
 
 def episodes_of(name: str, value: Any) -> list[int]:
-    """Indices in a split: "0:40", "0:3,5:8,9" or a list of numbers; RecordingError names one that says none."""
+    """Return the indices in a split: "0:40", "0:3,5:8,9" or a list of numbers. Raises: RecordingError if invalid."""
     try:
         if isinstance(value, str):
             return [index for part in value.split(",") if part.strip() for index in _range(part)]
@@ -23,12 +23,12 @@ def episodes_of(name: str, value: Any) -> list[int]:
 
 
 def written(splits: Mapping[str, Iterable[int]]) -> dict[str, str]:
-    """Splits as info.json has them: half-open ranges, several with commas between; none that is empty."""
+    """Return splits in the form of info.json: half-open ranges, separated by commas; empty splits are omitted."""
     return {name: text for name, indices in splits.items() if (text := _text(sorted(set(indices))))}
 
 
 def with_more(splits: Mapping[str, Any], first: int, end: int) -> dict[str, Any]:
-    """`splits` with the new episodes `first` to `end` (excluded) in the one for training; RecordingError."""
+    """Return `splits` with the episodes `first` to `end` (excluded) added for training. Raises: RecordingError."""
     if first >= end:
         return dict(splits)
     known = episodes_of(TRAIN, splits.get(TRAIN, ""))

@@ -1,4 +1,4 @@
-"""Puts the files of an episode into a dataset so that a crash at any moment leaves the old contents."""
+"""Atomic writes of an episode into a dataset: a crash at any moment leaves the old contents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HERE, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and the flag of renameat2(2)
 
 @contextmanager
 def lock_dataset(root: Path) -> Iterator[None]:
-    """Hold the dataset for one writer, waiting for another one to finish; creates the folder."""
+    """Hold the writers' lock of the dataset, waiting for another writer; create the folder if needed."""
     try:
         root.mkdir(parents=True, exist_ok=True)
         descriptor = _lock(root)
@@ -41,7 +41,7 @@ def lock_dataset(root: Path) -> Iterator[None]:
 
 
 def _lock(root: Path) -> int:
-    """The descriptor of the lock of the folder that is at `root` now: it may have been exchanged meanwhile."""
+    """Lock the folder that is at `root` now, which may be exchanged while waiting; return the descriptor."""
     while True:
         descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -51,11 +51,10 @@ def _lock(root: Path) -> int:
 
 
 def recover(root: Path) -> None:
-    """Take back what an interrupted publication left; the caller holds the lock.
+    """Undo an interrupted publication; the caller holds the lock.
 
-    The plan of that publication names its files. Those of an episode that info.json does not count are
-    removed, and so is every line about it; the files of an episode that it counts stay, in either version:
-    publishing that episode again completes it.
+    The plan of that publication names its files. If info.json does not count the episode, they are removed, with every
+    line about it. If it does, the files stay, in either version: publishing the episode again completes it.
     """
     staging = root / FOLDER
     if not staging.exists():
@@ -85,7 +84,7 @@ def _take_back(root: Path, index: int, files: list[Path]) -> None:
 
 
 def require_empty(root: Path) -> None:
-    """Raise RecordingError where a folder without info.json holds anything that is not ours to overwrite."""
+    """Check that a folder without info.json holds no foreign files. Raises: RecordingError."""
     ours = {FOLDER, LOCK, "data", "videos", "meta", "eva"}
     foreign = sorted(entry.name for entry in root.iterdir() if entry.name not in ours)
     foreign += [
@@ -99,10 +98,10 @@ def require_empty(root: Path) -> None:
 
 
 class Draft:
-    """A whole new dataset on its way: made in a hidden folder beside `target`, then put there by one rename.
+    """Complete new dataset: written into a hidden folder next to `target`, then moved there by one rename.
 
-    `replacing`: it takes the place of the folder that is there, exchanged at once; else there must be none, or an
-    empty one. Leaving the block without `place` removes it. One that was killed is removed by `repair`.
+    `replacing`: it is exchanged with the existing folder in one step; otherwise the target must not exist or be empty.
+    Leaving the block without `commit` removes the draft; the draft of a killed process is removed by `repair`.
     """
 
     def __init__(self, target: Path, replacing: bool) -> None:
@@ -136,7 +135,7 @@ class Draft:
             raise RecordingError(f"{self._target} is there already and not empty: give a folder that is not")
 
     def commit(self) -> None:
-        """Sync everything and put it at the target; what was there before is in `folder` then, and is removed."""
+        """Sync all files and move them to the target; the replaced dataset, then in `folder`, is removed."""
         try:
             for path in sorted(self.folder.rglob("*")):
                 if path.is_file():
@@ -154,7 +153,7 @@ class Draft:
 
 
 def remove_drafts(target: Path) -> list[Path]:
-    """Remove what killed makers of `target` left beside it; the folders of those still at work stay."""
+    """Remove drafts of `target` left by killed processes; locked ones, still being written, stay."""
     removed = []
     for folder in sorted(target.absolute().parent.glob(f"{glob.escape(_draft_prefix(target))}*")):
         try:
@@ -177,7 +176,7 @@ def _draft_prefix(target: Path) -> str:
 
 
 def _exchange(one: Path, other: Path) -> None:
-    """Let two folders change places in one step, so that there is one of them at any moment."""
+    """Exchange two folders in one step, so that both paths exist at any moment. Raises: RecordingError, OSError."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.renameat2(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _RENAME_EXCHANGE):
         number = ctypes.get_errno()
@@ -189,9 +188,9 @@ def _exchange(one: Path, other: Path) -> None:
 
 
 class Staging:
-    """Files prepared beside the dataset's and then renamed into place, the big ones first, info.json last.
+    """Files prepared next to the dataset's and then renamed into place, the large ones first, info.json last.
 
-    Leaving the block without `place` takes everything back.
+    Leaving the block without `commit` undoes everything.
     """
 
     def __init__(self, root: Path, episode_index: int, data: list[Path]) -> None:
@@ -215,7 +214,7 @@ class Staging:
         recover(self._root)
 
     def path(self, final: Path) -> Path:
-        """Path at which to prepare the file that goes to `final`."""
+        """Return the path at which to prepare the file for `final`."""
         return self._folder / str(final.relative_to(self._root)).replace("/", "|")
 
     def write(self, final: Path, content: bytes) -> None:
@@ -226,7 +225,7 @@ class Staging:
             raise disk_error("publishing to", self._root, error) from error
 
     def commit(self, before: dict[str, bytes], after: dict[str, bytes]) -> None:
-        """Write the documents, sync everything, then rename: `before`, the data, `after` in their order."""
+        """Write the documents, sync all files, then rename in the order `before`, data, `after`."""
         try:
             for name, content in (before | after).items():
                 self.path(self._root / name).write_bytes(content)

@@ -1,4 +1,4 @@
-"""Statistics of an episode's columns and pictures, and of all episodes, as LeRobot keeps them."""
+"""Statistics of an episode's columns and images, and of all episodes, in LeRobot's form."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from runtime.core.picture_bounds import open_video
 from runtime.core.types import UInt8
 from runtime.datasets.video_frames import StoredImages
 
-# min, max, mean, std and the quantiles: lists of the feature's shape; count: [n]
+# min, max, mean, std, quantiles: lists of the feature's shape; count: [n]
 Statistic = dict[str, list[Any]]
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-FIGURES = ("min", "max", "mean", "std")  # without which a statistic is none, beside the count
-SAMPLED_PICTURES = 100  # per video and episode
+FIGURES = ("min", "max", "mean", "std")  # required figures of a statistic, besides its count
+SAMPLED_PICTURES = 100  # images sampled per video and episode
 
 
 def column_statistic(values: NDArray[Any]) -> Statistic | None:
-    """Of one column [N] or [N, ...], over the rows where it is known; None where it is known nowhere.
+    """Return the statistic of a column [N] or [N, ...] over its finite rows; None if there are none.
 
-    The deviation is that of the population. Rows that are not finite are not counted.
+    The standard deviation is that of the population.
     """
     rows = values if values.ndim > 1 else values.reshape(-1, 1)
     known = rows[finite(rows)]
@@ -43,13 +43,13 @@ def column_statistic(values: NDArray[Any]) -> Statistic | None:
 
 
 def finite(rows: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where all of a row of [N, ...] is finite, [N]."""
+    """Return which rows of [N, ...] are finite in all values, bool [N]."""
     good: NDArray[np.bool_] = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
     return good
 
 
 def fault(statistic: object, shapes: Sequence[tuple[int, ...]]) -> str:
-    """What makes a statistic unusable, "" where nothing does; its figures are to have one of `shapes`."""
+    """Return why a statistic is unusable, "" if it is usable; each figure must have one of `shapes`."""
     if not isinstance(statistic, Mapping):
         return f"is {statistic!r:.80}, expected {', '.join(FIGURES)} and count"
     for name in FIGURES + tuple(name for name in QUANTILES if name in statistic):
@@ -71,10 +71,12 @@ def fault(statistic: object, shapes: Sequence[tuple[int, ...]]) -> str:
 
 
 def video_statistic(path: Path, frames: int) -> Statistic:
-    """Of a video's pictures per channel in 0..1, shape (3, 1, 1), from an even subsample.
+    """Return the statistic of a video's images per channel in 0..1, shape (3, 1, 1), from an even subsample.
 
-    Depth of more than 8 bits counts with all of them. Every frame is decoded on the way; raises RecordingError where
-    there are not exactly `frames`.
+    Depth of more than 8 bits is used with its full bit depth. Every frame is decoded.
+
+    Raises:
+        RecordingError: The video does not have exactly `frames` frames or cannot be decoded.
     """
     import av
 
@@ -102,9 +104,9 @@ def video_statistic(path: Path, frames: int) -> Statistic:
 
 
 def picture_statistic(pictures: StoredImages) -> Statistic | None:
-    """As `video_statistic`, of pictures that are stored one by one; None where there is none of them.
+    """Do as `video_statistic` for images stored one by one; None if all are missing or no value is finite.
 
-    Those that are missing do not count. Depth of 16 bits counts as shares of 65535, floats as they are.
+    Missing images are skipped. Depth of 16 bits is scaled by 65535, floats are used unchanged.
     """
     there = [number for number in range(len(pictures)) if not pictures.is_missing(number)]
     sums, deep = _Histogram(), _Deep()
@@ -120,7 +122,7 @@ def picture_statistic(pictures: StoredImages) -> Statistic | None:
 
 
 class _Deep:
-    """Depth pictures: figures of each, then of all together, so that they need not fit into memory."""
+    """Statistic of depth images: computed per image and then merged, so that they need not fit into memory."""
 
     def __init__(self) -> None:
         self._each: list[Statistic] = []
@@ -130,14 +132,14 @@ class _Deep:
         return self._pictures > 0
 
     def add(self, depth: NDArray[np.floating[Any]]) -> None:
-        """A picture [H, W] of shares of the full scale."""
+        """Add an image [H, W] in shares of the full scale."""
         self._pictures += 1
         statistic = column_statistic(depth.reshape(-1))
         if statistic is not None:
             self._each.append(statistic)
 
     def statistic(self) -> Statistic | None:
-        """The one channel three times, as LeRobot wants it; None where no number is known."""
+        """Return the single channel three times, as LeRobot expects; None if no value is finite."""
         if not self._each:
             return None
         together = _merge_statistics(self._each)
@@ -148,7 +150,7 @@ class _Deep:
 
 
 class _Histogram:
-    """Count of each value 0 to 255, by channel: everything else follows from it exactly."""
+    """Counts of the values 0 to 255 per channel, from which all figures follow exactly."""
 
     def __init__(self) -> None:
         self._pictures = 0
@@ -180,10 +182,13 @@ class _Histogram:
 
 
 def aggregate_statistics(episodes: Iterable[Mapping[str, Statistic]]) -> dict[str, Statistic]:
-    """The statistics of all episodes together, each episode weighted by its count.
+    """Return the statistics of all episodes together, each episode weighted by its count.
 
-    Source: the parallel form of the variance (Chan, Golub, LeVeque 1979). Quantiles are the mean of those of the
-    episodes, as LeRobot makes them; there are none where an episode has none. ValueError for a count not above 0.
+    Source: parallel form of the variance (Chan, Golub, LeVeque 1979). A quantile is the weighted mean of the episodes'
+    quantiles, as in LeRobot; it is omitted if an episode lacks it.
+
+    Raises:
+        ValueError: A count is not above 0.
     """
     collected: dict[str, list[Statistic]] = {}
     for statistics in episodes:

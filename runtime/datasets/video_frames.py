@@ -1,4 +1,4 @@
-"""The pictures of one episode and camera by frame number, exact whatever B-frames and groups a video has."""
+"""Images of one episode and camera by frame number, exact with any B-frames and groups of pictures."""
 
 from __future__ import annotations
 
@@ -26,19 +26,24 @@ if TYPE_CHECKING:
 
 KEPT_BYTES = (
     16 << 20
-)  # decoded frames that are kept of a video: going backwards decodes a group of pictures once
+)  # bytes of decoded frames cached per video, so that reading backwards decodes a group of pictures once
 
 
 class ImageSequence(ABC):
-    """Picture k of one camera and episode as RGB uint8 [H, W, 3], read-only; not safe to share between threads."""
+    """Images of one camera and episode: image k is RGB uint8 [H, W, 3], read-only. Not thread-safe."""
 
     @abstractmethod
     def __len__(self) -> int:
-        """Count of pictures."""
+        """Return the number of images."""
 
     @abstractmethod
     def __getitem__(self, index: int) -> UInt8:
-        """Picture `index`; raises IndexError beyond the last, RecordingError where it cannot be decoded."""
+        """Return image `index`.
+
+        Raises:
+            IndexError: There is no such image.
+            RecordingError: The image cannot be decoded.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -55,7 +60,7 @@ class ImageSequence(ABC):
 
 @dataclass(frozen=True, slots=True)
 class VideoSegment:
-    """The part of a video that is one episode: frame k at `start` + k / `fps` seconds."""
+    """Part of a video that is one episode: frame k at `start` + k / `fps` [s]."""
 
     start: float
     frames: int
@@ -67,11 +72,11 @@ class VideoSegment:
 
 
 class VideoFrames(ImageSequence):
-    """The frames of a video, or of a stretch of one.
+    """Frames of a video, or of a segment of it.
 
-    Frames are numbered in order of presentation from a scan of the packets, never from rounded times. Reading
-    in order decodes each frame once; any other order seeks to the key frame before the wanted one and decodes
-    forward from there. The newest decoded frames are kept. Raises RecordingError, naming the file.
+    Frames are numbered in order of presentation by a scan of the packets, never by rounded times. Reading in order
+    decodes each frame once; any other order seeks to the key frame before the wanted frame and decodes from there.
+    The newest decoded frames are cached. Raises: RecordingError, naming the file.
     """
 
     def __init__(self, path: Path, stretch: VideoSegment | None = None) -> None:
@@ -92,9 +97,9 @@ class VideoFrames(ImageSequence):
             self._container.close()
             raise
         self._frames: Iterator[av.VideoFrame] = iter(())
-        self._upcoming: int | None = None  # the frame that `_frames` yields next; None: a seek is due
+        self._upcoming: int | None = None  # frame that `_frames` yields next; None: seek first
         self._newest: tuple[int, UInt8] | None = None
-        self._kept: dict[int, av.VideoFrame] = {}  # in the order in which they were decoded
+        self._kept: dict[int, av.VideoFrame] = {}  # cached frames, in the order of decoding
 
     def _scan(self) -> None:
         if not self._container.streams.video:
@@ -117,7 +122,7 @@ class VideoFrames(ImageSequence):
             raise RecordingError(f"{self._path} does not start with a key frame")
 
     def _packets(self) -> Iterator[Any]:
-        """The packets to be numbered; of a stretch, those from the key frame before it to its end."""
+        """Yield the packets to number; for a segment, those from the key frame before it to its end."""
         end = None
         if self._stretch is not None:
             self._container.seek(int(self._stretch.start / self._stream.time_base), stream=self._stream)
@@ -143,17 +148,17 @@ class VideoFrames(ImageSequence):
 
     @property
     def times(self) -> list[float]:
-        """When each frame is shown, in the time of the file [s]."""
+        """Presentation times of the frames in the file [s]."""
         base = float(self._stream.time_base)
         return [time * base for time in self._times]
 
     @property
     def stamps(self) -> list[int]:
-        """When each frame is shown, as its time stamp in the file."""
+        """Presentation times of the frames, as time stamps in the file."""
         return list(self._times)
 
     def coded(self) -> Iterator[bytes]:
-        """The packets of the frames as they are stored, in coded order; the next picture that is read seeks."""
+        """Yield the frames' packets as stored, in coded order; the next image that is read requires a seek."""
         wanted = set(self._times)
         self._upcoming = None
         try:
@@ -166,12 +171,12 @@ class VideoFrames(ImageSequence):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width, as the stream says."""
+        """Height and width, as the stream declares them."""
         return self._stream.height, self._stream.width
 
     @property
     def is_deep(self) -> bool:
-        """True if it is depth, one number of more than 8 bits per point."""
+        """True for depth: one component of more than 8 bits."""
         given = self._stream.codec_context.format
         return given is not None and [part.bits > 8 for part in given.components] == [True]
 
@@ -222,7 +227,7 @@ class VideoFrames(ImageSequence):
             del self._kept[next(iter(self._kept))]
 
     def _reachable(self, index: int) -> bool:
-        """True if decoding on is the way: the frame lies ahead and no key frame lies between."""
+        """Return True if decoding can continue: the frame is ahead, without a key frame in between."""
         if self._upcoming is None or index < self._upcoming:
             return False
         return index == self._upcoming or self._key_before(index) <= self._times[self._upcoming]
@@ -245,7 +250,7 @@ class VideoFrames(ImageSequence):
 
 
 def stored_row(found: object) -> Mapping[str, Any] | None:
-    """What a row of an image column holds, as "bytes" and "path"; some write the bytes or the path alone."""
+    """Return a row of an image column as "bytes" and "path"; some writers store only the bytes or the path."""
     if isinstance(found, Mapping):
         return found
     if isinstance(found, bytes):
@@ -254,7 +259,7 @@ def stored_row(found: object) -> Mapping[str, Any] | None:
 
 
 def to_rgb(image: Image.Image) -> UInt8:
-    """An open picture as RGB uint8 [H, W, 3]; one of depth in shades of grey, its most distant point white."""
+    """Convert an open image to RGB uint8 [H, W, 3]; depth becomes grey, with its most distant point white."""
     depth = _depth(image)
     if depth is None:
         return np.array(image.convert("RGB"), dtype=np.uint8)
@@ -270,9 +275,9 @@ def _depth(image: Image.Image) -> NDArray[np.float64] | None:
 
 
 class StoredImages(ImageSequence):
-    """The pictures of an image column: coded as PNG, JPEG or TIFF in the rows, or in files that the rows name.
+    """Images of an image column: encoded as PNG, JPEG or TIFF in the rows, or in files that the rows name.
 
-    Depth is shown in shades of grey, the most distant of a picture white, what is not known (0) black.
+    Depth is shown in grey: the most distant point of an image is white, unknown (0) is black.
     """
 
     def __init__(self, name: str, rows: Sequence[object], root: Path) -> None:
@@ -292,22 +297,22 @@ class StoredImages(ImageSequence):
         return picture
 
     def size(self, index: int) -> tuple[int, int]:
-        """Height and width of picture `index`, as its header says; raises RecordingError."""
+        """Return height and width of image `index` from its header. Raises: RecordingError."""
         with self._opened(index) as image:
             return image.height, image.width
 
     def depth(self, index: int) -> NDArray[np.float64] | None:
-        """Picture `index` as float64 [H, W] where it is of more than 8 bits: shares of 65535, or floats as they are."""
+        """Return image `index` as float64 [H, W] if it is depth (shares of 65535, or floats), else None."""
         with self._opened(index) as image:
             return _depth(image)
 
     def is_missing(self, index: int) -> bool:
-        """True if nothing is stored of picture `index`."""
+        """Return True if nothing is stored for image `index`."""
         row = stored_row(self._rows[index])
         return row is None or (row.get("bytes") is None and not row.get("path"))
 
     def row(self, index: int) -> dict[str, Any] | None:
-        """Stored row of picture `index`, with a file of its own read in; None where nothing is stored."""
+        """Return the stored row of image `index`, with the content of its file; None if nothing is stored."""
         if self.is_missing(index):
             return None
         path = (stored_row(self._rows[index]) or {}).get("path")
@@ -340,4 +345,4 @@ class StoredImages(ImageSequence):
         return path.read_bytes()
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing: no file stays open."""

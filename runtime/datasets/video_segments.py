@@ -1,4 +1,4 @@
-"""Takes the video of one episode out of a file, as the same coded pictures where that is possible."""
+"""Extraction of one episode's video from a file, as the same encoded images if possible."""
 
 from __future__ import annotations
 
@@ -19,19 +19,22 @@ from runtime.datasets.video_frames import VideoFrames, VideoSegment
 if TYPE_CHECKING:
     import av
 
-TOLERANCE = 1e-4  # of LeRobot, between a row and its picture [s]
-ENCODING = {"crf": "18", "preset": "veryfast", "g": "2", "bf": "0"}  # x264, where pictures are coded again
+TOLERANCE = 1e-4  # LeRobot's tolerance between a row and its image [s]
+ENCODING = {"crf": "18", "preset": "veryfast", "g": "2", "bf": "0"}  # x264 options for images encoded anew
 
 
 class NotCopyableError(RecordingError):
-    """The coded pictures of the episode cannot be had without those of others."""
+    """The encoded images of the episode cannot be separated from those of other episodes."""
 
 
 def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
-    """Put the `frames` coded pictures of `span` into `target`, frame k at k / fps, index at the front.
+    """Copy the `frames` encoded images of `span` to `target`, frame k at k / fps, index at the front.
 
-    A file that is all of that already is copied as it is. Raises NotCopyableError where the first is no key frame or
-    other pictures lie between them in coded order, RecordingError where pictures are missing.
+    A file that has this form already is copied unchanged.
+
+    Raises:
+        NotCopyableError: The first image is no key frame, or images of other episodes lie between in coded order.
+        RecordingError: Images are missing, or too far from their rows in time.
     """
     stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
     with VideoFrames(span.path, stretch) as scan:
@@ -39,7 +42,7 @@ def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
     if len(times) < frames:
         raise RecordingError(f"{span.path} has {len(times)} frames for {frames} rows")
     off = np.abs(np.array(times[:frames]) - times[0] - np.arange(frames) / fps).max(initial=0.0)
-    if len(times) != frames and off > 0.5 / fps:  # as many pictures as rows are those of the rows
+    if len(times) != frames and off > 0.5 / fps:  # if the counts match, images belong to rows by number
         raise RecordingError(
             f"{span.path}: its pictures are up to {off:.2f} s off the rows, which come at {fps:g} Hz: "
             "make its video anew at that rate"
@@ -51,7 +54,11 @@ def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
 
 
 def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
-    """As `cut`, but with the pictures decoded and coded again as H.264: they lose a little."""
+    """Do as `copy_segment`, but decode the images and encode them as H.264, which loses a little quality.
+
+    Raises:
+        RecordingError: The images cannot be encoded, or are depth of more than 8 bits.
+    """
     import av
 
     stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
@@ -79,13 +86,13 @@ def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
 
 
 def extra_stream_kinds(path: Path) -> set[str]:
-    """Kinds of what a video file holds beside its pictures."""
+    """Return the types of the streams in a video file besides its images."""
     with open_video(path) as container:
         return {stream.type for stream in container.streams} - {"video"}
 
 
 def _is_ready(path: Path, frames: int, fps: float) -> bool:
-    """True if the whole file is what is wanted: these frames at these times, its index at the front."""
+    """Return True if the whole file has the wanted form: these frames at these times, its index at the front."""
     with VideoFrames(path) as whole:
         times = whole.times
     if len(times) != frames or np.abs(np.array(times) - np.arange(frames) / fps).max() > TOLERANCE:
@@ -95,7 +102,7 @@ def _is_ready(path: Path, frames: int, fps: float) -> bool:
 
 
 def _index_first(file: Any) -> bool:
-    """True if the box `moov` comes before `mdat`."""
+    """Return True if the box `moov` comes before `mdat`."""
     while len(head := file.read(8)) == 8:
         size, kind = int.from_bytes(head[:4], "big"), head[4:]
         if kind in (b"moov", b"mdat"):
@@ -119,7 +126,7 @@ def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
             av.open(str(target), "w", format="mp4", options={"movflags": "faststart"}) as container,
         ):
             packets = list(_coded(source, recorded, rank))
-            # Pictures are decoded as much earlier as the most belated of them in coded order wants.
+            # B-frames: decoding times precede presentation by the largest delay in coded order, so that dts <= pts.
             ahead = max(number - rank[packet.pts] for number, packet in enumerate(packets))
             copy = copied_stream(container, recorded.streams.video[0])
             copy.time_base = 1 / rate
@@ -133,7 +140,7 @@ def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
 
 
 def _coded(source: Path, recorded: av.container.InputContainer, rank: dict[int, int]) -> Iterator[Any]:
-    """The packets of the pictures in `rank` (their number by time stamp), in coded order."""
+    """Yield the packets of the images in `rank` (number by time stamp), in coded order."""
     first = min(rank, key=rank.__getitem__)
     stream = recorded.streams.video[0]
     recorded.seek(first, stream=stream)

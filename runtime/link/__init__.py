@@ -1,1 +1,1 @@
-"""A station on its own computer, linked to its lab: both ends of the link, and the keys of both."""
+"""Link between a station on its own computer and its lab: both ends, and the keys of both."""

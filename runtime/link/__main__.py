@@ -1,6 +1,6 @@
 """`python -m runtime.link STATION`: links a station of this computer to the lab at which it is enrolled.
 
-A family that is enrolled starts it by itself; beside a lockstep station it is started by hand.
+The processes of an enrolled station start it by themselves; for a lockstep station it is started by hand.
 """
 
 from __future__ import annotations
@@ -29,7 +29,11 @@ _LOOK_S = 0.2
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Link until a signal or the end of standard input; exit code 1 where a part of it failed, 2 without keys."""
+    """Run the link until a signal or the end of standard input.
+
+    Returns:
+        Exit code: 1 if a thread of the link failed, 2 if there are no usable keys.
+    """
     given = _parser().parse_args(arguments)
     logs.configure_logging("link")
     data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
@@ -46,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
-    """Link until `ended`; anew where the station is enrolled anew. Raises RuntimeFault without keys."""
+    """Run the link until `ended`; restart it after a new enrolment. Raises: RuntimeFault without usable keys."""
     while not ended():
         written = _written(data, station_dir)
         lab, key = known_lab(station_dir), station_key(data)
@@ -71,7 +75,7 @@ def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
 
 
 def _uploads() -> UploadSettings | None:
-    """How episodes travel; where that cannot be read they do not, and stops and commands go on."""
+    """Read the upload settings; None if they are invalid: then no episodes are sent, while stops and commands work."""
     try:
         return UploadSettings.read(os.environ)
     except ConfigurationError as error:
@@ -80,7 +84,7 @@ def _uploads() -> UploadSettings | None:
 
 
 def _written(data: Path, station_dir: Path) -> list[tuple[int, int]]:
-    """Which files the keys are in: others where they were replaced."""
+    """Return the identity of the key files, which changes when they are replaced."""
     found = [path.stat() for path in (known_lab_path(station_dir), key_path(data)) if path.exists()]
     return [(one.st_ino, one.st_mtime_ns) for one in found]
 

@@ -1,6 +1,6 @@
-"""Who may connect to a lab: the keys of its stations, and any key while a code for enrolment is open.
+"""Admission of connections to a lab: the keys of its stations, and any key while a code for enrolment is open.
 
-ZMQ asks it during the handshake (ZAP, RFC 27); a key that is refused there never gets a message in.
+ZMQ asks during the handshake (ZAP, RFC 27), so that no message of a refused key is ever received.
 """
 
 from __future__ import annotations
@@ -21,49 +21,49 @@ _POLL_MS = 200
 _KEY_BYTES = 32
 _FRAMES = 7
 _EVERY_S, _MOST_NAMES = 10.0, 64
-_REFUSED_S, _MOST_NOTED = 30.0, 1024  # whose connection broke a bound; and how many of such are kept in mind
-# Handshakes of one key. Every connection takes the next of 2^32 numbers at the port, and libzmq ends the process where
-# that is one that a peer has given itself: who may connect without end meets it within the hour.
+_REFUSED_S, _MOST_NOTED = 30.0, 1024  # refusal after a broken bound [s]; greatest number of names remembered
+# Handshakes of one key: burst, and rate [1/s]. Each connection gets the next of 2^32 routing numbers of the port, and
+# libzmq aborts if a peer has chosen that number for itself: unlimited connections would reach it within an hour.
 _AT_ONCE, _PER_S = 100.0, 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Keys of stations, in hexadecimal, with the names that each may use; whether unknown keys may enrol."""
+    """Keys of stations, hexadecimal, with the station names of each; whether unknown keys may enrol."""
 
     stations: Mapping[str, frozenset[str]] = field(default_factory=lambda: MappingProxyType({}))
     enrolling: bool = False
 
     def may_connect(self, key: str) -> bool:
-        """True if this key is let in: as a station, or to enrol and for nothing else."""
+        """Return True if the key is admitted: as a station, or only to enrol."""
         return self.enrolling or key in self.stations
 
     def may_be(self, key: str, station: str) -> bool:
-        """True if this key is that station's."""
+        """Return True if the key belongs to that station."""
         return station in self.stations.get(key, ())
 
     def names(self) -> set[str]:
-        """All stations that have a key."""
+        """Return the names of all stations that have a key."""
         return {name for names in self.stations.values() for name in names}
 
 
 class AllowList:
-    """What is allowed now; replaced as a whole, read from any thread. And who is not, for a while."""
+    """Present admissions, replaced as a whole and read from any thread, and temporary refusals."""
 
     def __init__(self, allowed: Allowed | None = None) -> None:
         self.now = allowed or Allowed()
-        # By keys of stations, and addresses of others:
-        self._refused: dict[str, float] = {}  # until when
-        self._spent: dict[str, tuple[float, float]] = {}  # handshakes that count still, and when that was
+        # By key for stations, by address for all others:
+        self._refused: dict[str, float] = {}  # end of the refusal
+        self._spent: dict[str, tuple[float, float]] = {}  # handshakes in the bucket, and when it was updated
         self._lock = threading.Lock()
 
     def refuse(self, name: str, now: float) -> None:
-        """Let that key, or unknown keys from that address, in no more for half a minute, as they were told."""
+        """Refuse a key, or unknown keys from an address, for `_REFUSED_S`."""
         with self._lock:
             _note(self._refused, name, now + _REFUSED_S)
 
     def refused(self, key: str, address: str, now: float) -> bool:
-        """True for a handshake of one that is refused for a while, or makes too many."""
+        """Record a handshake; return True if its key or address is refused or makes too many."""
         name = key if key in self.now.stations else address
         with self._lock:
             spent, at = self._spent.get(name, (0.0, now))
@@ -80,14 +80,14 @@ def _note(noted: dict[str, Any], name: str, value: Any) -> None:
 
 
 class Seldom:
-    """Of each name one line in ten seconds, and of no more than so many names: a flood is not to fill the log."""
+    """Log limiter: one line per name in ten seconds, of a bounded number of names, so that no flood fills the log."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._told: dict[str, float] = {}
 
     def due(self, name: str) -> bool:
-        """True if a line about it may be said now."""
+        """Return True if a line about that name may be logged now."""
         now = self._clock()
         self._told = {one: at for one, at in self._told.items() if now - at < _EVERY_S}
         if name in self._told or len(self._told) >= _MOST_NAMES:
@@ -97,7 +97,7 @@ class Seldom:
 
 
 class Admission:
-    """Answers ZMQ's question for some contexts, in a thread of its own."""
+    """Thread that answers the handshakes of some ZMQ contexts (ZAP)."""
 
     def __init__(
         self,
@@ -117,11 +117,11 @@ class Admission:
         self._thread = threading.Thread(target=self._work, name="admission", daemon=True)
 
     def start(self) -> None:
-        """Begin, before anything listens."""
+        """Start the thread; call it before a socket listens."""
         self._thread.start()
 
     def end(self) -> None:
-        """End it; nobody is let in any more."""
+        """Stop the thread; no further connection is admitted."""
         self._ended.set()
         self._thread.join()
         for socket in self._sockets:
@@ -136,7 +136,7 @@ class Admission:
                 socket.send_multipart(self.answer(socket.recv_multipart()))
 
     def answer(self, frames: list[bytes]) -> list[bytes]:
-        """What is said of a handshake: 200 with the key as its user, 300 for a while, or 400."""
+        """Return the ZAP reply: 200 with the key as user id, 300 if refused for a while, or 400."""
         if len(frames) != _FRAMES or frames[5] != b"CURVE" or len(frames[6]) != _KEY_BYTES:
             request = frames[1] if len(frames) > 1 else b""
             return [b"1.0", request, b"400", b"CURVE alone is spoken here", b"", b""]

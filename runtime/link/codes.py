@@ -1,7 +1,7 @@
-"""The one-time code with which a computer is enrolled: the lab's key, which it connects to, and a secret.
+"""One-time code for enrolment: the public key of the lab's gate, and a secret.
 
-With the whole key in it nothing has to be fetched from an address that nobody has verified: who answers there without
-that key cannot read what the station sends.
+The code contains the whole key, so nothing has to be fetched from an unverified address: a computer that answers there
+without the lab's secret key cannot read the station's messages.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ _GROUP = 8
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """The public key of the lab's gate, and the secret that is good once."""
+    """Public key of the lab's gate, and a secret that is valid once."""
 
     lab: bytes
     secret: bytes
 
     def text(self) -> str:
-        """As people copy it: nine groups of letters and digits."""
+        """Return the code as people copy it: nine groups of eight letters and digits."""
         whole = self.lab + self.secret
         letters = base64.b32encode(whole + _sum(whole)).decode()
         return "-".join(letters[at : at + _GROUP] for at in range(0, len(letters), _GROUP))
 
 
 def fresh(lab: bytes) -> Code:
-    """A new code of the lab with that public key."""
+    """Return a new code of the lab with that public key."""
     return Code(lab, secrets.token_bytes(SECRET_BYTES))
 
 
 def read(shown: str) -> Code:
-    """The code that was copied; ConfigurationError where something of it is missing or mistyped."""
+    """Parse a copied code. Raises: ConfigurationError if it is incomplete or mistyped."""
     letters = "".join(shown.split()).replace("-", "").upper()
     try:
         whole = base64.b32decode(letters)
@@ -54,13 +54,13 @@ def read(shown: str) -> Code:
 
 
 def fingerprint(key: bytes) -> str:
-    """A public key as two people compare it: four groups of five of the SHA-256's hexadecimal digits."""
+    """Return a public key as people compare it: four groups of five hexadecimal digits of its SHA-256."""
     digest = hashlib.sha256(key).hexdigest()
     return " ".join(digest[at : at + 5] for at in range(0, 20, 5))
 
 
 def digest(secret: bytes) -> str:
-    """What the lab keeps of the secret of a code."""
+    """Return the digest that the lab stores in place of the secret of a code."""
     return hashlib.sha256(b"eva-web enrolment 1\0" + secret).hexdigest()
 
 

@@ -1,6 +1,6 @@
-"""The list of an episode's files, with sizes and SHA-256: what travels, and by what it is known to be whole.
+"""List of an episode's files with sizes and SHA-256, which defines the content to send and when it is complete.
 
-Two folders with the same list have the same digest. Names that start with a dot are no files of an episode.
+Folders with the same list have the same digest. Files whose names start with a dot do not belong to an episode.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from runtime.core.errors import CodecError, RecordingError
 from runtime.recording.files import disk_error
 
 MANIFEST, OUTCOME = "manifest.json", "outcome.json"
-LARGEST_LIST = 1 << 20  # bytes of a list as it is sent
+LARGEST_LIST = 1 << 20  # bytes of a packed list
 MOST_FILES = 256
 LARGEST_EPISODE = 1 << 40  # bytes
 _LONGEST_NAME = 255  # bytes
 _DIGEST_CHARACTERS = frozenset("0123456789abcdef")
-_STEP = 4 << 20  # bytes that are read between two breaths
+_STEP = 4 << 20  # bytes read between two pauses
 
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """One file: its name, bytes, and SHA-256 in hexadecimal."""
+    """File of an episode: name, size [bytes], and SHA-256 in hexadecimal."""
 
     name: str
     size: int
@@ -38,28 +38,28 @@ class File:
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """All files of an episode, in the order of their names."""
+    """All files of an episode, sorted by name."""
 
     files: tuple[File, ...]
 
     @property
     def size(self) -> int:
-        """Bytes of all files."""
+        """Size of all files [bytes]."""
         return sum(file.size for file in self.files)
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the list, in hexadecimal."""
+        """SHA-256 of the packed list, in hexadecimal."""
         return hashlib.sha256(self.packed()).hexdigest()
 
     def packed(self) -> bytes:
-        """The list as it is sent: one way of writing for each list."""
+        """Return the list as it is sent: the same bytes for equal lists."""
         rows = [[file.name, file.size, file.sha256] for file in self.files]
         return json.dumps(rows, ensure_ascii=False, separators=(",", ":")).encode()
 
 
 def unpacked(sent: bytes) -> Contents:
-    """The list that was sent; CodecError names what cannot be an episode's."""
+    """Parse and check a list that was sent. Raises: CodecError, naming the entry that an episode cannot have."""
     try:
         rows = json.loads(sent) if len(sent) <= LARGEST_LIST else None
     except (ValueError, RecursionError):
@@ -79,7 +79,7 @@ def unpacked(sent: bytes) -> Contents:
 
 
 def is_episode(uuid: str) -> bool:
-    """True if it is a uuid as recorders write it, and so a name of a folder that is nothing else."""
+    """Return True if it is a uuid as recorders write it, which makes it safe as a folder name."""
     try:
         return str(UUID(uuid)) == uuid
     except ValueError:
@@ -87,7 +87,7 @@ def is_episode(uuid: str) -> bool:
 
 
 def contents_of(folder: Path) -> Contents:
-    """The list of a folder, every byte read; RecordingError where it cannot be."""
+    """Return the list of a folder, reading every byte. Raises: RecordingError."""
     reading = contents_in_steps(folder)
     while True:
         try:
@@ -98,7 +98,7 @@ def contents_of(folder: Path) -> Contents:
 
 
 def contents_in_steps(folder: Path) -> Generator[None, None, Contents]:
-    """As `contents_of`, with a pause after every few megabytes."""
+    """Do as `contents_of`, as a generator that pauses after every few megabytes."""
     files = []
     try:
         for path in sorted(folder.iterdir(), key=lambda path: path.name):
@@ -132,7 +132,7 @@ def _file(row: Any) -> File:
 
 
 def _may_name(name: Any) -> bool:
-    """True if it names a file in the very folder, and none that we keep there ourselves."""
+    """Return True if it names a visible file directly in the episode's folder."""
     if not isinstance(name, str) or not name or name.startswith(".") or "/" in name or "\0" in name:
         return False
     try:

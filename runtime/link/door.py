@@ -1,8 +1,8 @@
-"""A port of a lab: who has connected there, what they say, and how they are cut off.
+"""Listening port of a lab: its connections, their messages, and how they are cut off.
 
-Everything that a connection may use up is bounded here: messages of one turn, bytes of a second, the time that it may
-take to say who it is, and how many there are. What breaks a bound is cut off, its key refused for a while, and nothing
-else notices.
+Everything that a connection can use up is bounded here: messages per turn, bytes per second, the time until it
+identifies itself, and the number of connections. A connection that exceeds a bound is cut off and its key refused for
+a while; other connections are not affected.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from runtime.link.wire import MOST_PARTS, Beat, Bye, Message, read, write
 
 log = logging.getLogger(__name__)
 _EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_CLOSED | zmq.EVENT_DISCONNECTED
-_TURN = 200  # messages that are taken up in one turn
+_TURN = 200  # messages handled per turn
 _TURN_BYTES = 16 << 20
-_TURN_PARTS = 20_000  # some 20 ms, where a message is made of nothing but parts
-_QUEUED = 64  # messages of one connection, in each direction
+_TURN_PARTS = 20_000  # about 20 ms for messages of many empty parts
+_QUEUED = 64  # messages per connection and direction
 _HANDSHAKE_MS = 2000
-_NAMED_S = 5.0  # from connecting to the first word
-_SILENT_S = 5.0  # without a word from who was greeted
-_LAST_WORD_S = 0.3  # for a Bye to go out, before the connection is cut
+_NAMED_S = 5.0  # from connecting to the first message [s]
+_SILENT_S = 5.0  # silence of an identified connection [s]
+_LAST_WORD_S = 0.3  # for a Bye to be sent before the connection is closed [s]
 _LOOK_S, _WATCH_S = 1.0, 0.05
-_UNNAMED_BYTES = 16 << 10  # handshake and first message
-_MOST_MESSAGES = 2000  # of one connection in a second: some hundred are usual at the most
+_UNNAMED_BYTES = 16 << 10  # handshake and first message together
+_MOST_MESSAGES = 2000  # per connection and second; usual are at most some hundred
 _MOST_CONNECTIONS = 1024
 _BACKLOG = 256
-_BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
+_BYTES_RECEIVED = 128  # offset of tcpi_bytes_received in struct tcp_info
 _TCP_INFO_BYTES = 192
 Address = tuple[Any, ...]
 
 
 @dataclass(slots=True)
 class Peer:
-    """A connection: its descriptor in this process, the other end's address, and what is known of it."""
+    """Connection: its descriptor in this process, the other end's address, and its counters."""
 
     descriptor: int
     address: Address
@@ -57,8 +57,8 @@ class Peer:
     key: str = ""
     heard_at: float = 0.0
     received: int = 0
-    read: int = 0  # bytes that it had sent when it was last seen to have said something whole
-    messages: int = 0  # since somebody last looked
+    read: int = 0  # bytes received when its last complete message was noticed
+    messages: int = 0  # since the last call of `look`
     cut_at: float = float("inf")
 
     def __str__(self) -> str:
@@ -67,7 +67,7 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A message as it came: over which connection, with whose key."""
+    """Received message with its connection and the key of that connection."""
 
     route: bytes
     key: str
@@ -82,9 +82,9 @@ class _PeerIndex:
 
 
 class Door:
-    """One port. All of it belongs to one thread, which calls `arrivals` and `look`.
+    """Listening port. One thread uses it and calls `arrivals` and `look` regularly.
 
-    `rate` is how many bytes a second one connection may send, over any second.
+    `rate`: Bytes per second that one connection may send, measured over about one second.
     """
 
     def __init__(
@@ -102,8 +102,8 @@ class Door:
         self._known = _PeerIndex()
         self._seldom = Seldom(clock)
         self._looked = self._watched = clock()
-        self._parts: list[zmq.Frame] = []  # of a message that is not read to its end
-        self.gone: list[bytes] = []  # connections that have ended since somebody last looked
+        self._parts: list[zmq.Frame] = []  # parts of an incomplete message
+        self.gone: list[bytes] = []  # connections that have ended; the caller clears it
         self.socket = context.socket(zmq.ROUTER)
         self.socket.linger = 0
         self.socket.set(zmq.ROUTER_MANDATORY, 1)
@@ -111,8 +111,8 @@ class Door:
         self.socket.set(zmq.SNDHWM, _QUEUED)
         self.socket.set(zmq.MAXMSGSIZE, largest)
         self.socket.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
-        # No heartbeats of ZMQ's own: its library (4.3.5) aborts where one is due on a connection that broke while it
-        # was not read, as that of a flood does. Signs of life are ours, and `look` ends who gives none.
+        # No heartbeats of ZMQ: libzmq 4.3.5 aborts if one is due on a connection that broke while it was not read,
+        # which a flood causes. Our own messages are the signs of life; `look` ends silent connections.
         self.socket.set(zmq.BACKLOG, _BACKLOG)
         self.socket.set(zmq.IPV6, 1)
         self.socket.zap_domain = b"stations"
@@ -132,7 +132,7 @@ class Door:
         return int(bound.rpartition(":")[2])
 
     def arrivals(self) -> list[Arrival]:
-        """What has come, as much as a turn has time for; what cannot be read costs its sender the connection."""
+        """Return received messages, bounded per turn. A connection that sends an unreadable message is cut off."""
         self._hear_of_connections()
         found: list[Arrival] = []
         room, self._room = _TURN_BYTES, _TURN_PARTS
@@ -145,7 +145,7 @@ class Door:
         return found
 
     def _message(self) -> list[zmq.Frame]:
-        """The next one, [] where none is there to its end; of too many parts it has as many as show that."""
+        """Return the frames of the next complete message, [] if none; of too many parts only one more is kept."""
         with suppress(zmq.Again):
             while self._room:
                 self._room -= 1
@@ -158,7 +158,7 @@ class Door:
         return []
 
     def send(self, route: bytes, message: Message, *parts: bytes) -> bool:
-        """Send it, without waiting; False where the connection has gone, or takes no more."""
+        """Send a message without waiting; return False if the connection has ended or its queue is full."""
         try:
             self.socket.send_multipart([route, *write(message, *parts)], zmq.NOBLOCK)
         except zmq.ZMQError:  # EHOSTUNREACH, EAGAIN
@@ -166,17 +166,17 @@ class Door:
         return True
 
     def key_of(self, route: bytes) -> str:
-        """The key, in hexadecimal, with which that connection was made; "" where it has ended."""
+        """Return the key of a connection, hexadecimal; "" if it has ended."""
         peer = self._known.by_route.get(route)
         return peer.key if peer is not None else ""
 
     def address_of(self, route: bytes) -> str:
-        """The address, without its port, from which that connection came; "" where it has ended."""
+        """Return the remote address of a connection, without port; "" if it has ended."""
         peer = self._known.by_route.get(route)
         return str(peer.address[0]) if peer is not None else ""
 
     def cut(self, route: bytes, why: str, again_s: float = 30.0) -> None:
-        """Say why, and end the connection a moment later; nothing of it is heard any more."""
+        """Send the reason and close the connection a moment later; further messages of it are ignored."""
         peer = self._known.by_route.pop(route, None)
         if peer is None:
             return
@@ -187,7 +187,7 @@ class Door:
             log.warning("%s is cut off: %s", peer, why)
 
     def poll(self) -> None:
-        """Cut off who floods, says nothing, or is one too many; time and again."""
+        """Cut off connections that flood, are silent or exceed the number allowed. Call regularly."""
         now = self._clock()
         for peer in [one for one in self._known.by_descriptor.values() if now >= one.cut_at]:
             self._shut(peer)
@@ -213,7 +213,10 @@ class Door:
                 self._end(peer, "it says nothing")
 
     def _watch(self) -> None:
-        """Cut off who sends what has no end, and who is one too many: thousands come in a moment."""
+        """Cut off connections with an endless message, and surplus unidentified connections.
+
+        Runs every `_WATCH_S`, because thousands of connections can arrive within a moment.
+        """
         unnamed = [peer for peer in self._known.by_descriptor.values() if not peer.route]
         for peer in unnamed[: max(0, len(self._known.by_descriptor) - _MOST_CONNECTIONS)]:
             self._end(peer, f"there are more than {_MOST_CONNECTIONS} connections")
@@ -266,7 +269,7 @@ class Door:
         return Arrival(route, peer.key, message, parts)
 
     def _named(self, route: bytes, frame: zmq.Frame) -> Peer | None:
-        """Whose connection that is of which this is the first message; None where it has ended, or is cut off."""
+        """Return the peer whose first message this is; None if the connection has ended or was cut off."""
         try:
             descriptor, key = int(frame.get(zmq.SRCFD)), str(frame["User-Id"])
         except (zmq.ZMQError, KeyError, TypeError, ValueError):
@@ -274,11 +277,11 @@ class Door:
         peer = self._known.by_descriptor.get(descriptor)
         if (
             peer is None or peer.route
-        ):  # it came while this turn was reading, and may have the descriptor of another
+        ):  # connected during this turn, perhaps with the descriptor of an ended connection
             self._hear_of_connections()
             peer = self._known.by_descriptor.get(descriptor)
         if peer is None or peer.route == route or (peer.route and self._is_there(peer.route)):
-            return None  # cut off already, or ended, and what it had still sent
+            return None  # a message sent before the connection was cut off or ended
         if self._known.by_route.pop(peer.route, None) is not None:
             self.gone.append(peer.route)
         peer.route, peer.key = route, key
@@ -286,12 +289,15 @@ class Door:
         return peer
 
     def _is_there(self, route: bytes) -> bool:
-        """False for one that has ended: what it had sent was read after another connection had its descriptor."""
-        self.socket.get(zmq.EVENTS)  # so that ZMQ takes up what has ended
+        """Whether the connection still exists.
+
+        A message may be read only after its connection has ended and its descriptor has gone to another connection.
+        """
+        self.socket.get(zmq.EVENTS)  # makes ZMQ process ended connections
         return self.send(route, Beat())
 
     def _flood(self, peer: Peer, why: str) -> None:
-        """Cut it off, and let its key in no more for a while; which key that is its first message tells."""
+        """Cut the connection off and refuse its key, or its address if it is not a station's, for a while."""
         if peer.route in self._known.by_route:
             known = peer.key in self._allowed.now.stations
             self._allowed.refuse(peer.key if known else str(peer.address[0]), self._clock())
@@ -306,7 +312,7 @@ class Door:
                 log.warning("%s is cut off: %s", peer, why)
 
     def _shut(self, peer: Peer) -> None:
-        """Break the connection, which ZMQ then notices; never another one that has its descriptor by now."""
+        """Break the TCP connection, so that ZMQ notices; never a newer connection with the same descriptor."""
         self._known.by_descriptor.pop(peer.descriptor, None)
         with suppress(OSError), _same(peer.descriptor) as connection:
             if connection.getpeername() == peer.address:
@@ -314,7 +320,7 @@ class Door:
 
 
 def _address(descriptor: int) -> Address | None:
-    """The other end of a connection; None where it has ended."""
+    """Return the remote address of a connection; None if it has ended."""
     try:
         with _same(descriptor) as connection:
             address = connection.getpeername()
@@ -324,7 +330,7 @@ def _address(descriptor: int) -> Address | None:
 
 
 def _received(peer: Peer) -> int:
-    """Bytes that a connection has sent so far; what they were known to be where it has ended."""
+    """Return the bytes received over a connection so far; the last known number if it has ended."""
     try:
         with _same(peer.descriptor) as connection:
             if connection.getpeername() != peer.address:
@@ -339,9 +345,9 @@ def _received(peer: Peer) -> int:
 
 
 def _break(connection: sockets.socket) -> None:
-    """Reset it: to shut it down would leave what a flood has under way, and goes on to send, to be read.
+    """Reset the connection; a shutdown would leave the queued and still arriving bytes of a flood to be read.
 
-    That is a connect to no address, which Python does not offer (connect(2), AF_UNSPEC).
+    A reset is a connect to no address, which Python does not offer (connect(2), AF_UNSPEC).
     """
     nowhere = struct.pack("=H14x", sockets.AF_UNSPEC)
     if ctypes.CDLL(None).connect(connection.fileno(), nowhere, len(nowhere)) != 0:
@@ -349,7 +355,7 @@ def _break(connection: sockets.socket) -> None:
 
 
 def _same(descriptor: int) -> sockets.socket:
-    """A second descriptor of what that one is now; OSError where it is no socket."""
+    """Return a socket over a duplicate of the descriptor. Raises: OSError if it is not a socket."""
     copy = os.dup(descriptor)
     try:
         return sockets.socket(fileno=copy)

@@ -1,6 +1,6 @@
-"""Computers that want to be stations, at the lab's end: the database is asked in a thread, a few times in a minute.
+"""Enrolment at the lab's end: a thread asks the database, and the number of tries per minute is limited.
 
-So many for each address: who guesses keeps nobody elsewhere from enrolling.
+The limit counts per address, so that guessing does not keep computers elsewhere from enrolling.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from runtime.link.codes import digest
 from runtime.link.wire import Enrol, Enrolled
 
 log = logging.getLogger(__name__)
-_EACH, _ALL, _WITHIN_S = 10, 100, 60.0  # tries of one address and of all, in so many seconds
-_STALE_S = 5.0  # after which the computer that asked is not waiting any more: its code stays good
+_EACH, _ALL, _WITHIN_S = 10, 100, 60.0  # tries per address and in all, within so many seconds
+_STALE_S = 5.0  # [s] after which the computer no longer waits; its code then stays valid
 Enroller = Callable[[str, str, str], Enrolled | str]
-"""Asked with the digest of a code, a key in hexadecimal and the computer's name; says who it is now, or why not."""
+"""Called with the digest of a code, a key in hexadecimal and the computer's name; returns the result or the refusal."""
 
 
 class Enrolling:
-    """Tries to enrol, and what became of them; `ask` and `answers` belong to one thread, and never wait."""
+    """Tries to enrol and their results. One thread calls `ask` and `answers`; neither blocks."""
 
     def __init__(self, enrol: Enroller, clock: Callable[[], float] = time.monotonic) -> None:
         self._enrol, self._clock = enrol, clock
@@ -34,7 +34,7 @@ class Enrolling:
         threading.Thread(target=self._work, name="enrolment", daemon=True).start()
 
     def request(self, route: bytes, address: str, key: str, enrol: Enrol) -> str:
-        """Have it looked at; or why it is not."""
+        """Queue a try; return why it is refused, "" if it is queued."""
         now = self._clock()
         self._tries = [one for one in self._tries if now - one[0] < _WITHIN_S]
         if len(self._tries) >= _ALL or sum(one[1] == address for one in self._tries) >= _EACH:
@@ -47,7 +47,7 @@ class Enrolling:
         return ""
 
     def answers(self) -> list[tuple[bytes, Enrolled | str]]:
-        """What was found since."""
+        """Return the results since the last call, each with its connection."""
         found = []
         with suppress(Empty):
             while True:
@@ -55,7 +55,7 @@ class Enrolling:
         return found
 
     def end(self) -> None:
-        """Look at nothing more; a database that hangs keeps nobody waiting."""
+        """Stop the thread after the current query, without waiting for it: the database may hang."""
         self._ended = True
         with suppress(Full):
             self._asked.put_nowait(None)

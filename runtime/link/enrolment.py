@@ -1,4 +1,4 @@
-"""A robot's computer becomes a station of a lab: with its own key, and the code that the lab has shown."""
+"""Enrolment of a robot's computer as a station of a lab, with its own key and the code that the lab shows."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from runtime.link.release import version
 from runtime.link.wire import RELEASE, Bye, Enrol, Enrolled, read, write
 
 _POLL_MS = 100
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")  # of a station, which is a folder here
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")  # allowed name of a station, which becomes a folder
 _HEARD_S, _AGAIN_S = (
     2.0,
     0.3,
-)  # for which a lab may not have heard of a code that it has just shown; between two tries
+)  # [s] until the gate knows a code just shown; between two tries
 _NOT_OPEN = Bye("no code is open there: have the administration show a new one")
 
 
 def address_of(given: str) -> tuple[str, int]:
-    """Host and port of the lab; ConfigurationError."""
+    """Return host and port of the lab. Raises: ConfigurationError."""
     host, _, port = given.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ConfigurationError(
@@ -38,7 +38,17 @@ def address_of(given: str) -> tuple[str, int]:
 
 
 def enrol(data: Path, address: str, code: Code, key: KeyPair, timeout: float = 10.0) -> KnownLab:
-    """Ask the lab, and write down what it says; ConfigurationError for its refusal, TransportError where it is mute."""
+    """Enrol this computer with the lab at `address` and write the station's record of it.
+
+    Tries again for `_HEARD_S` if the lab does not know the code yet.
+
+    Args:
+        timeout: Longest wait for an answer [s], per try.
+
+    Raises:
+        ConfigurationError: The lab refuses, or the address or the name that it assigns is invalid.
+        TransportError: There is no readable answer.
+    """
     host, port = address_of(address)
     shown = f"[{host}]" if ":" in host else host
     context: zmq.Context[Any] = zmq.Context()
@@ -71,7 +81,7 @@ def _exchange(
     deadline = time.monotonic() + timeout
     try:
         while time.monotonic() < deadline:
-            over = bool(monitor.poll(0))  # looked at first: what was said before that can still be read
+            over = bool(monitor.poll(0))  # read before the socket: messages sent before the end still count
             if dealer.poll(0 if over else _POLL_MS):
                 message, _ = read(dealer.recv_multipart())
                 if isinstance(message, Enrolled | Bye):

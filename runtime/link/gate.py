@@ -1,7 +1,7 @@
-"""The lab's end of the link: to the programs of this computer every linked station looks like one that runs here.
+"""Lab's end of the link: makes linked stations look like local ones to the programs of this computer.
 
-One thread passes stops and commands: stops first, those of every station, then a few messages of each. Nothing in it
-waits for a database or for a station.
+One thread relays stops and commands: first the stops of all stations, then a few messages of each. It never waits for
+a database or a station.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ from runtime.link.wire import (
 )
 
 log = logging.getLogger(__name__)
-RATE = 8e6  # bytes a second that one connection may send
+RATE = 8e6  # greatest rate of one connection [bytes/s]
 _POLL_MS = 50
 _LOOK_S = 0.05
-_TRY_S = 2.0  # between two tries to have the folder of a station
-_MOST_PENDING = 64  # commands of one station that wait for their answers
+_TRY_S = 2.0  # between two tries to lock the folder of a station
+_MOST_PENDING = 64  # pending commands per station
 _PENDING_S = 30.0
-_HOPE_S = 0.8  # for which a press waits for a link that has just been lost, before its sender is told
-_HELD_S = 5.0  # after which a press that could not be passed on is none any more
+_HOPE_S = 0.8  # [s] that a press waits for a link just lost before its sender is answered
+_HELD_S = 5.0  # [s] after which a press that could not be sent is dropped
 _MOST_HELD = 64
 _LOST = "the link to its computer is lost: it goes on by its own rules"
 _NOT_RUNNING = "its computer is linked, and the station does not run there: start it"
 
 
 class Gate:
-    """The first port of a lab; all but `end` belongs to one thread, which calls `turn`."""
+    """First port of a lab. One thread uses it and calls `turn`; only `linked` is for any thread."""
 
     def __init__(
         self,
@@ -75,9 +75,19 @@ class Gate:
         clock: Callable[[], float] = time.monotonic,
         incoming: Incoming | None = None,
     ) -> None:
-        """`where`: the address to listen at, and its two ports; 0 takes a free one. Raises TransportError.
+        """Listen at both ports.
 
-        Without `incoming` the lab takes no episodes of stations elsewhere.
+        Args:
+            data: Data folder of the lab.
+            key: CURVE key pair of the lab.
+            tokens: Ed25519 secret with which commands are signed.
+            allowed: Keys that may connect.
+            enrol: Checks a code for enrolment.
+            where: Address to listen at, and its two ports; 0 chooses a free port.
+            incoming: Receiver of episodes; None: the lab accepts no episodes of stations elsewhere.
+
+        Raises:
+            TransportError: A port cannot be opened.
         """
         host, port, second_port = where
         self._stations = data / "stations"
@@ -98,7 +108,7 @@ class Gate:
         self._streams.start()
 
     def turn(self, wait_ms: int = _POLL_MS) -> None:
-        """Wait for somebody, and pass on what there is: stops before all else."""
+        """Wait for messages and pass them on, stops first. Raises: TransportError if the streams' thread has failed."""
         self._wait(wait_ms)
         if self._streams.failed:
             raise TransportError("streams of stations elsewhere have ended: see the log above")
@@ -107,7 +117,7 @@ class Gate:
         heard = {self._handle_safely(arrival) for arrival in self._door.arrivals()}
         for remote in [
             self._remotes[name] for name in heard if name
-        ]:  # once all is heard that has come meanwhile
+        ]:  # after all messages of this turn, so that each station is adjusted once
             self._adjust(remote)
         for remote in self._remotes.values():
             self._command(remote)
@@ -119,7 +129,7 @@ class Gate:
             self._poll(now)
 
     def close(self) -> None:
-        """End it: no station is linked any more."""
+        """Close the mirrors of all stations and both ports."""
         for remote in self._remotes.values():
             self._close(remote, "the lab's gate was ended")
         self._enrolling.end()
@@ -130,7 +140,7 @@ class Gate:
         self._streams.context.destroy(linger=0)
 
     def linked(self) -> set[str]:
-        """The stations that can be commanded now; from any thread."""
+        """Return the stations that can be commanded now; from any thread."""
         return {remote.name for remote in list(self._remotes.values()) if remote.up}
 
     def _wait(self, wait_ms: int) -> None:
@@ -146,10 +156,10 @@ class Gate:
                 poller.register(remote.mirror.commands.socket, zmq.POLLIN)
         poller.poll(wait_ms)
 
-    # --- what the lab's programs say ---------------------------------------------------------------------------
+    # --- from the lab's programs --------------------------------------------------------------------------------
 
     def _press(self, remote: Remote) -> None:
-        """Everything that has come at the socket for the e-stop."""
+        """Pass on all messages of the e-stop socket; hold presses for which there is no connection."""
         if (mirror := remote.mirror) is None:
             return
         presses, others = mirror.estop_turns.take_turn()
@@ -164,7 +174,7 @@ class Gate:
             self._pass_command(remote, (call, command), (GUARD, "estop"), mirror.estops)
 
     def _command(self, remote: Remote) -> None:
-        """Stops that have come at the socket for commands, and a few of the rest."""
+        """Pass on all stops of the command socket, and a bounded share of its other messages."""
         if remote.mirror is None or remote.mirror.command_turns is None or remote.mirror.commands is None:
             return
         server = remote.mirror.commands
@@ -173,7 +183,7 @@ class Gate:
             self._pass_command(remote, asked, (COORDINATOR, "commands"), server)
 
     def _pass_press(self, remote: Remote, held: PendingPress) -> bool:
-        """Send a press over whichever connection lives; False where none does."""
+        """Send a press over a live connection, that for stops first; return False if there is none."""
         now = self._clock()
         line = remote.line(STOPS, now) or remote.line(COMMANDS, now)
         if line is None or remote.mirror is None:
@@ -210,7 +220,14 @@ class Gate:
     def _send(
         self, remote: Remote, line: Line, place: tuple[str, str], said: tuple[bytes, bool], stops: bool
     ) -> int:
-        """Send what was `said`, with a token where its user is known; its number, 0 where it could not be sent."""
+        """Send a command, with a token if its user is verified.
+
+        Args:
+            said: Payload, and whether the web has signed it.
+
+        Returns:
+            Number of the request; 0 if it could not be sent.
+        """
         self._number += 1
         payload, verified = said
         ask = Ask(self._number, *place, stops=stops)
@@ -219,10 +236,10 @@ class Gate:
             ask = Ask(self._number, *place, stops, line.challenge, serial, signature)
         return self._number if self._door.send(line.route, ask, payload) else 0
 
-    # --- what stations say -------------------------------------------------------------------------------------
+    # --- from stations -----------------------------------------------------------------------------------------
 
     def _handle_safely(self, arrival: Arrival) -> str:
-        """As `_hear`; what nobody foresaw costs its sender the connection, and no other station its link."""
+        """Call `_hear`; after an unforeseen error cut off the sender, so that no other station is affected."""
         try:
             return self._handle(arrival)
         except Exception:
@@ -231,7 +248,7 @@ class Gate:
             return ""
 
     def _handle(self, arrival: Arrival) -> str:
-        """Take up what came; the name of the station that lives, "" where none is known by it."""
+        """Handle a message; return the name of the station that sent it, "" if it is not identified yet."""
         message = arrival.message
         known = self._by_route.get(arrival.route)
         if known is None:
@@ -275,7 +292,7 @@ class Gate:
             self._door.cut(arrival.route, remote.refusal, _TRY_S)
             return
         if why := apart(hello.release, hello.version, hello.station, lab_side=True):
-            if not remote.up:  # of a station that is linked another program says so
+            if not remote.up:  # while the station is linked, this is a second program
                 self._lower(remote, why)
             self._door.cut(arrival.route, why)
             return
@@ -284,7 +301,7 @@ class Gate:
             remote.session = hello.session
         elif (line := remote.lines.pop(hello.role, None)) is not None:
             self._drop_line(line, "another connection of this station has taken its place", 1.0)
-        self._adjust(remote)  # what was asked over a connection that went is not answered by the next
+        self._adjust(remote)  # answers of the old connection's requests never arrive on the new one
         remote.lines[hello.role] = Line(arrival.route, self._clock())
         self._by_route[arrival.route] = (hello.station, hello.role)
         self._door.send(arrival.route, Welcome(RELEASE, version()))
@@ -305,10 +322,10 @@ class Gate:
         self._door.send(route, told)
         log.info("%s is enrolled", answer.station)
 
-    # --- what changes ------------------------------------------------------------------------------------------
+    # --- changes -----------------------------------------------------------------------------------------------
 
     def _poll(self, now: float) -> None:
-        """Who is allowed, who lives, what waits too long."""
+        """Check admissions, connections, held presses and pending commands."""
         self._door.poll()
         names = self._allowed.now.names()
         for name in names:
@@ -329,13 +346,13 @@ class Gate:
                     remote.mirror.moved_streams(streams)
 
     def _find_remote(self, name: str) -> Remote | None:
-        """What is known of a station that is enrolled; None where it is not."""
+        """Return the record of an enrolled station, created if needed; None if it is not enrolled."""
         if name not in self._remotes and name in self._allowed.now.names():
             self._remotes[name] = Remote(name)
         return self._remotes.get(name)
 
     def _try(self, remote: Remote) -> None:
-        """Have what is still missing of the station here."""
+        """Create the station's mirror or streams if they are missing."""
         if remote.mirror is None:
             self._mirrored(remote)
         elif remote.name not in self._streams.places:
@@ -343,7 +360,7 @@ class Gate:
             self._streams.serve(remote.name, remote.mirror.station_dir)
 
     def _mirrored(self, remote: Remote) -> bool:
-        """Have the folder of the station; False where another process has it."""
+        """Create the station's mirror and publish its streams; return False, with `refusal` set, if that fails."""
         remote.tried_at = self._clock()
         try:
             remote.mirror = Mirror(self._context, self._stations / remote.name)
@@ -356,7 +373,7 @@ class Gate:
         return True
 
     def _adjust(self, remote: Remote) -> None:
-        """Show the station as linked, or as lost, where that has changed."""
+        """Publish the station as linked or lost if that has changed."""
         now = self._clock()
         lives = remote.line(STOPS, now) is not None and remote.line(COMMANDS, now) is not None
         streams = self._streams.places.get(remote.name)
@@ -387,7 +404,10 @@ class Gate:
             remote.held = [held for held in remote.held if not self._pass_press(remote, held)]
 
     def _hold(self, remote: Remote) -> None:
-        """Nobody knows of what was sent and not answered; a press is sent again where the link comes back in time."""
+        """Drop pending commands whose answers were lost with the link.
+
+        Presses among them are held instead, and are sent again if the link returns in time.
+        """
         for pending in remote.pending.values():
             if pending.press is not None:
                 pending.press.sent = True
@@ -395,15 +415,15 @@ class Gate:
         remote.pending.clear()
 
     def _lower(self, remote: Remote, why: str) -> None:
-        """Let the lab's programs know why the station cannot be commanded."""
+        """Publish why the station cannot be commanded."""
         if remote.told != why and remote.mirror is not None:
             remote.mirror.lower(why)
             self._log_once(remote, why)
 
     def _hold_on(self, remote: Remote, now: float) -> None:
-        """Tell who presses that the link is lost; what is too old is not pressed any more."""
+        """Answer senders of held presses when the link stays lost; drop presses older than `_HELD_S`."""
         for held in list(remote.held):
-            known = now - remote.lost_at > _HOPE_S  # it was lost before the press
+            known = now - remote.lost_at > _HOPE_S  # lost before the press
             if not held.told and (known or now - held.at > _HOPE_S):
                 self._give_up(remote, held)
             if now - held.at > _HELD_S:
@@ -415,7 +435,7 @@ class Gate:
             remote.mirror.estops.answer(held.call, _not_sent(remote, held.command, held.sent))
 
     def _lose(self, routes: list[bytes]) -> None:
-        """Connections have ended."""
+        """Remove connections that have ended."""
         for route in routes:
             known = self._by_route.pop(route, None)
             remote = self._remotes.get(known[0]) if known is not None else None
@@ -428,14 +448,14 @@ class Gate:
         routes.clear()
 
     def _leave_withdrawn(self, remote: Remote) -> None:
-        """Cut off connections whose key is not the station's any more."""
+        """Cut off connections whose key no longer belongs to the station."""
         for role, line in list(remote.lines.items()):
             if not self._allowed.now.may_be(self._door.key_of(line.route), remote.name):
                 del remote.lines[role]
                 self._drop_line(line, "the lab has withdrawn or replaced this station's key", 30.0)
 
     def _forget(self, remote: Remote) -> None:
-        """The station is not enrolled here any more."""
+        """Remove a station that is no longer enrolled."""
         self._leave_lines(remote, "the lab has withdrawn this station's key", 30.0)
         self._streams.leave(remote.name)
         self._close(remote, "the key of its computer was withdrawn")
@@ -460,14 +480,15 @@ class Gate:
     def _log_once(self, remote: Remote, what: str) -> None:
         if remote.told != what:
             remote.told = what
-            if self._seldom.due(
-                f"{remote.name}: {what}"
-            ):  # a computer may say the one and the other all the time
+            if self._seldom.due(f"{remote.name}: {what}"):  # a computer may alternate between two reasons
                 log.warning("%s: %s", remote.name, what)
 
 
 def _payload(mirror: Mirror, call: IncomingMessage, command: Command) -> tuple[bytes, bool]:
-    """The command as it is passed on, and whether the web has signed it: else only what was understood of it."""
+    """Return the payload to pass on, and whether the web has signed it.
+
+    An unsigned command is encoded anew, so that only its decoded fields reach the station.
+    """
     if call.signature and mirror.key.verifies(call.payload, call.signature):
         return call.payload, True
     return encode(command), False
@@ -486,7 +507,7 @@ def _not_sent(remote: Remote, command: Command, sent: bool = False) -> Ack:
 
 
 def _failed(remote: Remote, command: Command, reason: str) -> Ack:
-    """The answer in the station's place: a press that failed says what is left to do."""
+    """Return the answer in the station's place; that of a failed press demands the hardware stop."""
     if command.kind == "estop":
         return Ack(command.uuid, "failed", f"USE THE HARDWARE STOP: {reason}", data={"station": remote.name})
     return Ack(command.uuid, "failed" if command.kind in STOPPING else "refused", reason, kind=command.kind)

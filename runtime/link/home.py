@@ -1,7 +1,7 @@
-"""Episodes of one station on its own computer: which of them the lab lacks, which it has, which may go.
+"""Episodes of one station on its own computer: not yet sent, verified by the lab, and removable.
 
-DATA/uploads/STATION/UUID.json     the lab has compared it: with which digest, when, and what labels it has
-DATA/episodes/.leaving/UUID/       is being removed
+DATA/uploads/STATION/UUID.json     receipt: digest that the lab has verified, when, and the digest of its labels
+DATA/episodes/.leaving/UUID/       episode that is being removed
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)
 UPLOADS, LEAVING = "uploads", ".leaving"
-_LOOK_S, _LOOK_SHARE = 2.0, 50.0  # between two looks; and at least so many times as long as one took
+_LOOK_S, _LOOK_SHARE = 2.0, 50.0  # between two scans [s]; least ratio of pause to duration of a scan
 _DAY_S = 86400.0
 
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """What the lab has said of an episode; `verified` is when, Unix time [s]. Digests are SHA-256, hexadecimal."""
+    """The lab's confirmation of an episode; `verified` is the Unix time [s]. Digests: SHA-256, hexadecimal."""
 
     episode: str
-    lab: str  # its public key, in hexadecimal
+    lab: str  # public key of the lab, hexadecimal
     digest: str
     bytes: int
     verified: float
     labels: str = ""
-    removed: float | None = None  # when it was removed here
+    removed: float | None = None  # Unix time of its removal here [s]
 
 
 class Home:
-    """The disk of a station's computer, as far as one station's episodes go; all of it belongs to one thread.
+    """One station's episodes on the disk of its computer. One thread uses it.
 
-    `keep_days` is for how long they are kept here after the lab has compared them; None: for ever.
+    `keep_days`: Days that an episode stays here after the lab has verified it; None: forever.
     """
 
     def __init__(
@@ -65,26 +65,26 @@ class Home:
         )
         self._data, self._root = data, data / "episodes"
         self._receipts = {receipt.episode: receipt for receipt in self._read()}
-        self._closed: dict[str, float] = {}  # ours, that the lab lacks, and since when they are closed
-        self._others: set[str] = set()  # of other stations of this computer, or of none
+        self._closed: dict[str, float] = {}  # this station's episodes that the lab lacks: time of closing
+        self._others: set[str] = set()  # episodes of other stations of this computer, or of none
         self._put_off: dict[str, float] = {}
-        self._labels: dict[str, tuple[int, int]] = {}  # files that were looked into, as they were then
+        self._labels: dict[str, tuple[int, int]] = {}  # label files known to be at the lab: mtime and size
         self._look_at = -float("inf")
         self._finish_removing()
 
     def folder(self, episode: str) -> Path:
-        """Where an episode lies."""
+        """Return the folder of an episode."""
         return self._root / episode
 
     def next(self) -> str:
-        """The newest closed episode that the lab lacks and may be offered now, else one that may go; "" for none."""
+        """Return the newest closed episode that the lab lacks and may be offered, else a removable one; "" if none."""
         self._poll()
         now = self._clock()
         found = [uuid for uuid in self._closed if now >= self._put_off.get(uuid, now)]
         return max(found, key=self._closed.__getitem__) if found else self._removable(now)
 
     def next_labels(self) -> tuple[str, bytes] | None:
-        """Labels of an episode that the lab has, which it does not have as they are now."""
+        """Return uuid and lines of an episode at the lab whose labels have changed; None if there is none."""
         folder, now = self._data / LABELS, self._clock()
         try:
             files = list(os.scandir(folder))
@@ -104,7 +104,10 @@ class Home:
         return None
 
     def arrived(self, episode: str, contents: Contents) -> None:
-        """The lab has compared it. One that has been here long enough is removed; else a receipt is kept."""
+        """Record that the lab has verified the episode. Raises: RecordingError.
+
+        Writes a receipt; removes the episode instead if it was offered again because its retention time is over.
+        """
         known = self._receipts.get(episode)
         if known is not None and known.digest == contents.digest and self._over(known):
             self._remove(known)
@@ -114,14 +117,14 @@ class Home:
         self._closed.pop(episode, None)
 
     def labels_arrived(self, episode: str, lines: bytes) -> None:
-        """The lab has these labels."""
+        """Record that the lab has these labels."""
         self._store_receipt(replace(self._receipts[episode], labels=hashlib.sha256(lines).hexdigest()))
 
     def put_off(self, what: str, seconds: float) -> None:
-        """Do not offer the episode again before; nor the labels of one, as "labels UUID"."""
+        """Do not offer an episode, or labels named "labels UUID", for so many `seconds`."""
         self._put_off[what] = self._clock() + seconds
 
-    # --- what there is -------------------------------------------------------------------------------------------
+    # --- scan ---------------------------------------------------------------------------------------------------
 
     def _poll(self) -> None:
         now = self._clock()
@@ -130,7 +133,7 @@ class Home:
         try:
             names = [entry.name for entry in os.scandir(self._root) if is_episode(entry.name)]
         except OSError:
-            names = []  # nothing was recorded here yet
+            names = []  # nothing has been recorded here yet
         for name in names:
             if name not in self._receipts and name not in self._closed and name not in self._others:
                 self._sort_in(name)
@@ -139,7 +142,7 @@ class Home:
         self._look_at = self._clock() + max(_LOOK_S, _LOOK_SHARE * (self._clock() - now))
 
     def _sort_in(self, name: str) -> None:
-        """Its outcome is the last that a recorder writes: an episode without is open, or was left so."""
+        """Classify a new folder. The recorder writes the outcome last: an episode without it is not closed."""
         try:
             closed = (self._root / name / OUTCOME).stat().st_mtime
         except OSError:
@@ -157,7 +160,7 @@ class Home:
     # --- receipts ------------------------------------------------------------------------------------------------
 
     def _read(self) -> list[Receipt]:
-        """Those of this lab: another one has nothing of it yet."""
+        """Read the receipts of this lab. Those of another lab do not count: this one lacks the episodes."""
         found = []
         for path in (self._data / UPLOADS / self._station).glob("*.json"):
             try:
@@ -181,24 +184,27 @@ class Home:
     # --- retention -----------------------------------------------------------------------------------------------
 
     def _over(self, receipt: Receipt) -> bool:
-        """True if it has been kept for long enough."""
+        """Return True if the retention time of an episode that is still here is over."""
         if self._keep_days is None or receipt.removed is not None:
             return False
         return self._wall() - receipt.verified >= self._keep_days * _DAY_S
 
     def _removable(self, now: float) -> str:
-        """One that may go: it is offered once more before, so that the lab compares what it has then."""
+        """Return an episode whose retention time is over, "" if there is none.
+
+        It is offered once more before its removal, so that the lab verifies the copy that it has now.
+        """
         if self._keep_days is None:
             return ""
         for uuid, receipt in self._receipts.items():
             if self._over(receipt) and now >= self._put_off.get(uuid, now):
                 if self.folder(uuid).is_dir():
                     return uuid
-                self._store_receipt(replace(receipt, removed=self._wall()))  # somebody else has
+                self._store_receipt(replace(receipt, removed=self._wall()))  # another program has removed it
         return ""
 
     def _remove(self, receipt: Receipt) -> None:
-        """At once for all who look: nothing ever finds a part of it."""
+        """Remove an episode. It is renamed first, so that readers find all of it or nothing."""
         folder, leaving = self.folder(receipt.episode), self._root / LEAVING / receipt.episode
         try:
             leaving.parent.mkdir(exist_ok=True)
@@ -211,7 +217,7 @@ class Home:
         log.info("episode %s is removed here: the lab has it", receipt.episode)
 
     def _finish_removing(self) -> None:
-        """What a kill has left of folders that were being removed."""
+        """Finish removals that a crash interrupted."""
         for folder in (self._root / LEAVING).glob("*"):
             if folder.name in self._receipts:
                 shutil.rmtree(folder, ignore_errors=True)

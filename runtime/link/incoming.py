@@ -1,11 +1,11 @@
-"""Episodes of stations elsewhere on their way to the lab's disk: asked for bit by bit, compared, then there at once.
+"""Episodes of stations elsewhere on their way to the lab's disk: requested in pieces, verified, published at once.
 
-DATA/episodes/.arriving/STATION/UUID/   what is here of one; beside it UUID.json, its list, and UUID.declined, why not
-DATA/episodes/UUID/                     all of it, once every file is what the list says: by one rename
-DATA/arrivals/UUID                      arrived, or its labels have, and the worker has not made rows of it yet
+DATA/episodes/.arriving/STATION/UUID/   part that has arrived; UUID.json: its list, UUID.declined: why it was declined
+DATA/episodes/UUID/                     complete episode: moved here by one rename after every file was verified
+DATA/arrivals/UUID                      episode or labels that have arrived and have no rows in the database yet
 
-Each station has a thread of its own, which gives way to all others: what one sends, or is compared of one, delays no
-other, and no picture. Of a cut or a kill, at whichever byte, the files here are as long as they got.
+Each station has a thread of its own with the lowest priority: its transfers and hashing delay neither other stations
+nor pictures. After a lost connection or a kill, at any byte, the transfer continues from the length of the files.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ from runtime.recording.files import disk_error, read_json, write_atomic
 from runtime.recording.labels import FOLDER as LABELS
 
 log = logging.getLogger(__name__)
-RESERVE = 5 << 30  # bytes of the disk that stay free for everything else
+RESERVE = 5 << 30  # free space of the disk that episodes may not use [bytes]
 LARGEST_LABELS = 1 << 20  # bytes
 ARRIVING, ARRIVALS = ".arriving", "arrivals"
-_WINDOW = 8  # pieces under way
-_MOST_BEGUN = 3  # episodes of one station that are here in part
-_MOST_DECLINED = 64  # of one station that pages say something of
-_MOST_TRIES = 3  # of a file that is not what the list says
-_SOON_S, _LATER_S, _NEVER_S = 60.0, 600.0, 86400.0  # until the station may offer it again
+_WINDOW = 8  # pieces requested at once
+_MOST_BEGUN = 3  # partial episodes per station
+_MOST_DECLINED = 64  # refusals per station that are stored for the pages
+_MOST_TRIES = 3  # per file whose content differs from the list
+_SOON_S, _LATER_S, _NEVER_S = 60.0, 600.0, 86400.0  # [s], until the station may offer it again
 Owner = Callable[[str], str]
-"""Asked with an episode's uuid; the name of the station that it is known to be of, "" for none. OSError: not now."""
+"""Called with an episode's uuid; returns its station's name, "" if unknown. Raises: OSError if the lookup fails."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What is here of an episode that is on its way [bytes]; why it is not, where the lab has declined it."""
+    """Bytes of an episode that have arrived, and its size; `why`: reason if the lab has declined it."""
 
     here: int
     size: int
@@ -54,7 +54,7 @@ class Progress:
 
 
 def progress_of(data: Path, station: str, uuid: str) -> Progress | None:
-    """How far an episode of that station has come; None where it was never offered, or has arrived."""
+    """Return the progress of an episode of that station; None if it was never offered or has arrived."""
     begun = data / "episodes" / ARRIVING / station
     try:
         why = _temporary_path(begun, uuid, "declined").read_text("utf-8")
@@ -69,7 +69,7 @@ def progress_of(data: Path, station: str, uuid: str) -> Progress | None:
 
 
 def arrivals(data: Path) -> list[tuple[str, Path]]:
-    """Episodes that have arrived, or their labels, since somebody last took them in: uuid, and what to remove then."""
+    """Return uuid and mark of episodes that have arrived, or whose labels have; remove the mark after ingesting."""
     folder = data / ARRIVALS
     try:
         return [(path.name, path) for path in sorted(folder.iterdir()) if is_episode(path.name)]
@@ -78,7 +78,10 @@ def arrivals(data: Path) -> list[tuple[str, Path]]:
 
 
 class Incoming:
-    """All stations' desks. `hear` and `left` are for one thread, which `wake` tells to ask for `answers`."""
+    """Receiver of the episodes of all stations. One thread calls `hear` and `left`.
+
+    The event descriptor `wake` becomes readable when `answers` has messages to send.
+    """
 
     def __init__(self, data: Path, owner: Owner, reserve: int = RESERVE) -> None:
         self._data, self._owner, self._reserve = data, owner, reserve
@@ -87,18 +90,18 @@ class Incoming:
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def handle(self, station: str, route: bytes, message: Message, part: bytes) -> None:
-        """A message about an episode has come from the station."""
+        """Queue a station's message about an episode for its thread."""
         if station not in self._desks:
             self._desks[station] = _Desk(Shelf(self._data, station, self._owner, self._reserve), self._send)
         self._desks[station].put(route, message, part)
 
     def left(self, station: str, route: bytes) -> None:
-        """That connection of the station has ended: what it was asked for does not come any more."""
+        """Record that a connection has ended: the pieces requested over it do not arrive any more."""
         if station in self._desks:
             self._desks[station].put(route, None, b"")
 
     def answers(self) -> list[tuple[bytes, Message]]:
-        """What is to be sent since the last time, each over its connection."""
+        """Return the messages to send since the last call, each with its connection."""
         with suppress(BlockingIOError):
             os.eventfd_read(self.wake)
         found = []
@@ -108,7 +111,7 @@ class Incoming:
         return found
 
     def end(self) -> None:
-        """End all desks after what they are at."""
+        """Stop all threads after their current messages."""
         for desk in self._desks.values():
             desk.end()
         os.close(self.wake)
@@ -119,7 +122,7 @@ class Incoming:
 
 
 class _Desk:
-    """The thread of one station."""
+    """Thread that handles the episodes of one station."""
 
     def __init__(self, shelf: Shelf, say: Callable[[bytes, Message], None]) -> None:
         self._shelf, self._say = shelf, say
@@ -160,14 +163,14 @@ class _Desk:
 
 @dataclass(slots=True)
 class _Begun:
-    """The episode that is on its way, which file of it, and what was asked for of that."""
+    """Episode that is being received: its current file, and the pieces requested of it."""
 
     episode: str
     contents: Contents
     folder: Path
     number: int = 0
     descriptor: int = -1
-    next: int = 0  # the first byte of the file that was not asked for
+    next: int = 0  # first byte of the file that has not been requested
     asked: deque[Want] = field(default_factory=deque)
     tries: int = 0
 
@@ -186,7 +189,7 @@ class _Begun:
 
 
 class _Unwanted(Exception):
-    """The episode is not taken: why, and after how long it may be offered again."""
+    """The episode is declined; `again_s`: pause before the station may offer it again [s]."""
 
     def __init__(self, why: str, again_s: float) -> None:
         super().__init__(why)
@@ -194,7 +197,7 @@ class _Unwanted(Exception):
 
 
 class Shelf:
-    """What one station has sent, on the disk; all of it belongs to one thread."""
+    """Disk storage for the episodes that one station sends. One thread uses it."""
 
     def __init__(self, data: Path, station: str, owner: Owner, reserve: int = RESERVE) -> None:
         self.station = station
@@ -204,7 +207,7 @@ class Shelf:
         self._begun: _Begun | None = None
 
     def handle(self, message: Message, part: bytes) -> Iterator[Message]:
-        """The answers to a message of the station."""
+        """Handle a message of the station; yield the answers."""
         episode = getattr(message, "episode", "")
         try:
             if isinstance(message, Offer):
@@ -223,7 +226,7 @@ class Shelf:
             yield self._declined(episode, str(disk_error("writing", self._root, error)), _SOON_S)
 
     def drop(self) -> None:
-        """What is under way does not come any more; what is here of it stays, to go on from."""
+        """Stop receiving the current episode; its files stay, to be continued later."""
         if self._begun is not None:
             self._begun.close()
         self._begun = None
@@ -249,7 +252,7 @@ class Shelf:
     def _piece(self, piece: Piece, data: bytes) -> Iterator[Message]:
         begun = self._begun
         if begun is None or begun.episode != piece.episode:
-            return  # it was under way when the episode was declined
+            return  # sent before the station learned that the episode is declined
         want = begun.asked.popleft() if begun.asked else None
         if want is None or (piece.file, piece.offset) != (want.file, want.offset):
             self.drop()
@@ -269,7 +272,7 @@ class Shelf:
         yield from self._go_on(begun)
 
     def _go_on(self, begun: _Begun) -> Iterator[Message]:
-        """Ask for what is missing of the file; where nothing is, compare it and go on with the next."""
+        """Request the missing bytes of the current file; if there are none, verify it and continue with the next."""
         while begun.number < len(begun.contents.files):
             file = begun.file
             if begun.descriptor < 0:
@@ -286,7 +289,7 @@ class Shelf:
         yield self._finish(begun)
 
     def _compare(self, begun: _Begun, file: File) -> None:
-        """Read back what is on the disk; a file that is another one is sent anew, three times at the most."""
+        """Verify a file by reading it back from the disk; a wrong one is sent again, `_MOST_TRIES` times in all."""
         os.fsync(begun.descriptor)
         begun.close()
         if _sha256(begun.path) == file.sha256:
@@ -317,7 +320,7 @@ class Shelf:
         return self._arrived(begun.episode, begun.contents)
 
     def _answer_existing(self, episode: str, contents: Contents) -> Message:
-        """An episode that is here: the same, or another one, which stays as it is."""
+        """Answer for an episode that the lab has already; one with other content is declined and not overwritten."""
         here = contents_of(self._episodes / episode)
         if here != contents:
             other = [file.name for file in contents.files if file not in here.files]
@@ -334,7 +337,7 @@ class Shelf:
         log.info("%s: episode %s has arrived, %d bytes", self.station, episode, contents.size)
         return Arrived(episode, contents.digest)
 
-    # --- what is required ----------------------------------------------------------------------------------------
+    # --- requirements --------------------------------------------------------------------------------------------
 
     def _require_own(self, episode: str) -> None:
         try:
@@ -345,7 +348,7 @@ class Shelf:
             raise _Unwanted(f"episode {episode} is of another station of this lab", _NEVER_S)
 
     def _require_named(self, begun: _Begun) -> None:
-        """The episode's own manifest says what it was offered as: one that does not is thrown away."""
+        """Check that the manifest names this episode and station; delete the files otherwise."""
         try:
             manifest = read_json(begun.folder / MANIFEST)
         except RecordingError as error:
@@ -365,15 +368,18 @@ class Shelf:
                 _SOON_S,
             )
 
-    # --- what lies there -----------------------------------------------------------------------------------------
+    # --- files ---------------------------------------------------------------------------------------------------
 
     def _staging(self, episode: str, contents: Contents) -> Path:
-        """The folder of what is here of it, without anything that is of no use; others make room for it."""
+        """Return the folder of the partial episode, without files that are not in its list.
+
+        The oldest partial episodes beyond `_MOST_BEGUN` are deleted.
+        """
         folder, known = self._root / episode, _temporary_path(self._root, episode, "json")
         sent = contents.packed()
         if (
             not known.exists() or known.read_bytes() != sent
-        ):  # another one of the same name was offered before
+        ):  # different content was offered under this uuid before
             self._forget(episode)
         folder.mkdir(parents=True, exist_ok=True)
         for path in folder.iterdir():
@@ -386,7 +392,7 @@ class Shelf:
         return folder
 
     def _forget(self, episode: str) -> None:
-        """Remove what is here of it in part, and what is said of it."""
+        """Delete the partial files of an episode, its list and its refusal."""
         shutil.rmtree(self._root / episode, ignore_errors=True)
         for kind in ("json", "declined"):
             _temporary_path(self._root, episode, kind).unlink(missing_ok=True)
@@ -394,7 +400,7 @@ class Shelf:
     def _declined(self, episode: str, why: str, again_s: float) -> Declined:
         log.warning("%s: episode %.40r is not taken: %s", self.station, episode, why)
         if is_episode(episode):
-            with suppress(OSError, RecordingError):  # a disk that is full: the station is told all the same
+            with suppress(OSError, RecordingError):  # full disk: the station is answered all the same
                 self._root.mkdir(parents=True, exist_ok=True)
                 write_atomic(_temporary_path(self._root, episode, "declined"), why.encode())
                 for path in sorted(self._root.glob("*.declined"), key=_changed)[:-_MOST_DECLINED]:
@@ -402,7 +408,7 @@ class Shelf:
         return Declined(episode, why[:500], again_s)
 
     def _request_reconcile(self, episode: str) -> None:
-        """Have the worker make rows of it."""
+        """Mark the episode for the worker that writes its rows."""
         folder = self._data / ARRIVALS
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / episode, self.station.encode())
@@ -410,7 +416,7 @@ class Shelf:
     # --- labels --------------------------------------------------------------------------------------------------
 
     def _labelled(self, episode: str, lines: bytes) -> Message:
-        """Keep the lines: all that are here are their beginning, or nothing is changed."""
+        """Store label lines if they extend those that are here; otherwise decline them and change nothing."""
         if not is_episode(episode) or len(lines) > LARGEST_LABELS:
             raise _Unwanted(
                 f"{len(lines)} bytes of labels; allowed: {LARGEST_LABELS}, of an episode", _NEVER_S
@@ -441,7 +447,7 @@ def _sha256(path: Path) -> str:
 
 
 def _opened(path: Path, size: int) -> tuple[int, int]:
-    """A descriptor to write with, and how many bytes are there; a file that is longer than it may be begins anew."""
+    """Open a file for writing; return descriptor and present size. A file longer than `size` starts anew."""
     if path.is_symlink() or _size(path) > size:
         path.unlink()
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)

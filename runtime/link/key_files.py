@@ -1,9 +1,9 @@
-"""Keys of both ends as files that this account alone can read, and what a station knows of its lab.
+"""Keys of both ends in files that only this account can read, and a station's record of its lab.
 
-DATA/link/station.key       of a robot's computer, for all its stations
-DATA/link/lab.key           of a lab: to which stations connect
-DATA/link/tokens.key        of a lab: with which it signs commands
-DATA/stations/NAME/lab.json of a station that is enrolled: where its lab is, and its public keys
+DATA/link/station.key       key of a robot's computer, for all its stations
+DATA/link/lab.key           key of a lab, which authenticates it to stations
+DATA/link/tokens.key        key with which a lab signs commands
+DATA/stations/NAME/lab.json an enrolled station's record of its lab: address and public keys
 """
 
 from __future__ import annotations
@@ -31,49 +31,49 @@ _STATION, _LAB, _TOKENS = "station.key", "lab.key", "tokens.key"
 
 @dataclass(frozen=True, slots=True)
 class KeyPair:
-    """A pair of CURVE keys, 32 bytes each."""
+    """Pair of CURVE keys, 32 bytes each."""
 
     public: bytes
     secret: bytes
 
     @classmethod
     def from_secret(cls, secret: bytes) -> KeyPair:
-        """The pair of a secret key."""
+        """Return the pair that belongs to a secret key."""
         public = zmq.curve_public(z85(secret))
         return cls(zmq.utils.z85.decode(public), secret)
 
 
 @dataclass(frozen=True, slots=True)
 class KnownLab:
-    """What a station knows of its lab: where it is, and by what it knows that it is the lab."""
+    """A station's record of its lab: its address, and the public keys that authenticate it."""
 
     station: str
-    lab: str  # its name, as people know it
+    lab: str  # name that people use
     host: str
     port: int
     second_port: int
-    key: str  # of CURVE, hexadecimal
-    tokens: str  # of Ed25519, hexadecimal
+    key: str  # CURVE public key, hexadecimal
+    tokens: str  # Ed25519 public key, hexadecimal
 
 
 def z85(key: bytes) -> bytes:
-    """A key of 32 bytes as ZMQ wants it."""
+    """Encode a key of 32 bytes for ZMQ."""
     encoded: bytes = zmq.utils.z85.encode(key)
     return encoded
 
 
 def folder(data: Path) -> Path:
-    """The folder of keys in a data folder."""
+    """Return the folder of keys in a data folder."""
     return data / "link"
 
 
 def key_path(data: Path) -> Path:
-    """The file of this computer's key."""
+    """Return the path of this computer's key."""
     return folder(data) / _STATION
 
 
 def station_key(data: Path) -> KeyPair:
-    """The pair of this computer; ConfigurationError where it has none, or others can read it."""
+    """Return this computer's key pair. Raises: ConfigurationError if it has none or others can read it."""
     path = key_path(data)
     if not path.exists():
         raise ConfigurationError(f"{path} is not there: make it with python -m runtime.keys new")
@@ -81,7 +81,7 @@ def station_key(data: Path) -> KeyPair:
 
 
 def make_station_key(data: Path, replace: bool = False) -> KeyPair:
-    """A new pair for this computer; ConfigurationError where it has one, unless that is to be replaced."""
+    """Create a key pair for this computer. Raises: ConfigurationError if it has one and not `replace`."""
     path = key_path(data)
     if path.exists() and not replace:
         raise ConfigurationError(
@@ -94,29 +94,29 @@ def make_station_key(data: Path, replace: bool = False) -> KeyPair:
 
 
 def lab_key(data: Path) -> KeyPair:
-    """The pair of this lab's gate, made where there is none."""
+    """Return the key pair of this lab's gate; create it on first use."""
     return KeyPair.from_secret(
         _load_or_create(folder(data) / _LAB, zmq.utils.z85.decode(zmq.curve_keypair()[1]))
     )
 
 
 def tokens_key(data: Path) -> bytes:
-    """The secret with which this lab signs commands, made where there is none: the 32 bytes of an Ed25519 key."""
+    """Return the Ed25519 secret, 32 bytes, with which this lab signs commands; create it on first use."""
     return _load_or_create(folder(data) / _TOKENS, secrets.token_bytes(_KEY_BYTES))
 
 
 def known_lab_path(station_dir: Path) -> Path:
-    """The file that a station has where it is enrolled."""
+    """Return the path of the file that an enrolled station has."""
     return station_dir / "lab.json"
 
 
 def save_lab(station_dir: Path, lab: KnownLab) -> None:
-    """Write down what the station knows of its lab from now on."""
+    """Write the station's record of its lab."""
     _write(known_lab_path(station_dir), json.dumps(asdict(lab), indent=1).encode())
 
 
 def known_lab(station_dir: Path) -> KnownLab:
-    """What the station knows of its lab; ConfigurationError where it is not enrolled, or its file is of no use."""
+    """Read the station's record of its lab. Raises: ConfigurationError if it is not enrolled or the file is invalid."""
     path = known_lab_path(station_dir)
     try:
         found = json.loads(path.read_text("utf-8"))
@@ -145,7 +145,7 @@ _LAB_FIELDS: dict[str, Any] = {
 
 
 def _read(path: Path) -> bytes:
-    """A key of 32 bytes; ConfigurationError where others can read it, or it is something else."""
+    """Read a key of 32 bytes. Raises: ConfigurationError if others can read the file or it is not a key."""
     try:
         found = os.stat(path, follow_symlinks=False)
         if not stat.S_ISREG(found.st_mode) or found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
@@ -166,7 +166,10 @@ def _read(path: Path) -> bytes:
 
 
 def _load_or_create(path: Path, secret: bytes) -> bytes:
-    """The key in that file, which is `secret` where there was none; nobody ever sees a part of it."""
+    """Return the key in the file, which becomes `secret` if there was none.
+
+    The complete draft is linked into place: a concurrent reader never reads part of a key, and the first writer wins.
+    """
     if not path.exists():
         _write(path, secret, create_durably)
     return _read(path)

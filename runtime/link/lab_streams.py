@@ -1,7 +1,7 @@
-"""Streams of linked stations at the lab: published as each would publish them itself, asked for while anybody looks.
+"""Streams of linked stations at the lab: published as a station publishes them, requested while there are subscribers.
 
-The second port, in a thread and a ZMQ context of its own: pictures delay no command. A station sends as many bundles as
-it has credit for; it gets a credit back when one has been passed on. Episodes come here too, for `incoming.py`.
+The second port has its own thread and ZMQ context, so that pictures delay no command. A station sends as many bundles
+as it has credit for; each bundle passed on renews its credit. Episodes arrive here too, for `incoming.py`.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ from runtime.link.wire import (
 )
 
 log = logging.getLogger(__name__)
-RATE = 64e6  # bytes a second that one connection may send
+RATE = 64e6  # greatest rate of one connection [bytes/s]
 _POLL_MS = 50
-_WINDOW = {STATE: 4, PICTURES: 2}  # bundles under way
-_SLACK = 16  # bundles beyond the credit, after which a connection is cut off: our own arithmetic may be late
+_WINDOW = {STATE: 4, PICTURES: 2}  # bundles in transit
+_SLACK = 16  # bundles tolerated beyond the credit, because our count may lag behind the station's
 _NAMES = {STATE: re.compile(r"[a-z_]{1,40}"), PICTURES: re.compile(r"camera/[A-Za-z0-9_.-]{1,80}")}
 _MOST_TOPICS = 32
-_MOST_OFFERED = 4  # episodes and labels of one station that wait for an answer
-_SOON_S = 0.5  # after which a station tries again that the first port may not have let in yet
+_MOST_OFFERED = 4  # unanswered offers of episodes and labels per station
+_SOON_S = 0.5  # [s], until a station tries again that the first port may not have admitted yet
 
 
 @dataclass(slots=True)
 class _Flow:
-    """One socket of one station, and the connection that feeds it; "" where none does."""
+    """Stream socket of one station, and the connection that feeds it; `route` is b"" if there is none."""
 
     published: Publisher
     role: str
@@ -68,24 +68,24 @@ class _Flow:
 
 @dataclass(slots=True)
 class _Sender:
-    """A connection over which a station sends episodes: which pieces it was asked for, and offers not yet answered."""
+    """Connection over which a station sends episodes, with counts of pieces requested and offers unanswered."""
 
     station: str
     asked: int = 0
     offered: int = 0
 
     def may_send(self, message: Offer | Labels | Piece) -> bool:
-        """Count the message; False where there are more of its kind than a station sends that keeps to its part."""
+        """Count the message; return False if the station sends more of its kind than the protocol allows."""
         if isinstance(message, Piece):
             self.asked -= 1
             return self.asked >= 0
-        self.asked = 0  # those that were asked for before do not come any more
+        self.asked = 0  # pieces requested before an offer do not arrive any more
         self.offered += 1
         return self.offered <= _MOST_OFFERED
 
 
 class LabStreams:
-    """The second port of a lab; without `incoming` no station can send episodes."""
+    """Second port of a lab; without `incoming` no station can send episodes."""
 
     def __init__(
         self,
@@ -104,46 +104,44 @@ class LabStreams:
         self._orders: SimpleQueue[tuple[str, Path | None]] = SimpleQueue()
         self._flows: dict[tuple[str, str], _Flow] = {}
         self._by_route: dict[bytes, _Flow] = {}
-        self.places: dict[
-            str, tuple[str, str]
-        ] = {}  # by station: where its state and its pictures are published
-        self.failed = False  # by what nobody foresaw: the gate ends then, and is started again
+        self.places: dict[str, tuple[str, str]] = {}  # by station: endpoints of its state and its pictures
+        self.failed = False  # after an unforeseen error: the gate then ends and is restarted
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._work, name="streams", daemon=True)
 
     def open(self) -> int:
-        """Listen, once somebody answers who may connect; returns the port. Raises TransportError."""
+        """Listen, after admission has started; return the port. Raises: TransportError."""
         host, port, key = self._where
         largest = LARGEST_PICTURE
         self._door = Door(self.context, host, port, key, largest, RATE, self._allowed, self._clock)
         return self._door.port
 
     def start(self) -> None:
-        """Begin in a thread of its own."""
+        """Start the thread."""
         self._thread.start()
 
     def end(self) -> None:
-        """End it; nothing is published any more."""
+        """Stop the thread; nothing is published any more."""
         self._ended.set()
         self._thread.join()
 
     def serve(self, station: str, station_dir: Path) -> None:
-        """Publish what this station sends in that folder; from any thread."""
+        """Publish the streams of a station in that folder; from any thread."""
         self._orders.put((station, station_dir))
 
     def leave(self, station: str) -> None:
-        """Publish nothing more of it; from any thread."""
+        """Stop publishing the streams of a station; from any thread."""
         self.places.pop(station, None)
         self._orders.put((station, None))
 
     def turn(self, wait_ms: int = _POLL_MS) -> None:
-        """Wait for a station, and pass on what has come."""
+        """Wait for a station, and pass on its messages."""
         self._wait(wait_ms)
         self._obey()
         for arrival in self._door.arrivals():
             try:
                 self._handle(arrival)
-            except Exception:  # no other station is to lose its streams for it
+            except Exception:  # streams of other stations must go on
                 log.exception("streams of a station's computer cannot be taken up")
                 self._door.cut(arrival.route, "the lab cannot take up what it sends: see the log of its gate")
         self._answer_senders()
@@ -267,7 +265,7 @@ class LabStreams:
                 flow.published.publish(stream, payload)
 
     def _send_credits(self, flow: _Flow) -> None:
-        """Give back credits, while anybody listens; say what is wanted where that has changed."""
+        """Renew the credit while there are subscribers; send the list of wanted streams if it has changed."""
         flow.published.poll_subscriptions()
         wanted = sorted(flow.published.topics)[:_MOST_TOPICS]
         if not flow.route:
@@ -292,7 +290,7 @@ class LabStreams:
                 self._cut_sender(arrival.route, "it sends what nobody has asked for")
 
     def _answer_senders(self) -> None:
-        """What the desks say: each is a word to a station, and counts what that may send now."""
+        """Send the answers about episodes, and count what each station may send now."""
         for route, message in self._incoming.answers() if self._incoming is not None else ():
             sender = self._senders.get(route)
             if sender is None:

@@ -1,7 +1,7 @@
-"""One connection of a station to its lab: dialled, greeted, kept alive, dropped where it is silent.
+"""Connection of a station to its lab: connecting, greeting, signs of life, and dropping it if it is silent.
 
-The station dials and the lab never does. What the lab has sent over a connection that was dropped is never read: it
-was asked before, and nobody waits for it any more.
+The station connects, never the lab. Messages that are still unread when a connection is dropped are discarded: they
+belong to requests that the lab no longer waits for.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from runtime.link.wire import (
 )
 
 log = logging.getLogger(__name__)
-_GREETED_S = 2.0  # for connecting and the lab's welcome
-_SHORTEST_S, _LONGEST_S = 0.1, 2.0  # between two tries
-_REFUSED_S = 30.0  # after the lab has said that it knows no such key
+_GREETED_S = 2.0  # [s], for connecting and the lab's welcome
+_SHORTEST_S, _LONGEST_S = 0.1, 2.0  # [s], between two tries
+_REFUSED_S = 30.0  # [s], after the lab has refused the key
 _MOST_WAIT_S = 300.0
-_TURN = 100  # messages that are read in one turn
-_WAITING_TO_GO = 64  # messages, beyond which a line is as good as lost
+_TURN = 100  # messages read per turn
+_WAITING_TO_GO = 64  # queued messages at which a connection counts as lost
 _FATAL = zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _FATAL |= zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_DISCONNECTED | zmq.EVENT_CLOSED
 _AUTH = zmq.EVENT_HANDSHAKE_FAILED_AUTH
-_LOW_EFFORT = 0x20  # TOS of DSCP CS1: routers that know it let everything else go first
+_LOW_EFFORT = 0x20  # TOS of DSCP CS1: routers that know it prefer all other traffic
 Heard = tuple[Message, list[bytes]]
 
 
@@ -70,13 +70,18 @@ class Dial:
         return f"tcp://{host}:{port}"
 
 
-Dialled = tuple[zmq.Socket[Any], zmq.Socket[Any]]  # and where ZMQ tells what has become of the connection
+Dialled = tuple[zmq.Socket[Any], zmq.Socket[Any]]  # connection and its monitor
 
 
 def dialled(context: zmq.Context[Any], endpoint: str, lab: bytes, key: KeyPair, low: bool = False) -> Dialled:
-    """A socket that connects to the lab with that public key, and never by itself a second time; ZMQError.
+    """Open a socket that connects once, without reconnecting, to the lab with that public key. Raises: ZMQError.
 
-    With `low` its packets are marked as those that may wait.
+    Args:
+        lab: Public key of the lab, 32 bytes.
+        low: Mark the packets as low priority (DSCP CS1).
+
+    Returns:
+        The socket and its monitor.
     """
     socket: zmq.Socket[Any] = context.socket(zmq.DEALER)
     socket.linger = 0
@@ -92,7 +97,7 @@ def dialled(context: zmq.Context[Any], endpoint: str, lab: bytes, key: KeyPair, 
         z85(key.public),
         z85(key.secret),
     )
-    monitor = socket.get_monitor_socket(_FATAL)  # before anything can happen to it
+    monitor = socket.get_monitor_socket(_FATAL)  # before connecting, so that no event is missed
     try:
         socket.connect(endpoint)
     except zmq.ZMQError:
@@ -102,16 +107,16 @@ def dialled(context: zmq.Context[Any], endpoint: str, lab: bytes, key: KeyPair, 
 
 
 def ended(socket: zmq.Socket[Any], monitor: zmq.Socket[Any]) -> None:
-    """Close both, with all that waits."""
+    """Close a socket and its monitor; queued messages are discarded."""
     socket.disable_monitor()
     monitor.close(linger=0)
     socket.close(linger=0)
 
 
 class Line:
-    """A connection of one role; all of it belongs to one thread, which calls `turn`.
+    """Connection of one role. One thread uses it and calls `turn` regularly.
 
-    `beat` is what the station says of itself with each sign of life.
+    `beat` returns the sign of life that the station sends every BEAT_S.
     """
 
     def __init__(
@@ -131,16 +136,16 @@ class Line:
         self._pause = _SHORTEST_S
         self._low = dial.role == EPISODES
         self._again_at = -float("inf")
-        self.connections = 0  # how often it was greeted: what is under way belongs to one of them
+        self.connections = 0  # number of welcomes: a request belongs to the connection that carried it
 
     def turn(self) -> list[Heard]:
-        """Dial where it is time, say that we live, and return what the lab has said since."""
+        """Connect if it is due, send a sign of life, and return the messages received since the last call."""
         now = self._clock()
         if self.socket is None:
             if now >= self._again_at:
                 self._open(now)
             return []
-        # First of all: what came after a silence may have been asked long ago.
+        # Before reading: a command that arrives after a silence may be old, so it is dropped with the connection.
         lost = LOST_EPISODES_S if self._low else LOST_S
         if now - self._heard_at > (lost if self.up else _GREETED_S):
             self.drop(f"nothing was heard of the lab for {now - self._heard_at:.1f} s")
@@ -154,7 +159,7 @@ class Line:
         return heard
 
     def send(self, message: Message, *parts: bytes) -> bool:
-        """Send it, without waiting; False where there is no line, or it takes no more."""
+        """Send a message without waiting; return False if there is no connection or its queue is full."""
         if self.socket is None:
             return False
         try:
@@ -165,7 +170,12 @@ class Line:
         return True
 
     def drop(self, why: str, again_s: float | None = None) -> None:
-        """End the connection with all that is under way on it; the next try is soon, and later each time."""
+        """Close the connection and discard its pending messages.
+
+        Args:
+            why: Reason, logged if it is new.
+            again_s: Time until the next try [s]; None: soon, then with a growing delay of up to `_LONGEST_S`.
+        """
         self.close()
         if why != self.why:
             log.warning("no %s connection to the lab at %s: %s", self._dial.role, self._dial.endpoint, why)
@@ -227,7 +237,7 @@ class Line:
         self.connections += 1
 
     def _connection_problem(self) -> tuple[str, float | None] | None:
-        """What ZMQ says has become of the connection: why, and when to try again; None where nothing has."""
+        """Return why ZMQ reports the connection as failed, and the delay of the next try; None if it does not."""
         assert self._monitor is not None
         if not readable(self._monitor):
             return None

@@ -1,7 +1,7 @@
-"""A station on another computer as the lab's programs find any: its folder, and sockets of the same names in it.
+"""Mirror of a station on another computer: a folder with the sockets by which the lab's programs find any station.
 
-The socket for the e-stop is there for as long as the station is enrolled, those for commands and streams while the
-link is: who looks for them meanwhile is told since when it is lost.
+The e-stop socket exists as long as the station is enrolled, those for commands and streams while the link is up.
+While it is down, clients find the reason and the time of the loss instead.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from runtime.ipc.station_lock import StationLockedError, acquire
 from runtime.link.wire import COORDINATOR, GUARD, MEDIA
 
 log = logging.getLogger(__name__)
-LINK = "link"  # in `endpoints/`: what is known of the link, for people
+LINK = "link"  # file in `endpoints/`: reason and time of a lost link, for people
 STOPPING = ("stop", "halt", "estop")
-_LAST_WORDS_MS = 200  # for answers that are on their way when the socket ends
-_SHARE = 8  # of commands that are no stops, in one turn
+_LAST_WORDS_MS = 200  # for answers that are still being sent when the socket closes
+_SHARE = 8  # commands other than stops per turn
 _GATE = ", the gate, for a station on another computer"
 
 
@@ -33,7 +33,7 @@ class MirrorLockedError(Exception):
 
 
 class Mirror:
-    """The folder of one station, held for as long as this is open. Raises MirrorTaken, TransportError."""
+    """Folder of one station, locked until `close`. Raises: MirrorTaken, TransportError."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
         self._context, self.station_dir = context, station_dir
@@ -54,9 +54,12 @@ class Mirror:
         self._endpoints.write(GUARD, {"estop": self.estops.endpoint})
 
     def raise_up(self, streams: tuple[str, str]) -> None:
-        """The station is linked: its socket for commands is a new one, so that nobody counts on what was before.
+        """Open a new command socket and publish its address: the station is linked.
 
-        `streams` are where its state and its pictures are published.
+        The socket is new at every link, so that no client waits for answers from before the loss.
+
+        Args:
+            streams: Endpoints at which the station's state and its pictures are published.
         """
         self._lower()
         self.commands = CommandServer(self._context, self.station_dir, "commands")
@@ -66,18 +69,18 @@ class Mirror:
         self._endpoints.withdraw(LINK)
 
     def pictures(self, there: bool) -> None:
-        """Whether the station shows any."""
+        """Publish the endpoint of the pictures, or withdraw it; `there`: whether the station shows any."""
         if there != self._cameras:
             self._cameras = there
             self._tell_where()
 
     def lower(self, why: str) -> None:
-        """The station cannot be commanded, since now; `why` is for people, the time beside it."""
+        """Close the command socket and record the time and `why`, a sentence for people."""
         self._endpoints.write(LINK, {"why": why, "since": repr(time.time())})
         self._lower()
 
     def poll(self) -> None:
-        """Listen anew where clients cannot connect any more."""
+        """Rebind sockets that clients cannot reach, and rewrite missing endpoint files. Call regularly."""
         if self.estops.rebind_if_unreachable() or self._endpoints.is_missing(GUARD):
             self._endpoints.write(GUARD, {"estop": self.estops.endpoint})
         if self.commands is not None and (
@@ -87,19 +90,19 @@ class Mirror:
 
     @property
     def waiting(self) -> bool:
-        """True if there is something to look into, without any further message."""
+        """True if messages are queued that no further readiness of a socket will announce."""
         return self.estop_turns.has_waiting or (
             self.command_turns is not None and self.command_turns.has_waiting
         )
 
     def moved_streams(self, streams: tuple[str, str]) -> None:
-        """They are published elsewhere now."""
+        """Publish new endpoints of the streams if they have changed."""
         if streams != self._streams and self.commands is not None:
             self._streams = streams
             self._tell_where()
 
     def close(self, why: str) -> None:
-        """The station is no longer this lab's: nothing of it is found, but why."""
+        """Withdraw all endpoints and release the folder: the station is no longer this lab's. `why` is recorded."""
         self.lower(why)
         self._endpoints.withdraw(GUARD)
         self.estops.socket.linger = _LAST_WORDS_MS

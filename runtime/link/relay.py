@@ -1,7 +1,7 @@
-"""What the lab asks, carried to the sockets of the station on this computer, and the answers back.
+"""Relay of the lab's requests to the sockets of the station on this computer, and of the answers back.
 
-Each question has a connection of its own while it waits, as that of any program here: none is refused because others
-wait, and an answer that comes late is never taken for another's.
+Each pending request uses a connection of its own, like that of a local program: none is refused because others are
+pending, and a late answer is never matched to another request.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from runtime.link.wire import COORDINATOR, GUARD
 
 log = logging.getLogger(__name__)
 ALLOWED = ((GUARD, "estop"), (COORDINATOR, "commands"))
-_MOST = 64  # questions that wait at once; beyond, the oldest is given up
-_PATIENCE_S = 30.0  # for an answer: nobody at the lab waits longer
-_FIND_S, _TELL_S = 5.0, 0.8  # for which the socket of a stop is looked for; after which its sender is told
+_MOST = 64  # pending requests; at this number the oldest is dropped
+_PATIENCE_S = 30.0  # [s], for an answer; the lab does not wait longer
+_FIND_S, _TELL_S = 5.0, 0.8  # [s]: search for the socket of a stop; first answer to its sender
 
 
 @dataclass(slots=True)
@@ -43,7 +43,7 @@ class _PendingQuestion:
 
 @dataclass(slots=True)
 class _Free:
-    """Connections to a socket over which nothing is under way."""
+    """Idle connections to one socket."""
 
     endpoint: str
     clients: list[CommandClient] = field(default_factory=list)
@@ -55,7 +55,7 @@ class _Free:
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """The answer to the question of that number: as the station packed it, or why there is none."""
+    """Answer to the request with that number: as the station packed it, or why there is none."""
 
     number: int
     packed: bytes = b""
@@ -63,7 +63,7 @@ class Answered:
 
 
 class Relay:
-    """Questions that wait for the station; belongs to one thread."""
+    """Requests that wait for the station's answer. One thread uses it."""
 
     def __init__(
         self, context: zmq.Context[Any], station_dir: Path, clock: Callable[[], float] = time.monotonic
@@ -76,7 +76,15 @@ class Relay:
     def send(
         self, number: int, place: tuple[str, str], payload: bytes, signature: bytes, stops: bool
     ) -> None:
-        """Send it to the socket; a stop goes after its socket wherever that goes meanwhile."""
+        """Send a request to the station's socket.
+
+        Args:
+            number: Number of the request, repeated in its `Answered`.
+            place: Process and name of the socket.
+            payload: Packed command.
+            signature: Signature of the payload for the station's command server.
+            stops: Whether it is a stop: it is sent again if its socket moves while the answer is pending.
+        """
         if len(self._asked) >= _MOST:
             self._end(next(iter(self._asked)))
         now = self._clock()
@@ -85,15 +93,15 @@ class Relay:
 
     @property
     def is_pending(self) -> bool:
-        """True while a question waits for the station."""
+        """True while requests wait for the station."""
         return bool(self._asked)
 
     def sockets(self) -> list[zmq.Socket[Any]]:
-        """What can be read where an answer has come."""
+        """Return the sockets that become readable when an answer arrives."""
         return [asked.client.socket for asked in self._asked.values() if asked.client is not None]
 
     def answers(self) -> list[Answered]:
-        """All that have come, and what is given up."""
+        """Return the answers that have arrived and the requests that have failed."""
         now, found = self._clock(), []
         for number, asked in list(self._asked.items()):
             packed = asked.client.packed_answer() if asked.client is not None else None
@@ -116,12 +124,12 @@ class Relay:
         return found
 
     def forget(self) -> None:
-        """Nobody waits for what was asked; what was sent is carried out all the same."""
+        """Drop all pending requests; commands that were sent are executed all the same."""
         for number in list(self._asked):
             self._end(number)
 
     def listening(self) -> list[str]:
-        """The processes of the station whose sockets are there."""
+        """Return the processes of the station whose sockets exist."""
         return [process for process in (GUARD, COORDINATOR, "media") if self._is_there(process)]
 
     def close(self) -> None:
@@ -132,7 +140,7 @@ class Relay:
         self._free.clear()
 
     def _send(self, asked: _PendingQuestion) -> None:
-        """To the socket where it is now, unless it was sent there."""
+        """Send the request to the current endpoint of its socket, unless it was sent there already."""
         try:
             endpoint = str(self._endpoints.read(asked.process)[asked.socket])
         except (TransportError, KeyError):
@@ -144,12 +152,12 @@ class Relay:
         asked.endpoint, asked.client = endpoint, self._client((asked.process, asked.socket), endpoint)
         try:
             asked.client.forward(asked.payload, asked.signature)
-        except zmq.ZMQError as error:  # its queue is full: nobody reads there
+        except zmq.ZMQError as error:  # the queue is full: the station does not read
             log.warning("%s takes no more: %s", endpoint, error.strerror)
 
     def _client(self, place: tuple[str, str], endpoint: str) -> CommandClient:
         free = self._free.get(place)
-        if free is None or free.endpoint != endpoint:  # the station was started anew, or listens elsewhere
+        if free is None or free.endpoint != endpoint:  # the station has restarted, or its socket has moved
             if free is not None:
                 free.close()
             free = self._free[place] = _Free(endpoint)

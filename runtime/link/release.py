@@ -1,4 +1,4 @@
-"""Version of this installation, as people are told it."""
+"""Version of this installation, as shown to people."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib.metadata import version as installed
 
 @cache  # cache: it is looked up on the disk, and the program that runs stays what it is
 def version() -> str:
-    """The installed version; "unknown" in a checkout that is not installed."""
+    """Return the installed version; "unknown" in a checkout that is not installed."""
     try:
         return installed("eva-web")
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""A station on another computer as its lab's gate knows it: its connections, what was asked of it, what waits."""
+"""Station on another computer as its lab's gate knows it: connections, pending commands and held presses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.link.wire import LOST_S
 
 @dataclass(slots=True)
 class Line:
-    """A connection of a station: its newest challenge, and when it was last heard."""
+    """Connection of a station: its newest challenge, and the time of its last message."""
 
     route: bytes
     heard_at: float
@@ -21,7 +21,7 @@ class Line:
 
 @dataclass(slots=True)
 class Pending:
-    """A command under way: who asked, and over which socket the answer goes."""
+    """Command that waits for the station's answer: its sender, and the socket for the answer."""
 
     server: CommandServer
     call: IncomingMessage
@@ -32,7 +32,7 @@ class Pending:
 
 @dataclass(slots=True)
 class PendingPress:
-    """A press of the e-stop; `told` once its sender has an answer."""
+    """Press of the e-stop that waits for the link; `told`: its sender has an answer already, but it is still sent."""
 
     call: IncomingMessage
     command: Command
@@ -40,12 +40,12 @@ class PendingPress:
     verified: bool
     at: float
     told: bool = False
-    sent: bool = False  # over a connection that was lost before the answer
+    sent: bool = False  # sent over a connection that was lost before the answer
 
 
 @dataclass(slots=True)
 class Remote:
-    """A station that is enrolled here."""
+    """Station that is enrolled here."""
 
     name: str
     mirror: Mirror | None = None
@@ -56,12 +56,12 @@ class Remote:
     listening: list[str] = field(default_factory=list)
     pending: dict[int, Pending] = field(default_factory=dict)
     held: list[PendingPress] = field(default_factory=list)
-    lives: bool = False  # its connections; `up`: and what they lead to
+    lives: bool = False  # both connections are alive; `up`: the station can also be commanded
     up: bool = False
     told: str = ""
     lost_at: float = -float("inf")
 
     def line(self, role: str, now: float) -> Line | None:
-        """A connection that lives and can have commands signed for it."""
+        """Return the connection of that role; None if it is silent or has sent no challenge to sign with."""
         found = self.lines.get(role)
         return found if found is not None and found.challenge and now - found.heard_at <= LOST_S else None

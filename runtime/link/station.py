@@ -1,6 +1,7 @@
-"""The station's end of the link: threads that pass commands, stops and streams between the lab and this computer.
+"""Station's end of the link: threads that carry commands, stops and streams between the lab and this computer.
 
-Stops have a connection, a thread and connections to the station of their own: they wait behind nothing else.
+Stops have their own connection to the lab, thread and connections to the station, so that they never wait behind
+anything else.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ from runtime.link.yielding import lower_priority
 
 log = logging.getLogger(__name__)
 _POLL_MS = 50
-_IDLE_MS = 100  # of turns in which nothing that was asked waits for the station
-_LOOK_S = 0.2  # between two looks which processes of the station listen
-# In place of a signature, of what no user of the lab is known to have given: the station obeys it in nothing but stops.
+_IDLE_MS = 100  # longest wait of a turn without pending requests
+_LOOK_S = 0.2  # between two checks of which processes listen [s]
+# Replaces the signature of a message without a verified user: the station obeys such a message only if it is a stop.
 NOBODY = b"nobody known to the lab"
-_UPLOAD_AGAIN_S = 30.0  # after what nobody foresaw
-_MOST_STREAMS_S = 1 / 40  # between two bundles
+_UPLOAD_AGAIN_S = 30.0  # pause after an unforeseen error [s]
+_MOST_STREAMS_S = 1 / 40  # shortest time between two bundles [s]
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A station of this computer, its lab, and the key with which it is known there."""
+    """Station of this computer, its lab, and the key that identifies it there."""
 
     station_dir: Path
     lab: KnownLab
@@ -50,16 +51,18 @@ class Place:
     session: bytes
 
     def dial(self, role: str) -> Dial:
-        """What a connection of that role needs."""
+        """Return the parameters of a connection of that role."""
         return Dial(self.lab, self.key, role, self.session)
 
 
 class Commands:
-    """Questions of the lab over the connection of one role; all of it belongs to one thread."""
+    """Relay of the lab's commands over the connection of one role. One thread uses it and calls `turn`."""
 
     def __init__(self, place: Place, role: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._place, self._role, self._clock = place, role, clock
-        self._context: zmq.Context[Any] = zmq.Context()  # what is slow in another one's delays nothing here
+        self._context: zmq.Context[Any] = (
+            zmq.Context()
+        )  # own context: traffic of other roles causes no delay here
         self._relay = Relay(self._context, place.station_dir, clock)
         tokens = Ed25519PublicKey.from_public_bytes(bytes.fromhex(place.lab.tokens))
         self._challenges = Challenges(place.lab.station, tokens, clock)
@@ -70,7 +73,7 @@ class Commands:
         self._connection = 0
 
     def turn(self) -> None:
-        """Wait for the lab or the station, and pass on what either says."""
+        """Wait for the lab or the station, and pass on their messages."""
         wait_ms = _POLL_MS if self._relay.is_pending else _IDLE_MS
         poller = zmq.Poller()
         for socket in (self._line.socket, *self._relay.sockets()):
@@ -88,11 +91,11 @@ class Commands:
 
     @property
     def problem(self) -> str:
-        """Why there is no connection to the lab, "" where there is; any thread may ask."""
+        """Why there is no connection to the lab, "" if there is one; any thread may read it."""
         return "" if self._line.up else self._line.why
 
     def close(self) -> None:
-        """Release every socket."""
+        """Release all sockets."""
         self._line.close()
         self._relay.close()
         self._context.destroy(linger=0)
@@ -101,7 +104,7 @@ class Commands:
         now = self._clock()
         if (
             self._role == COMMANDS and now - self._looked >= _LOOK_S
-        ):  # one of both: two would contradict each other
+        ):  # on one connection only: two reports could contradict each other
             self._looked, self._listening = now, self._relay.listening()
         return Beat(self._challenges.newest(), self._listening)
 
@@ -129,7 +132,7 @@ class Commands:
 
 
 class Streams:
-    """State and pictures, newest of each as often as the lab takes them; all of it belongs to one thread."""
+    """Relay of state and pictures, the newest of each within the lab's credit. One thread calls `turn`."""
 
     def __init__(self, place: Place, clock: Callable[[], float] = time.monotonic) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
@@ -143,7 +146,7 @@ class Streams:
         return line, Flow(self._context, source_of(place.station_dir, role))
 
     def turn(self, wait_ms: int = _IDLE_MS) -> None:
-        """Wait for the lab or the station, and send what is new where the lab takes it."""
+        """Wait for the lab or the station, and send new messages for which the lab has given credit."""
         now = self._clock()
         poller = zmq.Poller()
         for (line, flow), sent_at in zip(self._flows, self._sent_at, strict=True):
@@ -161,7 +164,7 @@ class Streams:
         heard = line.turn()
         if (
             line.connections != self._connections[at] or not line.up
-        ):  # what was asked for is of another connection
+        ):  # credit belongs to the connection that granted it
             flow.stop()
             self._connections[at] = line.connections
         for message, _ in heard:
@@ -174,7 +177,7 @@ class Streams:
             self._sent_at[at] = now
 
     def close(self) -> None:
-        """Release every socket."""
+        """Release all sockets."""
         for line, flow in self._flows:
             line.close()
             flow.close()
@@ -182,7 +185,7 @@ class Streams:
 
 
 class StationLink:
-    """The threads of one station's link; without `uploads` its episodes stay where they are."""
+    """Threads of one station's link; without `uploads` no episode is sent."""
 
     def __init__(
         self, station_dir: Path, lab: KnownLab, key: KeyPair, uploads: UploadSettings | None = None
@@ -206,23 +209,27 @@ class StationLink:
             )
 
     def start(self) -> None:
-        """Begin; returns at once."""
+        """Start the threads and return."""
         for thread in self._threads:
             thread.start()
 
     def end(self) -> None:
-        """End all of it."""
+        """Stop all threads and wait for them."""
         self._ended.set()
         for thread in self._threads:
             thread.join()
 
     @property
     def problem(self) -> str:
-        """Why the lab cannot stop the station just now, "" where it can."""
+        """Why the lab cannot stop the station at present, "" if it can."""
         return "not connected yet" if self._stops is None else self._stops.problem
 
     def _work(self, name: str, make: Callable[[], Commands | Streams]) -> None:
-        """One thread; what nobody foresaw ends the process, which is started again, rather than a part of it."""
+        """Run one thread of the link.
+
+        An unforeseen error sets `failed`, so that the whole process ends and is restarted: a link that works only in
+        part would be harder to notice.
+        """
         part = None
         try:
             part = make()
@@ -238,7 +245,7 @@ class StationLink:
                 part.close()
 
     def _upload(self, make: Callable[[], Uploads]) -> None:
-        """The thread of episodes: whatever befalls it, stops and commands go on, and it begins anew."""
+        """Run the thread of episodes. It restarts after errors and never affects stops and commands."""
         lower_priority()
         while not self._ended.is_set():
             try:

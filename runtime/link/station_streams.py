@@ -1,6 +1,6 @@
-"""Streams of a station on their way to its lab: the newest of each, never more than the lab has asked for.
+"""Streams of a station on their way to its lab: the newest message of each, within the credit that the lab grants.
 
-A slow link shows less often, and never what is old: what waits is replaced by what is newer.
+On a slow link messages are sent less often, never late: a waiting message is replaced by a newer one.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from runtime.ipc.bus import Endpoints
 from runtime.link.wire import COORDINATOR, MEDIA, MOST_PARTS, STATE, Bundle, Credit
 
 _READER_HIGH_WATER = 256
-_TURN = 500  # messages that are read in one turn
-_LOOK_EVERY = 20  # turns
+_TURN = 500  # messages read per turn
+_LOOK_EVERY = 20  # turns between two checks of the endpoint
 _MOST_CREDIT = 64
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A socket at which the station publishes: named by its process, and by its name there."""
+    """Publishing socket of the station: its process and its name there."""
 
     endpoints: Endpoints
     process: str
     socket: str
 
     def endpoint(self) -> str:
-        """Where it is now; "" where it is nowhere."""
+        """Return the current endpoint; "" if there is none."""
         try:
             return str(self.endpoints.read(self.process)[self.socket])
         except (TransportError, KeyError):
@@ -39,13 +39,13 @@ class Source:
 
 
 def source_of(station_dir: Path, role: str) -> Source:
-    """What a connection of that role carries."""
+    """Return the socket whose messages a connection of that role carries."""
     endpoints = Endpoints(station_dir)
     return Source(endpoints, COORDINATOR, "state") if role == STATE else Source(endpoints, MEDIA, "cameras")
 
 
 class Flow:
-    """The streams of one socket: heard while the lab wants any, and bundled as its credit allows."""
+    """Streams of one socket: subscribed while the lab wants any, and bundled as its credit allows."""
 
     def __init__(self, context: zmq.Context[Any], source: Source) -> None:
         self._context, self._source = context, source
@@ -57,13 +57,13 @@ class Flow:
         self._turns = 0
 
     def stop(self) -> None:
-        """Nobody asks for anything any more."""
+        """Forget the lab's credit and requests, and unsubscribe."""
         self._credit, self._wanted = 0, []
         self._newest.clear()
         self._disconnect()
 
     def allow(self, credit: Credit) -> None:
-        """The lab takes so many bundles more, of the streams whose names begin so."""
+        """Add the lab's credit, and subscribe to the streams whose names start with the given prefixes."""
         self._credit = min(self._credit + max(0, credit.count), _MOST_CREDIT)
         if credit.wanted != self._wanted:
             self._wanted = credit.wanted
@@ -71,7 +71,7 @@ class Flow:
             self._disconnect()
 
     def bundle(self) -> tuple[Bundle, list[bytes]] | None:
-        """What is new since the last one, None where nothing is, or the lab takes nothing yet."""
+        """Return the new messages as a bundle; None if there are none or the lab has granted no credit."""
         self._receive()
         if not self._credit or not self._newest:
             return None

@@ -1,7 +1,8 @@
-"""Signed permission for one command of a user, good for seconds counted on the station's own clock.
+"""Signed permission for one command of a user, valid for a few seconds on the station's own clock.
 
-The station makes challenges, the lab signs one of them with the command, the station verifies that: no two clocks have
-to agree, and what was signed once is good for one message. A token says who commands; it is never asked for to stop.
+The station issues challenges, the lab signs a challenge together with the command, and the station verifies the
+signature: the two clocks need not agree, and a signature is valid for one message. A token identifies the user who
+commands; stops never need one.
 """
 
 from __future__ import annotations
@@ -17,44 +18,46 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 
 from runtime.link.wire import Ask
 
-VALID_S = 3.0  # from when the station has made the challenge to when the command arrives
-_EVERY_S = 0.2  # between two challenges
+VALID_S = 3.0  # from issuing the challenge to the arrival of the command [s]
+_EVERY_S = 0.2  # shortest time between two challenges [s]
 _CHALLENGE_BYTES = 16
 _DOMAIN = b"eva-web link command 1\0"
-_MOST_SERIALS = 10_000  # of one challenge
+_MOST_SERIALS = 10_000  # per challenge: bounds the memory that a flood can use
 _LARGEST_SERIAL = (1 << 63) - 1
 
 
 def _signed(station: str, challenge: bytes, serial: int, place: str, payload: bytes) -> bytes:
-    """Bytes of a fixed layout but for two texts, which no zero byte is in."""
+    """Return the bytes to sign: fixed layout except two texts, which contain no zero byte and so cannot overlap."""
     words = f"{station}\0{place}\0".encode()
     return _DOMAIN + words + challenge + serial.to_bytes(8, "big") + hashlib.sha256(payload).digest()
 
 
 class Signer:
-    """The lab's end: signs commands for stations, each with a serial of its own."""
+    """Lab's end: signs commands for stations, each with a new serial."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
-        self._serial = secrets.randbits(48)  # so that two processes of one lab never give the same
+        self._serial = secrets.randbits(
+            48
+        )  # random start: two processes of a lab do not use the same serials
 
     def token(self, station: str, challenge: bytes, place: str, payload: bytes) -> tuple[int, bytes]:
-        """Serial and signature for one message with the station's challenge."""
+        """Return serial and signature for one message that uses the station's challenge."""
         self._serial += 1
         return self._serial, self._key.sign(_signed(station, challenge, self._serial, place, payload))
 
 
 class Challenges:
-    """The station's end: makes challenges, and knows which tokens are good and have not been used."""
+    """Station's end: issues challenges and checks that each token is valid and used once."""
 
     def __init__(
         self, station: str, key: Ed25519PublicKey, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._station, self._key, self._clock = station, key, clock
-        self._made: OrderedDict[bytes, tuple[float, set[int]]] = OrderedDict()  # when, and the serials used
+        self._made: OrderedDict[bytes, tuple[float, set[int]]] = OrderedDict()  # issue time, used serials
 
     def newest(self) -> bytes:
-        """A challenge for the lab: a new one where the last is some time old."""
+        """Return the current challenge; issue a new one if the last is older than `_EVERY_S`."""
         now = self._clock()
         last = next(reversed(self._made), None)
         if last is None or now - self._made[last][0] >= _EVERY_S:
@@ -65,7 +68,10 @@ class Challenges:
         return last
 
     def wrong(self, ask: Ask, payload: bytes) -> str:
-        """Why the token of a message is worth nothing; "" where it is good, which it is once."""
+        """Return the reason to reject a message's token, "" if it is valid.
+
+        A valid token is used up by this call: the same one is rejected from then on.
+        """
         if not ask.signature:
             return "the lab names no user for it"
         made = self._made.get(ask.challenge)
@@ -89,5 +95,5 @@ class Challenges:
 
 
 def place_of(ask: Ask) -> str:
-    """The socket that a command is for, as it is signed."""
+    """Return the socket that a command is for, in the form that is signed."""
     return f"{ask.process}/{ask.socket}"

@@ -1,4 +1,4 @@
-"""What a station's own computer knows of its link: in the station's folder, for its panel."""
+"""State of the link as a station's own computer knows it: a file in the station's folder, for its panel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NOT_RUNNING = "the process of the link does not run"
 
 @dataclass(frozen=True, slots=True)
 class Uplink:
-    """A lab by its name, and since when [Unix time, s] and why there is no link to it; since 0 where there is."""
+    """Name of the lab; since when [Unix time, s] and why there is no link to it; `since` is 0 while there is one."""
 
     lab: str
     since: float = 0.0
@@ -24,7 +24,7 @@ class Uplink:
 
 
 class Telling:
-    """Says it in the station's folder whenever it is another."""
+    """Writer of the link's state into the station's folder, whenever it changes."""
 
     def __init__(self, endpoints: Endpoints, lab: str, clock: Callable[[], float] = time.time) -> None:
         self._endpoints, self._clock = endpoints, clock
@@ -32,7 +32,7 @@ class Telling:
         self._lab = lab
 
     def update(self, trouble: str) -> None:
-        """`trouble` says why there is no link just now, "" where there is one."""
+        """Write the state if it has changed or its file is missing; `trouble`: why there is no link, "" if linked."""
         before = self._said
         lost = before is not None and before.why
         since = 0.0 if not trouble else before.since if lost and before else self._clock()
@@ -42,12 +42,12 @@ class Telling:
             self._endpoints.write(UPLINK, {"lab": now.lab, "since": repr(now.since), "why": now.why})
 
     def end(self) -> None:
-        """Nobody knows any more."""
+        """Remove the file: the state is unknown from now on."""
         self._endpoints.withdraw(UPLINK)
 
 
 def read_uplink(endpoints: Endpoints) -> dict[str, Any] | None:
-    """lab, since, why, for JSON; None where the station is not linked to a lab."""
+    """Return lab, since and why for JSON; None if the station is not linked to a lab."""
     try:
         found = endpoints.read(UPLINK)
         told = {"lab": str(found["lab"]), "since": float(found["since"]), "why": str(found["why"])}

@@ -1,6 +1,6 @@
-"""The station's end of episodes that travel to its lab: one at a time, the newest first, behind everything else.
+"""Station's end of the transfer of episodes to its lab: one at a time, the newest first, with the lowest priority.
 
-The lab asks for the bytes that it lacks, and nothing is sent that it has not asked for. How fast is bounded here.
+The lab requests the bytes that it lacks; nothing else is sent. The rate is limited here.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ from runtime.link.yielding import Throttle
 
 log = logging.getLogger(__name__)
 _POLL_MS = 100
-_TURN_S = 0.02  # for which files are read in one turn
+_TURN_S = 0.02  # [s], for reading files per turn
 _MOST_WANTED = 64
 _UNREADABLE_S = 600.0
-_SOONEST_S, _LATEST_S = 1.0, 86400.0  # after which what the lab has declined is offered again
-_HEARD_S = 3.0  # a station of which nothing is heard for so long is in no run
+_SOONEST_S, _LATEST_S = 1.0, 86400.0  # bounds of the pause before a declined offer is repeated [s]
+_HEARD_S = 3.0  # [s]; without state for longer, no run is assumed
 _LOOK_S = 1.0
-_RATE, _LEAST_RATE, _MOST_RATE = 10.0, 0.01, 50.0  # MB/s; the lab cuts off who sends more than 64
+_RATE, _LEAST_RATE, _MOST_RATE = 10.0, 0.01, 50.0  # MB/s; the lab cuts off connections above 64
 
 
 @dataclass(frozen=True, slots=True)
 class UploadSettings:
-    """How a station's episodes travel: bytes a second; whether they wait for the end of a run; days they are kept."""
+    """Transfer of a station's episodes: rate [bytes/s], whether it waits for the end of a run, days of retention."""
 
     rate: float = _RATE * 1e6
     waits: bool = False
@@ -60,7 +60,7 @@ class UploadSettings:
 
     @classmethod
     def read(cls, given: Mapping[str, str]) -> UploadSettings:
-        """From environment variables; ConfigurationError."""
+        """Read the settings from environment variables. Raises: ConfigurationError."""
         rate = _number(given, "EVA_UPLOAD_MB_S", _RATE, _LEAST_RATE, _MOST_RATE)
         keep = _number(given, "EVA_KEEP_DAYS", None, 0.0, 36500.0)
         word = given.get("EVA_UPLOAD_WAITS", "no").strip().lower()
@@ -85,7 +85,7 @@ def _number(
 
 
 class Runs:
-    """Whether a run goes on at the station, or something is recorded, as its state says."""
+    """Whether a run or a recording is active at the station, read from its published state."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, clock: Callable[[], float]) -> None:
         self._context, self._clock = context, clock
@@ -93,10 +93,10 @@ class Runs:
         self._endpoint = ""
         self._subscriber: Subscriber | None = None
         self._looked = self._heard = -float("inf")
-        self._going = False  # as it last said; where it has not yet, it is waited for
+        self._going = False  # last known; True from subscribing to the first state
 
     def going(self) -> bool:
-        """True while one does."""
+        """Return True while a run or a recording is active."""
         now = self._clock()
         if now - self._looked >= _LOOK_S:
             self._looked = now
@@ -126,7 +126,7 @@ class Runs:
 
 @dataclass(slots=True)
 class _Reading:
-    """An episode whose files are read for their digests, before it is offered."""
+    """Episode whose files are being hashed before it is offered."""
 
     episode: str
     steps: Generator[None, None, Contents]
@@ -134,7 +134,7 @@ class _Reading:
 
 @dataclass(frozen=True, slots=True)
 class _Offered:
-    """What the lab was told that there is, and has not answered: an episode, or its labels."""
+    """Offer that the lab has not answered yet: an episode, or its labels if `contents` is None."""
 
     episode: str
     contents: Contents | None
@@ -142,7 +142,7 @@ class _Offered:
 
 
 class Uploads:
-    """All of it belongs to one thread, which calls `turn`."""
+    """Transfer of one station's episodes. One thread uses it and calls `turn` regularly."""
 
     def __init__(
         self,
@@ -167,7 +167,7 @@ class Uploads:
         self._told: dict[str, str] = {}
 
     def turn(self, wait_ms: int = _POLL_MS) -> None:
-        """Wait for the lab, and send what it has asked for as far as there is time for it."""
+        """Wait for the lab, and send the bytes that it has requested, within the time and rate of a turn."""
         self._wait(wait_ms)
         heard = self._line.turn()
         if self._line.connections != self._connection or not self._line.up:
@@ -182,7 +182,7 @@ class Uploads:
             self._offer()
 
     def close(self) -> None:
-        """Release every socket."""
+        """Release all sockets."""
         self._line.close()
         if self._runs is not None:
             self._runs.close()
@@ -199,7 +199,7 @@ class Uploads:
         poller.poll(wait_ms)
 
     def _forget(self) -> None:
-        """What was under way belongs to a connection that has ended."""
+        """Drop the offer and its requests: they belong to a connection or an answer that has ended."""
         self._offered = self._reading = None
         self._wanted.clear()
 
@@ -225,12 +225,12 @@ class Uploads:
                 self._home.labels_arrived(offered.episode, offered.lines)
             elif message.digest == offered.contents.digest:
                 self._home.arrived(offered.episode, offered.contents)
-        except RecordingError as error:  # the receipt finds no room: it is offered again
+        except RecordingError as error:  # the receipt cannot be written, e.g. disk full: offer again later
             self._home.put_off(offered.episode, _UNREADABLE_S)
             self._log_once(offered.episode, str(error))
 
     def _send(self) -> None:
-        """The bytes that the lab lacks, as far as the bucket goes."""
+        """Send requested bytes as far as the rate limit allows."""
         until = self._clock() + _TURN_S
         while self._wanted and not self._throttle.wait_s() and self._clock() < until:
             want = self._wanted.popleft()
@@ -240,7 +240,7 @@ class Uploads:
                 self._forget()
 
     def _read(self, want: Want) -> bytes:
-        """Those bytes of a file that was offered; none of any other."""
+        """Return the requested bytes of a file that was offered; b"" for any other file or if it cannot be read."""
         contents = self._offered.contents if self._offered is not None else None
         if contents is None or want.file not in {file.name for file in contents.files}:
             return b""
@@ -256,7 +256,7 @@ class Uploads:
             return b""
 
     def _offer(self) -> None:
-        """Labels first, which are small; then the newest episode, once all of it is read."""
+        """Offer labels first, because they are small; then the newest episode once all of it is hashed."""
         if self._reading is None:
             labels = self._home.next_labels()
             if labels is not None:

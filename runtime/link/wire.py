@@ -1,8 +1,8 @@
-"""Messages between a station's computer and its lab, and which releases of the two understand each other.
+"""Messages between a station's computer and its lab, and the compatibility of their releases.
 
-A message is a header, a msgpack map of its fields with its name under "kind", and parts that the header speaks of.
-Unknown fields are ignored and missing ones have defaults, so that neighbouring releases talk. Nothing here raises
-anything but CodecError, whatever comes in.
+A message is a header and the parts that it describes. The header is a msgpack map of the fields, with the name of the
+message under "kind". Unknown fields are ignored and missing fields have defaults, so that neighbouring releases can
+communicate. Whatever is received, only CodecError is raised.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import msgpack  # type: ignore[import-untyped]
 
 from runtime.core.errors import CodecError
 
-# The number of this release as far as the link is concerned: counted up by each release that changes it. Neighbours
-# work with each other: the recorded messages of both are in tests/runtime/link/recorded.
+# Protocol number, increased by each release that changes the link. Neighbouring numbers are compatible; recorded
+# messages of both are in tests/runtime/link/recorded.
 RELEASE = 1
 STOPS, COMMANDS, STATE, PICTURES, EPISODES = "stops", "commands", "state", "pictures", "episodes"
 ROLES = (
@@ -25,27 +25,27 @@ ROLES = (
     STATE,
     PICTURES,
     EPISODES,
-)  # a station's connections: the first two to the first port
+)  # roles of a station's connections; the first two use the first port
 GUARD, COORDINATOR, MEDIA = (
     "guard",
     "coordinator",
     "media",
-)  # processes of a station that the lab sees through it
-# Seconds. A link of which nothing is heard for LOST is lost; pages need another 0.4 to say so, of 1.5 that they have.
+)  # station processes that the link mirrors at the lab
+# [s]. A link that is silent for LOST_S is lost; pages show that 0.4 s later, and have to within 1.5 s.
 BEAT_S, LOST_S = 0.15, 0.9
-# Of the connection for episodes: what it carries may be before a beat, on a line of 1 Mbit/s for seconds.
+# [s], for the connection of episodes: on a line of 1 Mbit/s its data can delay a beat for seconds.
 LOST_EPISODES_S = 10.0
 LARGEST_HEADER = 4096  # bytes
-LARGEST_ANSWER = 4 << 20  # bytes of one message at the first port: what a station answers, all its events
+LARGEST_ANSWER = 4 << 20  # bytes of a message at the first port: a station's answer with all its events
 LARGEST_PICTURE = 4 << 20  # bytes of one part at the second port
 PIECE = 64 << 10  # bytes of an episode's file in one message
 MOST_PARTS = 64
-_MOST_WORDS = 64  # of a list in a header
+_MOST_WORDS = 64  # entries of a list in a header
 
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """First message of each connection of a station; `session` is the same in all of one link's."""
+    """First message of each connection of a station; `session` is the same for all connections of one link."""
 
     release: int
     version: str
@@ -56,7 +56,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The lab's answer: who it is."""
+    """The lab's answer to `Hello`: its release and version."""
 
     release: int
     version: str
@@ -64,7 +64,7 @@ class Welcome:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """Why the other end hears nothing more over this connection, and after how long it may try again."""
+    """Reason to end this connection, and the pause before the next try [s]."""
 
     why: str
     again_s: float = 30.0
@@ -72,8 +72,10 @@ class Bye:
 
 @dataclass(frozen=True, slots=True)
 class Beat:
-    """A sign of life, of either end: the station's has its newest challenge, over the commands' connection also which
-    of its processes listen."""
+    """Sign of life of either end. The station's carries its newest challenge.
+
+    On the connection for commands it also lists the station processes that listen.
+    """
 
     challenge: bytes = b""
     listening: list[str] = field(default_factory=list)
@@ -81,10 +83,10 @@ class Beat:
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """A command for a socket of the station, which is the part that follows.
+    """Command for a socket of the station; the payload is the part that follows.
 
-    `challenge`, `serial` and `signature` are its token, all empty where the lab knows no user. `stops`: it is passed on
-    whatever its token is worth, for the station itself to judge.
+    `challenge`, `serial` and `signature` are its token, empty if the lab has not verified a user. `stops`: it is passed
+    on even with an invalid token, and the station decides.
     """
 
     number: int
@@ -98,7 +100,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The station's answer to the `Ask` of that number, which is the part that follows; or why there is none."""
+    """The station's answer to the `Ask` of that number: the part that follows, or the reason why there is none."""
 
     number: int
     failure: str = ""
@@ -106,7 +108,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Credit:
-    """So many more bundles may be sent over this connection, of streams whose names begin with a word of `wanted`."""
+    """Permission to send so many more bundles, of streams whose names start with an entry of `wanted`."""
 
     count: int
     wanted: list[str] = field(default_factory=list)
@@ -114,21 +116,21 @@ class Credit:
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """The newest of streams, a part each."""
+    """Newest messages of streams, one part each."""
 
     streams: list[str]
 
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A closed episode that the station has: the part that follows lists its files (`contents.py`)."""
+    """Closed episode that the station has; the part that follows lists its files (`contents.py`)."""
 
     episode: str
 
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """The lab lacks so many bytes of that file of the episode, from `offset` on."""
+    """Request for `count` bytes of a file of the episode, from `offset` on."""
 
     episode: str
     file: str
@@ -138,7 +140,7 @@ class Want:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """They are the part that follows; empty where the station's file has no such bytes any more."""
+    """Bytes that were requested, in the part that follows; empty if the station cannot read them any more."""
 
     episode: str
     file: str
@@ -147,14 +149,14 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """What people have said of the episode at the station so far is the part that follows: the lines of its file."""
+    """Labels of the episode at the station; the part that follows has the lines of their file."""
 
     episode: str
 
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """The lab has it, and has compared it with its digest: of the list of an `Offer`, or of the lines of `Labels`."""
+    """Confirmation that the lab has verified an episode or labels; `digest` is of the offered list or the lines."""
 
     episode: str
     digest: str
@@ -162,7 +164,7 @@ class Arrived:
 
 @dataclass(frozen=True, slots=True)
 class Declined:
-    """The lab does not take what was offered of that episode, and why; the station may offer it again after so long."""
+    """The lab does not accept what was offered of the episode; the station may offer it again after `again_s`."""
 
     episode: str
     why: str
@@ -171,7 +173,7 @@ class Declined:
 
 @dataclass(frozen=True, slots=True)
 class Enrol:
-    """A computer asks to be a station, with the one-time code that the lab's administration has shown."""
+    """Request of a computer to become a station, with the one-time code that the lab's administration shows."""
 
     release: int
     version: str
@@ -181,7 +183,7 @@ class Enrol:
 
 @dataclass(frozen=True, slots=True)
 class Enrolled:
-    """It is: under this name, at this lab, whose tokens this key verifies; pictures go to the second port."""
+    """Successful enrolment: name of the station and the lab, key that verifies tokens, port for pictures."""
 
     station: str
     lab: str
@@ -212,14 +214,14 @@ _TYPES = {kind: get_type_hints(kind) for kind in _KINDS.values()}
 
 
 def write(message: Message, *parts: bytes) -> list[bytes]:
-    """The message as the frames that are sent."""
+    """Return the frames of a message."""
     content = {one.name: getattr(message, one.name) for one in fields(message)}
     packed: bytes = msgpack.packb({"kind": type(message).__name__, **content})
     return [packed, *parts]
 
 
 def read(frames: Sequence[bytes]) -> tuple[Message, list[bytes]]:
-    """The message that came, and its parts; raises CodecError."""
+    """Return the message in the frames, and its parts. Raises: CodecError."""
     if not frames or len(frames) > MOST_PARTS + 1 or len(frames[0]) > LARGEST_HEADER:
         raise CodecError(f"{len(frames)} frames, the first of {len(frames[0]) if frames else 0} bytes")
     content = _unpacked(frames[0])
@@ -271,7 +273,7 @@ def _fits(value: object, wanted: Any) -> bool:
 
 
 def apart(theirs: int, version: str, station: str, lab_side: bool) -> str:
-    """Why the other end's release does not go with this one, naming both; "" where it does."""
+    """Return why the other end's release is incompatible with this one, naming both; "" if it is compatible."""
     if abs(theirs - RELEASE) <= 1:
         return ""
     from runtime.link.release import version as our_version

@@ -1,4 +1,4 @@
-"""A thread that gives way to all others, and sends no more than it may."""
+"""Lowest priority for a thread, and a limiter for the rate at which it sends."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
 
 
 def lower_priority() -> None:
-    """Put the calling thread, and those that it starts, last: nice 19, and the disk while nobody else wants it.
+    """Give the calling thread and those that it starts the lowest priority: nice 19, and the idle class of disk access.
 
-    Whoever reads in that class is served when the disk is idle, where its scheduler knows classes; else as all others.
+    The idle class takes effect only if the disk's scheduler supports classes.
     """
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICEST)
     number = _IOPRIO_SET.get(platform.machine())
@@ -26,18 +26,21 @@ def lower_priority() -> None:
 
 
 class Throttle:
-    """A bucket of bytes that fills at `rate` a second and holds `burst`: who takes more waits until it is paid for."""
+    """Token bucket of bytes that fills at `rate` [bytes/s] and holds `burst` bytes.
+
+    Taking more than it holds is allowed; the debt is paid by waiting.
+    """
 
     def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._rate, self._burst, self._clock = rate, burst, clock
         self._left, self._at = burst, clock()
 
     def wait_s(self) -> float:
-        """Seconds until something may be taken; 0 now."""
+        """Return the time until bytes may be taken [s]; 0 means now."""
         now = self._clock()
         self._left, self._at = min(self._burst, self._left + self._rate * (now - self._at)), now
         return max(0.0, -self._left / self._rate)
 
     def consume(self, count: int) -> None:
-        """So many bytes are sent; to be asked for with `wait_s` before."""
+        """Record that so many bytes are sent; call `wait_s` before."""
         self._left -= count

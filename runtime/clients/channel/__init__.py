@@ -1,1 +1,1 @@
-"""The control channel: JSON over ZMQ REQ/REP for scripts, in a process of its own beside the family."""
+"""Control channel: JSON over ZMQ REQ/REP for scripts, in a process separate from those of the station."""

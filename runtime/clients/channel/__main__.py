@@ -1,6 +1,6 @@
-"""`python -m runtime.clients.channel STATION`: the control channel of a station that runs, as its deployment says.
+"""`python -m runtime.clients.channel STATION`: control channel of a running station, configured by its deployment.
 
-The station starts it by itself where `control_channel.enabled` is set.
+The station starts it by itself if `control_channel.enabled` is set.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _AGAIN_S = 1.0
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until the supervisor is gone, or a signal; exit code 2 where the station is not known."""
+    """Serve until a signal or the supervisor's end; return exit code 2 if the station is unknown."""
     given = _parser().parse_args(arguments)
     log.configure_logging("channel")
     station_dir = data_folder(given.data_dir) / "stations" / given.station
@@ -75,7 +75,7 @@ def _settings(station_dir: Path) -> ControlChannelSettings:
 
 
 def serve(station_dir: Path, settings: ControlChannelSettings, ended: Callable[[], bool]) -> None:
-    """Listen until `ended`; a port that is taken is tried again every second."""
+    """Serve until `ended`; if the port is in use, try again every second."""
     operator = settings.operator or f"{getpass.getuser()}@{socket.gethostname()}"
     names = HolderNames(operator, settings.scripts)
     door = _open(station_dir, settings, names, ended)

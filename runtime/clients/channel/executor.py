@@ -1,4 +1,4 @@
-"""Carries out what scripts ask for, one after the other, and says what came of it."""
+"""Execution of the scripts' commands, one after the other, and their answers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LOOK_S = 0.1
 
 
 class CommandExecutor:
-    """The channel's one way to the coordinator, but for stops; used by one thread."""
+    """Only path of the channel to the coordinator, except for stops. One thread uses it."""
 
     def __init__(
         self,
@@ -45,10 +45,10 @@ class CommandExecutor:
         self._scripts = Scripts(open_client, lives, silence_s)
         self._outcomes = outcomes
         self._now, self._looked = now, 0.0
-        self._newest = ""  # why the newest command that was refused or failed was
+        self._newest = ""  # reason of the newest refused or failed command
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
-        """The answer to one message; every fault is a sentence in it."""
+        """Execute one message and return its answer; a fault becomes a sentence in the answer."""
         script = self._scripts.get_or_create(holder)
         if message.form == "query":
             return self._run_query(script, message)
@@ -64,12 +64,12 @@ class CommandExecutor:
             outcome.resolve("unknown" if isinstance(fault, TransportError) else "refused", self._newest)
         self._outcomes.add(outcome)
         if message.name == "select_collect_task" and outcome.result == "done":
-            return {"ok": True, **data}  # as it always was
+            return {"ok": True, **data}  # the older channel's form of this answer
         special = dict(data) if message.name == "tab_switch" else {}
         return json_answers.command_answer(message, outcome, data, self._state(script, outcome)) | special
 
     def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
-        """Answer with what came of it the first time, as far as it has come now."""
+        """Answer a repeated command with the outcome of its first execution, as known now."""
         if known.said != message.name:
             why = f"its id was given to {known.said!r} before"
             other = Outcome(known.id, message.name, "", "refused", why)
@@ -77,7 +77,7 @@ class CommandExecutor:
         return json_answers.command_answer(message, known, {}, self._state(script, known))
 
     def _state(self, script: Script, outcome: Outcome) -> str | None:
-        """After a command; None where the station has just gone, and the answer is still worth having."""
+        """Return the state after a command; None if it was refused or is unknown, or the station is gone."""
         if outcome.result in ("refused", "unknown"):
             return None
         try:
@@ -86,7 +86,7 @@ class CommandExecutor:
             return None
 
     def poll(self) -> None:
-        """Do what is due beside messages: leases, and the outcomes of commands that go on."""
+        """Renew leases and poll the outcomes of commands in progress. Call regularly."""
         for sentence in self._scripts.poll():
             log.warning("%s", sentence)
         if self._now() - self._looked >= _LOOK_S:
@@ -97,7 +97,7 @@ class CommandExecutor:
         going_on = self._outcomes.pending
         if not going_on:
             return
-        client = self._scripts.get_or_create("channel").client  # of no script: it asks, and holds nothing
+        client = self._scripts.get_or_create("channel").client  # client without a script: it only reads
         try:
             status = client.status()
             for outcome in going_on:
@@ -109,7 +109,7 @@ class CommandExecutor:
     # --- commands ------------------------------------------------------------------------------------------
 
     def _verb(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
-        """Do what a verb of the older channel comes to; returns the data of the answer."""
+        """Execute the commands that a verb of the older channel stands for; return the answer's data."""
         if message.name not in VERBS:
             raise UnsupportedVerb(
                 f"command not allowed: {str(message.fields['cmd'])!r:.80}; known: {', '.join(VERBS)}"
@@ -127,7 +127,7 @@ class CommandExecutor:
         return told
 
     def _run_command(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
-        """Do a command of ours; returns the data of the answer."""
+        """Execute a command of EVA Web; return the data of the answer."""
         kind, arguments = message.name, message.arguments
         if kind not in OWN:
             raise UnsupportedVerb(f"unknown command {kind!r:.80}; known: {', '.join(OWN)}")
@@ -146,7 +146,13 @@ class CommandExecutor:
     def _send_command(
         self, script: Script, kind: str, arguments: Mapping[str, Any], outcome: Outcome | None
     ) -> Mapping[str, Any]:
-        """Give one command under the script's lease; raises Refused, or TransportError: outcome unknown."""
+        """Send one command under the script's lease.
+
+        Raises:
+            Refused: The station refuses the lease or the command.
+            RuntimeFault: The station was unreachable before the command was sent.
+            TransportError: There is no answer; the outcome is unknown.
+        """
         with _refused_if_unreachable():
             self._claim(script)
             before = script.client.status()
@@ -231,7 +237,10 @@ def _commanded(client: StationClient) -> list[float]:
 
 @contextmanager
 def _refused_if_unreachable() -> Iterator[None]:
-    """A station that does not answer before anything was given to it has refused: nothing is unknown."""
+    """Turn a TransportError into a RuntimeFault, as long as no command was sent.
+
+    The command then counts as refused: its outcome is not unknown.
+    """
     try:
         yield
     except TransportError as fault:

@@ -1,4 +1,4 @@
-"""Holders of the channel's messages, and the messages that show that the script which commands is alive."""
+"""Holders of the channel's messages, and which messages show that the commanding script is alive."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from typing import Literal
 
 from runtime.clients.channel.message import Message
 
-_CONNECTIONS = 1000  # that are remembered
+_CONNECTIONS = 1000  # connections remembered
 
 
 class HolderNames:
-    """Whose a message is: a script that names itself, a connection, or all scripts together.
+    """Assignment of messages to holders: a script that names itself, a connection, or all scripts together.
 
-    `user` is who the channel's process commands for, as the deployment says. What scripts add to it is what they say
-    of themselves: nothing here proves it.
+    `user` is the account of the channel's process, from the deployment. Names that scripts add are their own claim,
+    which nothing verifies.
     """
 
     def __init__(self, operator: str, scripts: Literal["apart", "together"]) -> None:
         self.user, self._apart = f"channel:{operator}", scripts == "apart"
         self._numbers: dict[bytes, int] = {}
         self._next = itertools.count(1)
-        self._commanded: dict[bytes, bool] = {}  # by connection, of scripts that are one holder
+        self._commanded: dict[bytes, bool] = {}  # by connection: whether it has sent a command
 
     def holder(self, connection: bytes, client: str) -> str:
-        """The name under which it holds a lease; no script can give itself one outside the channel's."""
+        """Return the name of the lease's holder; scripts can only choose names below the channel's own."""
         if client:
             return f"{self.user}/{client}"
         if not self._apart:
@@ -35,11 +35,11 @@ class HolderNames:
         return f"{self.user}#{number}"
 
     def is_alive(self, connection: bytes, message: Message, stops: bool) -> bool:
-        """True if its holder is alive, as far as this message shows; `stops` where it ends something.
+        """Return True if the message shows that its holder is alive; `stops`: whether it ends something.
 
-        Of scripts that are one holder some only look, and must not keep alive what another one began. So a question
-        counts on a connection that has commanded, where it asks what became of a command, or as the first on a
-        connection, for the state: that is how clients wait that connect anew for every call.
+        If all scripts are one holder, a script that only watches must not keep alive the command of another. A query
+        therefore counts only on a connection that has sent a command, if it asks for the result of a command, or if it
+        is the first message of a connection and asks for the status: clients that reconnect for each call wait so.
         """
         if self._apart or message.client:
             return True

@@ -1,4 +1,4 @@
-"""Answers of the channel as JSON that every reader takes: numbers that are not finite become null."""
+"""Answers of the channel as JSON that every parser accepts: non-finite numbers become null."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from runtime.clients.channel.outcomes import Outcome
 
 
 def dumps(content: Mapping[str, Any]) -> bytes:
-    """The map as one frame of JSON in ASCII."""
+    """Encode the map as one frame of JSON in ASCII."""
     return json.dumps(to_builtin(content), allow_nan=False).encode()
 
 
 def to_builtin(value: Any) -> Any:
-    """The value in JSON's own types: NaN and infinity are None, arrays lists, what is foreign its text."""
+    """Convert to JSON's own types: NaN and infinity to None, arrays to lists, foreign types to text."""
     if isinstance(value, Mapping):
         return {str(key): to_builtin(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -34,7 +34,7 @@ def to_builtin(value: Any) -> Any:
 def command_answer(
     message: Message, outcome: Outcome, data: Mapping[str, Any], state: str | None
 ) -> dict[str, Any]:
-    """The answer to a command; `state` is that of the station after it, None where that is not known."""
+    """Build the answer to a command; `state`: the station's state after it, None if unknown."""
     result = {"id": outcome.id, "result": outcome.result}
     if outcome.result in ("refused", "failed", "unknown"):
         return {"ok": False, "error": outcome.reason, **message.echo, **result}
@@ -49,5 +49,5 @@ def command_answer(
 
 
 def error_answer(why: str) -> dict[str, Any]:
-    """The answer to what is no command."""
+    """Build the answer to a message that is not a command."""
     return {"ok": False, "error": why}

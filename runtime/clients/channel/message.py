@@ -1,4 +1,4 @@
-"""Message of a script: one frame of JSON, checked for its form before anything is done about it."""
+"""Message of a script: one frame of JSON, whose form is checked before anything is executed."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from runtime.ipc import estop_requests as pressing
 
 LARGEST = 64 * 1024  # bytes of one message
 _PREFIX = "web:"
-_LONGEST_NAME = 80  # characters of a press's name that its answer repeats
+_LONGEST_NAME = 80  # characters of a press's name that are repeated in the answer
 _CLIENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}")
 _OWN_KEYS = ("command", "arguments", "client", "id")
 
 
 class Malformed(RuntimeFault):
-    """A message that cannot be read; the sentence goes back to the script."""
+    """A message cannot be read; the text is returned to the script."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One request: a query, a `cmd` of the older channel (`name` is its verb), or a `command` of ours.
+    """Request: a query, a `cmd` of the older channel (`name` is its verb), or a `command` of EVA Web.
 
-    `argument` is what stands after the verb's colon, None where no colon does. `client` is how the script names
-    itself, "" where it does not. `fields` is the message as it came.
+    `argument` is the text after the verb's colon, None without a colon. `client` is the name that the script gives
+    itself, "" if none. `fields` is the message as received.
     """
 
     form: Literal["query", "cmd", "command"]
@@ -41,12 +41,12 @@ class Message:
 
     @property
     def echo(self) -> dict[str, Any]:
-        """The part of it that an answer repeats."""
+        """Part of the message that its answer repeats."""
         return {} if self.form == "query" else {self.form: self.fields[self.form]}
 
 
 def read(frames: list[bytes]) -> Message:
-    """The message in the frames behind the address; raises Malformed, but for a press of the e-stop."""
+    """Parse the frames behind the address. Raises: Malformed, but never for a press of the e-stop."""
     for frame in frames:
         if (said := pressing.parse_json_press(frame, "command", "cmd")) is not None:
             return _press(said)
@@ -66,7 +66,7 @@ def read(frames: list[bytes]) -> Message:
 
 
 def _press(said: Mapping[str, Any]) -> Message:
-    """A press, of which only what makes sense is kept; `arguments` has the reason."""
+    """Return a press of the e-stop; invalid fields of it are ignored, and `arguments` has the reason."""
     form: Literal["cmd", "command"] = "cmd" if isinstance(said.get("cmd"), str) else "command"
     word = said.get(form)
     named = word if isinstance(word, str) else pressing.NAME
@@ -136,7 +136,7 @@ def _client(fields: Mapping[str, Any]) -> str:
 
 
 def _identity(fields: Mapping[str, Any]) -> str:
-    """The uuid under which a repetition gets the first answer again; another name might come again tomorrow."""
+    """Return the uuid under which a repeated command gets its first answer. A plain name could recur by accident."""
     given = fields.get("id", "")
     if given == "":
         return ""

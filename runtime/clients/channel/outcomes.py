@@ -1,4 +1,4 @@
-"""Outcomes of commands that go on after they were accepted: looked at until they are over."""
+"""Outcomes of commands that continue after they were accepted; polled until they are over."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from runtime.clients.terminal.wait_settled import CALM_TICKS, Settled, is_busy
 
 KEPT = 1000
-# What the session is while each goes on; the rest goes on within the state it was given in.
+# Condition of the session while each command runs; all others run within the state in which they were sent.
 _WHILE = {"setup": "preparing", "home": "preparing", "run": "going", "resume": "going"}
 _WITHIN = {
     "step": "",
@@ -18,20 +18,21 @@ _WITHIN = {
     "cancel": "",
     "gripper": "",
     "move": "motion_done",
-}  # and the event they want
+}  # event that completes each; "" if none
 Events = Callable[[int], list[dict[str, Any]]]
 
 
 def is_long_running(kind: str) -> bool:
-    """True if a command goes on after it was accepted."""
+    """Return True if a command continues after it was accepted."""
     return kind in _WHILE or kind in _WITHIN or kind == "approach"
 
 
 @dataclass(slots=True)
 class Outcome:
-    """One command: "accepted", "refused" or "unknown", and from "accepted" on "done" or "failed".
+    """Outcome of one command: "accepted", "refused", "unknown", "done" or "failed".
 
-    `said` is the word of the script, `kind` the command of ours that it came to.
+    Only "accepted" changes later: to "done" or "failed", or to "unknown" if the station restarts. `said` is the name in
+    the script's message, `kind` the command of EVA Web that it stands for.
     """
 
     id: str
@@ -39,9 +40,9 @@ class Outcome:
     kind: str
     result: str
     reason: str = ""
-    before: Mapping[str, Any] = field(default_factory=dict)  # the status when it was given
-    events: list[dict[str, Any]] = field(default_factory=list)  # since then
-    looked_since: int | None = None  # the step of the first look
+    before: Mapping[str, Any] = field(default_factory=dict)  # status before the command
+    events: list[dict[str, Any]] = field(default_factory=list)  # events after the command
+    looked_since: int | None = None  # control step at the first poll
     calm_since: int | None = None
 
     @property
@@ -49,19 +50,22 @@ class Outcome:
         return {"id": self.id, "said": self.said, "result": self.result, "reason": self.reason}
 
     def resolve(self, result: str, reason: str) -> None:
-        """The command came to `result`, for that reason."""
+        """Set the result and its reason."""
         self.result, self.reason = result, reason
 
     def explain(self, reason: str) -> None:
-        """What is to be said of it besides."""
+        """Set the reason, without changing the result."""
         self.reason = reason
 
     def accept(self, kind: str, before: Mapping[str, Any]) -> None:
-        """The station took the command `kind`; `before` was its status where that goes on, {} where it is done."""
+        """Record that the station accepted the command `kind`.
+
+        `before` is the status before a command that continues; {} if the command is done at once.
+        """
         self.kind, self.result, self.before = kind, "accepted" if before else "done", before
 
     def poll(self, status: dict[str, Any], events_since: Events) -> None:
-        """See whether it is over."""
+        """Update the outcome from the station's status. Call regularly until it is no longer "accepted"."""
         if status["boot"] != self.before["boot"]:
             self._end("unknown", "the station was restarted")
             return
@@ -84,9 +88,9 @@ class Outcome:
         self._end("failed" if failure else "done", failure)
 
     def _is_settled(self, status: dict[str, Any]) -> bool:
-        """True if it was seen to stand twice, so far apart that what there is to tell of it was told.
+        """Return True if the station was at rest in two polls at least CALM_TICKS apart: its events are then complete.
 
-        What is seen in the first ticks says nothing: it may not have begun.
+        Polls in the first CALM_TICKS do not count: the command may not have begun.
         """
         step = status["control"]["step"]
         if self.looked_since is None:
@@ -107,14 +111,14 @@ class Outcome:
 
 
 class Outcomes:
-    """The newest outcomes by id; of several threads."""
+    """Newest outcomes by id; thread-safe."""
 
     def __init__(self) -> None:
         self._kept: dict[str, Outcome] = {}
         self._lock = threading.Lock()
 
     def add(self, outcome: Outcome) -> None:
-        """Remember it; what is known of an id is not replaced."""
+        """Store an outcome; only an "unknown" outcome of the same id is replaced."""
         with self._lock:
             first = self._kept.get(outcome.id)
             if first is None or first.result == "unknown":
@@ -128,6 +132,6 @@ class Outcomes:
 
     @property
     def pending(self) -> list[Outcome]:
-        """Those that go on."""
+        """Outcomes of commands that continue."""
         with self._lock:
             return [outcome for outcome in self._kept.values() if outcome.result == "accepted"]

@@ -1,4 +1,4 @@
-"""A thread with an inbox: what comes in is answered one after the other, however long one takes."""
+"""Worker thread with a queue: messages are answered one after the other, however long each takes."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from runtime.clients.channel import json_answers
 from runtime.clients.channel.message import Message
 
 log = logging.getLogger(__name__)
-WAITING = 64  # messages in one inbox
-EACH = 8  # of one connection, so that a flood finds no room and others do
+WAITING = 64  # messages in one queue
+EACH = 8  # messages per connection, so that a flood leaves room for other connections
 LATE_S = 4.0  # the older channel's scripts wait 5 s for an answer
 _PERIOD_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A message to be answered at `address`; `stops` counts the stops that had come before it."""
+    """Message to answer at `address`; `stops`: number of stops received before it."""
 
     address: list[bytes]
     holder: str
@@ -33,7 +33,7 @@ class Job:
 
 
 class RequestHandler(Protocol):
-    """Answers messages in a lane."""
+    """Handler that answers the messages of a worker."""
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]: ...
     def close(self) -> None: ...
@@ -43,11 +43,11 @@ Reply = Callable[[list[bytes], dict[str, Any]], None]
 
 
 class RequestWorker:
-    """Jobs for one clerk, who is made, used and closed in the lane's own thread.
+    """Thread that passes jobs to one handler, and closes the handler at its end.
 
-    `keep` is done about ten times a second; without it a lane is one of stops, which are carried out whatever comes,
-    also by a lane that is told to end. Elsewhere a command is answered without being carried out where it has waited
-    too long for who asked to be waiting still, or a stop has come after it.
+    `keep` is called about ten times a second. A worker without `keep` is for stops: it executes every job, also those
+    still queued when it ends. Other workers refuse a command that has waited longer than LATE_S, because its sender no
+    longer waits, or that was followed by a stop.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class RequestWorker:
         self._thread.start()
 
     def submit(self, job: Job) -> bool:
-        """Take a job; False if there was no room for it."""
+        """Queue a job; return False if the queue or its connection's share is full."""
         connection = job.address[0]
         with self._lock:
             if self._waiting[connection] >= EACH:
@@ -81,7 +81,7 @@ class RequestWorker:
         return True
 
     def end(self, patience: float) -> None:
-        """Let it finish what it is about and close its clerk; waits so long at most [s]."""
+        """Let the worker finish its present job and close its handler; wait at most `patience` [s]."""
         self._over.set()
         self._thread.join(patience)
         if self._thread.is_alive():
@@ -111,7 +111,7 @@ class RequestWorker:
             return json_answers.error_answer(why) | job.message.echo | {"result": "refused"}
         try:
             return self._clerk.answer(job.holder, job.message)
-        except Exception as error:  # whatever a message meets, the channel goes on
+        except Exception as error:  # no message may end the channel
             log.exception("%s cannot be answered", job.message.name)
             return (
                 json_answers.error_answer(f"handler error: {type(error).__name__}: {error}")
@@ -119,8 +119,8 @@ class RequestWorker:
             )
 
     def _void(self, job: Job) -> str:
-        """Why a command is not carried out any more, "" where it is."""
-        if self._keep is None or job.message.form == "query":  # stops are always carried out
+        """Return why a command is not executed any more, "" if it is."""
+        if self._keep is None or job.message.form == "query":  # stops are always executed
             return ""
         waited = time.monotonic() - job.came
         if job.stops != self._stops():
@@ -133,5 +133,5 @@ class RequestWorker:
         self._kept = time.monotonic()
         try:
             self._keep()
-        except Exception:  # a lease that is not renewed ends, and the robot holds
+        except Exception:  # a lease that is not renewed expires, and the robot holds
             log.exception("what is due beside messages was not done")

@@ -1,4 +1,4 @@
-"""The scripts behind the channel: each a holder of its own, which is alive as long as it speaks."""
+"""Scripts behind the channel: each holds a lease of its own, which lasts while the script sends messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.core.errors import TransportError
 
 @dataclass(slots=True)
 class ScriptSelection:
-    """The choices of one script; what is None or empty was not chosen, and the deployment's own holds."""
+    """Choices of one script. Values that are None or empty were not chosen: the deployment's apply."""
 
     task: str | None = None
     collect_task: str | None = None
@@ -22,35 +22,35 @@ class ScriptSelection:
     target: list[float] | None = None  # joints [D] of `manual_qpos`
 
     def choose(self, **chosen: Any) -> None:
-        """Remember; a strategy adds to the one that was chosen before."""
+        """Record choices; strategy parameters are added to those chosen before."""
         for name, value in chosen.items():
             setattr(self, name, self.strategy | value if name == "strategy" else value)
 
     @property
     def setup(self) -> dict[str, Any]:
-        """The arguments of a set-up with these choices."""
+        """Arguments of a set-up with these choices."""
         wanted = {"task": self.task, "strategy": self.strategy or None}
         return {name: value for name, value in wanted.items() if value is not None}
 
     @property
     def run(self) -> dict[str, Any]:
-        """The arguments of a run with these choices."""
+        """Arguments of a run with these choices."""
         return {} if self.mode is None else {"mode": self.mode}
 
 
-KEPT = 200  # scripts of one connection each, of which the oldest are forgotten
+KEPT = 200  # greatest number of scripts remembered; the oldest are dropped
 
 
 @dataclass(slots=True)
 class Script:
-    """One script: the client that commands for it, what it has chosen, whether it has the lease."""
+    """One script: its client, its choices, and whether it holds the lease."""
 
     client: StationClient
     selection: ScriptSelection = field(default_factory=ScriptSelection)
     holds: bool = False
 
     def claim(self) -> None:
-        """Claim the lease, or renew it; raises Refused where another has it."""
+        """Claim or renew the lease. Raises: Refused if another holder has it."""
         try:
             self.client.claim()
         except Refused:
@@ -59,13 +59,13 @@ class Script:
         self.holds = True
 
     def release(self) -> None:
-        """Give the lease back, where it has it."""
+        """Release the lease if the script holds it."""
         if self.holds:
             self.holds = False
             self.client.release()
 
     def mark_lease_lost(self) -> None:
-        """Its lease is over."""
+        """Record that the lease has ended."""
         self.holds = False
 
     def close(self) -> None:
@@ -73,7 +73,7 @@ class Script:
 
 
 class ScriptActivity:
-    """When each script was last heard; told by one thread, asked by another."""
+    """Time of each script's last message; written by one thread, read by another."""
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
@@ -81,7 +81,7 @@ class ScriptActivity:
         self._lock = threading.Lock()
 
     def record(self, holder: str) -> None:
-        """It has just spoken."""
+        """Record a message of that holder now."""
         with self._lock:
             self._heard.pop(holder, None)
             self._heard[holder] = self._now()
@@ -89,18 +89,18 @@ class ScriptActivity:
                 del self._heard[next(iter(self._heard))]
 
     def silence(self, holder: str) -> float:
-        """For how long it has said nothing [s]."""
+        """Return the time since the holder's last message [s]; infinite if there was none."""
         with self._lock:
             return self._now() - self._heard.get(holder, -float("inf"))
 
     def is_known(self, holder: str) -> bool:
-        """True if it is one of the channel's scripts."""
+        """Return True if the holder is one of the channel's scripts."""
         with self._lock:
             return holder in self._heard
 
 
 class Scripts:
-    """By the name of the holder; used by one thread, whose sockets their clients are."""
+    """Scripts by the name of their holder. One thread uses it, because it owns the sockets of their clients."""
 
     def __init__(
         self, open_client: Callable[[str], StationClient], lives: ScriptActivity, silence_s: float
@@ -109,7 +109,7 @@ class Scripts:
         self._known: dict[str, Script] = {}
 
     def get_or_create(self, holder: str) -> Script:
-        """The script, made where it is new."""
+        """Return the script of that holder; create it if it is new."""
         script = self._known.pop(holder, None) or Script(self._open(holder))
         self._known[holder] = script
         for name in [name for name, other in self._known.items() if not other.holds][:-KEPT]:
@@ -117,7 +117,7 @@ class Scripts:
         return script
 
     def poll(self) -> list[str]:
-        """Renew the leases of those who speak, end those of the silent; returns a sentence for each that ended."""
+        """Renew leases of active scripts, end those of silent scripts; return a sentence for each that ended."""
         told = []
         for holder, script in self._known.items():
             if not script.holds:
@@ -129,7 +129,7 @@ class Scripts:
                     continue
                 script.client.release()
                 told.append(f"{holder} has said nothing for {silence:.1f} s: its lease is over")
-            except TransportError as fault:  # a station that is away has no lease either, in a while
+            except TransportError as fault:  # the lease of an unreachable station expires by itself
                 if silence <= self._silence:
                     continue
                 told.append(f"{holder}: {fault}")
@@ -139,6 +139,6 @@ class Scripts:
         return told
 
     def close(self) -> None:
-        """Close their clients; leases that are held end by themselves."""
+        """Close all clients; leases still held expire by themselves."""
         for script in self._known.values():
             script.close()

@@ -1,4 +1,4 @@
-"""The channel's socket: takes messages from any number of scripts, hands them to lanes, sends the answers."""
+"""Socket of the channel: receives messages of any number of scripts, passes them to workers, sends the answers."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from runtime.core.errors import TransportError
 HOST = "127.0.0.1"
 _REPLIES = "inproc://channel-replies-{}"
 _END_S = 1.0
-_AT_ONCE = 64  # messages, after which answers go out first: a flood keeps nobody waiting for theirs
+_AT_ONCE = 64  # messages per call, so that a flood does not delay answers
 
 
 class ChannelServer:
-    """Listens on loopback alone; what has to stop a robot has lanes of its own, which nothing else delays."""
+    """Server on the loopback address only. Stops have workers of their own, which nothing else delays."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class ChannelServer:
         return RequestWorker(f"channel-{name}", clerk, self._reply, lambda: self._stops, keep)
 
     def _reply(self, address: list[bytes], answer: dict[str, Any]) -> None:
-        """Hand an answer over, from a lane's thread by a socket of that thread."""
+        """Pass an answer from a worker's thread to the server, through a socket of that thread."""
         if not hasattr(self._local, "socket"):
             self._local.socket = self._context.socket(zmq.PUSH)
             self._local.socket.linger = 0
@@ -70,7 +70,7 @@ class ChannelServer:
         self._local.socket.send_multipart([*address, json_answers.dumps(answer)])
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` seconds for messages and answers; pass on those there are, answers first."""
+        """Wait up to `timeout` [s], then send waiting answers and pass on waiting messages, bounded per call."""
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._replies, zmq.POLLIN)
@@ -83,7 +83,7 @@ class ChannelServer:
                 act(frames)
 
     def _route(self, frames: list[bytes]) -> None:
-        """Hand a message to its lane; what cannot be read, or finds no room, is answered at once."""
+        """Pass a message to its worker; answer at once if it cannot be read or the worker's queue is full."""
         end = frames.index(b"", 1) + 1 if b"" in frames[1:] else 1
         address, body = frames[:end], frames[end:]
         try:
@@ -103,15 +103,15 @@ class ChannelServer:
     def _lane_of(self, message: Message) -> RequestWorker:
         if not is_estop(message) and not is_stop(message):
             return self._desk
-        self._stops += 1  # void is what waits
+        self._stops += 1  # commands that are still waiting become void
         return self._estop if is_estop(message) else self._brake
 
     def _send(self, frames: list[bytes]) -> None:
-        """A script that is gone loses its answer."""
+        """Send an answer; it is lost if the script has disconnected."""
         self._socket.send_multipart(frames, zmq.NOBLOCK)
 
     def close(self) -> None:
-        """End the lanes and close the socket; leases that are held end by themselves."""
+        """Stop the workers and close the socket; leases still held expire by themselves."""
         for lane in (self._desk, self._brake, self._estop):
             lane.end(_END_S)
         self._socket.close()
@@ -127,10 +127,12 @@ def _next(socket: Any) -> list[bytes] | None:
 
 
 def _listening(context: zmq.Context[Any], port: int) -> tuple[Any, str]:
-    """A bound socket and its endpoint; raises TransportError where the port is taken."""
+    """Return a bound socket and its endpoint. Raises: TransportError if the port is in use."""
     socket = context.socket(zmq.ROUTER)
     socket.linger = 0
-    socket.set(zmq.MAXMSGSIZE, 16 * LARGEST)  # what is merely too large is told so
+    socket.set(
+        zmq.MAXMSGSIZE, 16 * LARGEST
+    )  # above LARGEST, so that a message slightly too large gets an answer
     try:
         socket.bind(f"tcp://{HOST}:{port or '*'}")
     except zmq.ZMQError as error:

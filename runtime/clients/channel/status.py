@@ -1,4 +1,4 @@
-"""The older channel's status, of a station's snapshot; what has no counterpart here is null, false or empty."""
+"""Status in the older channel's form, from a station's snapshot; keys without a counterpart are null, false, empty."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _ABSENT: dict[str, Any] = {
 
 
 def status(snapshot: Mapping[str, Any], selection: ScriptSelection, newest: str) -> dict[str, Any]:
-    """Every key that the older channel has, with ours as `state`, `reason`, `allowed`, `lease` and `estop`.
+    """Return every key of the older channel, and `state`, `reason`, `allowed`, `lease` and `estop` of EVA Web.
 
     `newest` is the reason of the newest command that was refused or failed.
     """
@@ -66,7 +66,7 @@ def _session(snapshot: Mapping[str, Any], selection: ScriptSelection, newest: st
     return {
         "policy_connected": started and not policy["lost"],
         "policy_error": snapshot["reason"] if policy["lost"] else None,
-        # What waits for an end of whatever goes on, waits for this word.
+        # Scripts wait for "idle" to detect the end of any activity.
         "session_status": "idle" if rests else state,
         "selected_task": selection.task if selection.task is not None else snapshot["task"],
         "selected_collect_task": selection.collect_task,

@@ -1,4 +1,4 @@
-"""Stops, which wait for nothing: `stop` and `halt` by the coordinator, the e-stop by the guard."""
+"""Handlers of stops, which wait for nothing: `stop` and `halt` at the coordinator, the e-stop at the guard."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _ANYBODY = 'anybody may {"command": "estop"}'
 
 
 def is_stop(message: Message) -> bool:
-    """True if it ends whatever goes on, under a lease."""
+    """Return True if the message is a stop that needs a lease."""
     if message.form == "command":
         return message.name in ("stop", "halt")
     return message.form == "cmd" and stops(message.name, message.argument)
 
 
 def is_estop(message: Message) -> bool:
-    """True if it presses the e-stop, which needs no lease."""
+    """Return True if the message presses the e-stop, which needs no lease."""
     return message.form != "query" and message.name == "estop"
 
 
 class StopHandler:
-    """Stops at the coordinator: also what another script of this channel has begun, whose lease it then uses."""
+    """Handler of stops at the coordinator; it uses the lease of whichever script of this channel holds it."""
 
     def __init__(
         self, open_client: Callable[[str], StationClient], lives: ScriptActivity, outcomes: Outcomes
@@ -38,7 +38,7 @@ class StopHandler:
         self._open, self._lives, self._outcomes = open_client, lives, outcomes
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
-        """The answer to `stop` or `halt`; whatever comes with it is not looked at."""
+        """Execute `stop` or `halt` and return the answer; further fields of the message are ignored."""
         kind = "halt" if message.name == "halt" else "stop"
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, kind, "done")
         state = None
@@ -52,7 +52,7 @@ class StopHandler:
         return json_answers.command_answer(message, outcome, {}, state)
 
     def _stop(self, holder: str, kind: str) -> str:
-        """Under the lease that a script of the channel holds, else under one of the asker's own."""
+        """Stop under the lease that a script of the channel holds, else under a lease of the sender."""
         client = self._open(holder)
         try:
             held = client.status()["lease"]["holder"]
@@ -67,17 +67,17 @@ class StopHandler:
             client.close()
 
     def close(self) -> None:
-        """Nothing is kept open."""
+        """Do nothing: no connection stays open."""
 
 
 class EStopHandler:
-    """Presses the e-stop at the guard."""
+    """Handler of e-stop presses, which go to the guard."""
 
     def __init__(self, open_client: Callable[[str], StationClient], outcomes: Outcomes) -> None:
         self._open, self._outcomes = open_client, outcomes
 
     def answer(self, holder: str, message: Message) -> dict[str, Any]:
-        """Answer of the guard to a press; never refused for an argument."""
+        """Press the e-stop and return the guard's answer; a press is never refused for an argument."""
         outcome = Outcome(message.id or str(uuid.uuid4()), message.name, "estop", "done")
         client = self._open(holder)
         try:
@@ -91,4 +91,4 @@ class EStopHandler:
         return json_answers.command_answer(message, outcome, {}, None)
 
     def close(self) -> None:
-        """Nothing is kept open."""
+        """Do nothing: no connection stays open."""

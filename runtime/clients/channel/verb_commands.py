@@ -1,4 +1,4 @@
-"""Commands of ours for a verb of the older channel, and the small words its arguments are made of."""
+"""Commands of EVA Web for a verb of the older channel, and parsers for the verb's arguments."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Step = tuple[str, Mapping[str, Any]]
 
 
 class UnsupportedVerb(RuntimeFault):
-    """A verb, or an argument of one, that means nothing here; the sentence says what to give instead."""
+    """A verb or one of its arguments has no meaning here; the message names an alternative."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandSequence:
-    """Commands of ours in their order, none where nothing is asked of the station; the last one's result counts.
+    """Commands to send in order, none if the verb needs nothing of the station; the last command's result counts.
 
-    `chosen` is remembered once they were accepted; `told` are further keys of the answer, `note` its reason.
+    `chosen` is recorded after they were accepted; `told` are further keys of the answer, `note` is its reason.
     """
 
     steps: tuple[Step, ...] = ()
@@ -57,26 +57,26 @@ class VerbContext:
         raise UnsupportedVerb(f"{self.verb}: {why}")
 
     def no_argument(self) -> None:
-        """Refuse an argument where none belongs."""
+        """Check that the verb has no argument. Raises: UnsupportedVerb."""
         if self.message.argument:
             self.refuse(f"takes no argument; given {self.message.argument!r:.80}")
 
     def text_argument(self, key: str = "") -> str:
-        """The argument, which has to be there; `key` of the message goes before it."""
+        """Return the required argument; the message's field `key` takes precedence. Raises: UnsupportedVerb."""
         said = self.message.fields.get(key, self.message.argument) if key else self.message.argument
         if not isinstance(said, str) or not said.strip():
             self.refuse(f"needs {f'{key!r} in the message, or ' if key else ''}an argument after a colon")
         return said.strip()
 
     def choice_argument(self, *allowed: str) -> str:
-        """The argument, one of `allowed`."""
+        """Return the argument if it is one of `allowed`. Raises: UnsupportedVerb."""
         said = self.text_argument()
         if said not in allowed:
             self.refuse(f"{said!r:.80} is none of {', '.join(allowed)}")
         return said
 
     def table(self) -> dict[str, Any]:
-        """The argument as a JSON object."""
+        """Parse the argument as a JSON object. Raises: UnsupportedVerb."""
         try:
             found = json.loads(self.text_argument())
         except (ValueError, RecursionError) as error:
@@ -86,7 +86,7 @@ class VerbContext:
         return found
 
     def joints(self, values: object) -> list[float]:
-        """One finite number per joint of the robot."""
+        """Check for one finite number per joint; return them as floats [D]. Raises: UnsupportedVerb."""
         names = self.status["facts"]["joint_names"]
         good = isinstance(values, list) and all(
             isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
@@ -97,7 +97,7 @@ class VerbContext:
         return [float(value) for value in values]  # type: ignore[attr-defined]
 
     def number(self, said: str) -> float:
-        """A finite number."""
+        """Parse a finite number. Raises: UnsupportedVerb."""
         try:
             found = float(said)
         except ValueError:
@@ -107,7 +107,10 @@ class VerbContext:
         return found
 
     def arm(self, side: str) -> str:
-        """The arm of a side: its name, or what its name begins with; a robot of one arm has it on both."""
+        """Return the arm with a gripper on a side, by its name or its prefix. Raises: UnsupportedVerb.
+
+        The only gripper of a robot counts as left and as right.
+        """
         arms: list[str] = self.status["facts"]["arms"]
         grips = [arm for arm in arms if arm in self.status["grippers"]]
         found = [arm for arm in grips if side and (arm == side or arm.startswith(side))]

@@ -1,4 +1,4 @@
-"""The verbs of the older channel, each with what it comes to in commands of ours."""
+"""Verbs of the older channel, each with the commands of EVA Web that it stands for."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from dataclasses import dataclass
 
 from runtime.clients.channel.verb_commands import CommandSequence, Step, VerbContext
 
-STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake whatever waits
-_STOPPING_INTENTS = ("accept", "cancel")  # of operator_action
+STOPS = ("stop", "halt", "rollout_stop")  # verbs that overtake waiting messages
+_STOPPING_INTENTS = ("accept", "cancel")  # intents of operator_action that stop
 _MODES = {"real": "continuous", "sim": "sim", "step": "preview", "preview": "preview", "manual": "manual"}
 _TABS = "there are no tabs here: nothing is done"
 
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """One verb: `does` makes its deed, `ours` is what it comes to, for people."""
+    """One verb: `build` returns its commands, `description` explains them to people."""
 
     build: Callable[[VerbContext], CommandSequence]
     description: str
 
 
 def stops(verb: str, argument: str | None) -> bool:
-    """True if a verb ends a motion, whatever else waits."""
+    """Return True if a verb ends a motion, which overtakes waiting messages."""
     intent = (argument or "").partition(":")[0]
     return verb in STOPS or (verb == "operator_action" and intent in _STOPPING_INTENTS)
 
 
 def commands_for_verb(scene: VerbContext) -> CommandSequence:
-    """Commands of ours for a known verb; raises NotOurs with the reason and what to give instead."""
+    """Return the commands for a known verb. Raises: UnsupportedVerb with the reason and an alternative."""
     return VERBS[scene.message.name].build(scene)
 
 
 def _plain(kind: str) -> Callable[[VerbContext], CommandSequence]:
-    """A verb that is a command of ours without arguments."""
+    """Return the builder of a verb that is one command without arguments."""
 
     def does(scene: VerbContext) -> CommandSequence:
         scene.no_argument()
@@ -43,7 +43,7 @@ def _plain(kind: str) -> Callable[[VerbContext], CommandSequence]:
 
 
 def _stopping(kind: str) -> Callable[[VerbContext], CommandSequence]:
-    """A stop is not refused for a word too many."""
+    """Return the builder of a stop, which is not refused for a superfluous argument."""
     return lambda scene: CommandSequence(((kind, {}),))
 
 
@@ -96,7 +96,7 @@ def _saved(scene: VerbContext) -> CommandSequence:
 
 
 def _reset(scene: VerbContext) -> CommandSequence:
-    """After a trial; a run that was halted is over then, one that goes on is not ended by it."""
+    """End a halted run, if there is one, and go home; a run in progress is not ended by it."""
     end: tuple[Step, ...] = (("stop", {}),) if scene.state_is["held"] else ()
     return CommandSequence((*end, ("home", {})))
 
@@ -114,7 +114,7 @@ def _tab(scene: VerbContext) -> CommandSequence:
     return CommandSequence(told={"tab": tab, "armed": armed and tab == "collect"}, note=_TABS)
 
 
-# --- what is selected ----------------------------------------------------------------------------------------
+# --- selections ---------------------------------------------------------------------------------------------
 
 
 def _task(scene: VerbContext) -> CommandSequence:
@@ -143,7 +143,7 @@ def _parameters(scene: VerbContext) -> CommandSequence:
     return CommandSequence((("tune", {"strategy": parameters}),), chosen={"strategy": parameters})
 
 
-# --- what a person does --------------------------------------------------------------------------------------
+# --- manual control -----------------------------------------------------------------------------------------
 
 
 def _target(scene: VerbContext) -> CommandSequence:
@@ -190,7 +190,7 @@ def _gripper(scene: VerbContext) -> CommandSequence:
 
 
 def _gripper_at(scene: VerbContext, arm: str, value: float) -> CommandSequence:
-    """To a number of its own unit, with the other joints where they are commanded."""
+    """Move the gripper to a number in its own unit; the other joints stay as commanded."""
     facts, joints = scene.status["facts"], scene.commanded()
     dims = dict(zip(scene.status["grippers"], facts["gripper_dims"], strict=True))
     joints[dims[arm]] = value
@@ -248,7 +248,7 @@ def _intervention(scene: VerbContext) -> CommandSequence:
 
 
 def _demonstrates(scene: VerbContext) -> bool:
-    """True if the operator is to drive the robot, or does."""
+    """Return True if the station is set up for demonstrations by the operator."""
     collect = scene.status.get("collect")
     return collect is not None and collect["set_up"]
 

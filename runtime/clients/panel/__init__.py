@@ -1,1 +1,1 @@
-"""The station's own panel: a page on its own machine with state, cameras, stop and e-stop, for when the lab is gone."""
+"""Station's own panel: a page on its own machine with state, cameras, stop and e-stop, for use without the lab."""

@@ -1,6 +1,6 @@
 """`python -m runtime.clients.panel STATION [--set-pin]`: the station's own panel, and its PIN.
 
-A family whose deployment has a [panel] starts it by itself; beside a lockstep station it is started by hand.
+A station whose deployment has a [panel] starts it by itself; for a lockstep station it is started by hand.
 """
 
 from __future__ import annotations
@@ -36,7 +36,11 @@ _AGAIN_S = 1.0
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until a signal or the end of standard input; exit code 2 where there is no panel, or no PIN to set."""
+    """Serve until a signal or the end of standard input, or set the PIN.
+
+    Returns:
+        Exit code: 2 if the deployment has no panel or the PIN cannot be set.
+    """
     given = _parser().parse_args(arguments)
     data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
     station_dir = data / "stations" / given.station
@@ -58,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def serve(station_dir: Path, ended: Callable[[], bool]) -> None:
-    """Listen until `ended`; a port that is taken is tried again every second. Raises ConfigurationError."""
+    """Serve until `ended`; if the port is in use, try again every second. Raises: ConfigurationError."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
     pin, endpoints = PinFile(station_dir), Endpoints(station_dir)
     stops, watch = Stops(context, station_dir), Watch(context, station_dir)
@@ -98,7 +102,7 @@ def _open(panel: Panel, ended: Callable[[], bool]) -> PanelServer | None:
 
 
 def _prompt_pin() -> str:
-    """The PIN from a terminal, twice; from a pipe, its first line."""
+    """Read the PIN: twice from a terminal, else the first line of standard input."""
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
     pin = getpass.getpass("PIN: ")

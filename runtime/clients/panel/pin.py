@@ -1,4 +1,4 @@
-"""The panel's PIN: kept as a hash that takes a while to try, and tried less and less often."""
+"""The panel's PIN: stored as a slow hash, and checked less and less often after wrong tries."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from runtime.core.durable_files import write_durably
 from runtime.core.errors import ConfigurationError
 
 SHORTEST, LONGEST = 6, 64
-_COST = {"n": 2**14, "r": 8, "p": 1}  # 16 MB and some 50 ms
+_COST = {"n": 2**14, "r": 8, "p": 1}  # scrypt: 16 MB and about 50 ms
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
-_FREE, _LONGEST_WAIT_S = 3, 300.0  # of one source
+_FREE, _LONGEST_WAIT_S = 3, 300.0  # per source: free failures, longest wait [s]
 _FREE_IN_ALL, _LONGEST_WAIT_IN_ALL_S = 20, 60.0
 _FORGOTTEN_S = 3600.0
 _MOST_SOURCES = 1000
 
 
 class PinFile:
-    """DATA/stations/NAME/panel.pin, which this account alone can read."""
+    """File DATA/stations/NAME/panel.pin, which only this account can read."""
 
     def __init__(self, station_dir: Path) -> None:
         self.path = station_dir / "panel.pin"
 
     def set(self, pin: str) -> None:
-        """Keep another one; ConfigurationError where it is too short or too long."""
+        """Store a new PIN. Raises: ConfigurationError if it is too short or too long."""
         if not SHORTEST <= len(pin) <= LONGEST:
             raise ConfigurationError(
                 f"the PIN has {len(pin)} characters; allowed: {SHORTEST} to {LONGEST}, digits or any others"
@@ -44,7 +44,7 @@ class PinFile:
 
     @property
     def version(self) -> tuple[int, int]:
-        """Which PIN it is: another one after each `set`; (0, 0) where there is none."""
+        """Identity of the stored PIN, which changes with each `set`; (0, 0) if there is none."""
         try:
             found = self.path.stat()
         except OSError:
@@ -52,7 +52,7 @@ class PinFile:
         return found.st_ino, found.st_mtime_ns
 
     def matches(self, pin: str) -> bool:
-        """True if it is this one; ConfigurationError where none is set, or its file is of no use."""
+        """Return True if the PIN is right. Raises: ConfigurationError if none is set or its file is invalid."""
         try:
             if self.path.stat().st_mode & _OTHERS:
                 raise ConfigurationError(f"{self.path} can be read by others; allowed: 0600; set a PIN again")
@@ -77,7 +77,7 @@ class _Failures:
     last: float = 0.0
 
     def add(self, now: float, free: int, longest: float) -> None:
-        """One more: the first ones cost nothing, then it is twice as long each time."""
+        """Count a failure: the first `free` cost nothing, then the wait doubles each time, up to `longest` [s]."""
         self.count, self.last = self.count + 1, now
         beyond = self.count - free
         if beyond >= 0:
@@ -85,9 +85,9 @@ class _Failures:
 
 
 class Attempts:
-    """Who has to wait before a PIN is looked at: each source of wrong ones, and all sources together.
+    """Waiting times before a PIN is checked: per source of wrong PINs, and for all sources together.
 
-    Times on a monotonic clock. The e-stop asks for no PIN, so nobody waits for it.
+    Times are of a monotonic clock. The e-stop needs no PIN and is never delayed.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -96,7 +96,7 @@ class Attempts:
         self._all = _Failures()
 
     def wait(self, source: str) -> float:
-        """Seconds until the next PIN of that source is looked at; 0 where it is at once."""
+        """Return the time until the next PIN of that source is checked [s]; 0 if at once."""
         now = self._now()
         if now - self._all.last > _FORGOTTEN_S:
             self._all = _Failures()
@@ -107,7 +107,7 @@ class Attempts:
         return max(0.0, self._all.until - now, own.until - now if own is not None else 0.0)
 
     def failed(self, source: str) -> None:
-        """A wrong PIN."""
+        """Record a wrong PIN."""
         now = self._now()
         self._sources.setdefault(source, _Failures()).add(now, _FREE, _LONGEST_WAIT_S)
         self._sources.move_to_end(source)
@@ -116,5 +116,5 @@ class Attempts:
         self._all.add(now, _FREE_IN_ALL, _LONGEST_WAIT_IN_ALL_S)
 
     def passed(self, source: str) -> None:
-        """The right one: this source begins anew, what others have tried stays."""
+        """Record the right PIN: failures of this source are cleared, those of all sources stay counted."""
         self._sources.pop(source, None)

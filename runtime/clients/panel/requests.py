@@ -1,14 +1,14 @@
-"""Requests to the panel: who may ask, and what is answered.
+"""Requests to the panel: who may send them, and their answers.
 
 | request | PIN |
 |---|---|
-| GET / and what it loads | no |
+| GET / and the files that it loads | no |
 | POST /estop | no |
 | POST /pin, POST /leave | |
 | GET /state, GET /camera/NAME; POST /stop | yes |
 
-A request for another host than the panel's names is refused (DNS rebinding); so is a POST of another origin, or one
-that names none and has not our header, which no page of another origin can send (CSRF).
+A request for a host other than the panel's names is refused (DNS rebinding). So is a POST from another origin, and one
+without an Origin unless it has our header, which a page of another origin cannot send (CSRF).
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from runtime.clients.panel.watch import Watch
 
 log = logging.getLogger(__name__)
 HEADER = "X-EVA-Panel"
-_LARGEST, _DROPPED = 1024, 65536  # bytes of what is posted; of what is too large as many are read
-_PRESS_S = 0.5  # for which the content of a press is waited for
+_LARGEST, _DROPPED = 1024, 65536  # largest body [bytes]; bytes that are read of a larger body
+_PRESS_S = 0.5  # wait for the body of a press [s]
 _PAGE = Path(__file__).parent / "page"
 _FILES = {"/panel.css": "text/css; charset=utf-8", "/panel.js": "text/javascript; charset=utf-8"}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
-    "X-Frame-Options": "DENY",  # no page of others lies over the buttons
+    "X-Frame-Options": "DENY",  # no other page can cover the buttons (clickjacking)
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "same-origin",  # without a referrer browsers say no origin
+    "Referrer-Policy": "same-origin",  # without a referrer browsers send no usable Origin
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
@@ -55,7 +55,7 @@ _HEADERS = {
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """What requests have to do with: one station's place, PIN, sessions, stops, and what is seen of it."""
+    """Everything that requests use: one station's address, PIN, sessions, stops and displayed state."""
 
     station: str
     place: PanelPlace
@@ -65,17 +65,17 @@ class Panel:
     watch: Watch
 
     def server(self) -> PanelServer:
-        """Listen; raises TransportError, ConfigurationError."""
+        """Start to listen. Raises: TransportError, ConfigurationError."""
         return PanelServer(self.place, partial(PanelRequests, self))  # type: ignore[arg-type]
 
     @property
     def cookie(self) -> str:
-        """Its name: with TLS one that browsers keep from other hosts and from what is not encrypted."""
+        """Name of the cookie: with TLS one that browsers restrict to this host and to encrypted requests."""
         return "__Host-eva-panel" if self.place.certificate else "eva-panel"
 
 
 class PanelRequests(BaseHTTPRequestHandler):
-    """The requests of one connection."""
+    """Handler of the requests of one connection."""
 
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "eva-panel", ""
@@ -85,15 +85,15 @@ class PanelRequests(BaseHTTPRequestHandler):
         super().__init__(connection.socket, address, server)
 
     def handle_one_request(self) -> None:
-        """One request within its time."""
+        """Handle one request within its deadline."""
         self._connection.until = time.monotonic() + REQUEST_S
         self._connection.presses = False
         super().handle_one_request()
 
-    # --- what is asked -----------------------------------------------------------------------------------------
+    # --- requests ----------------------------------------------------------------------------------------------
 
     def do_GET(self) -> None:
-        """The page, its files, the state, pictures."""
+        """Serve the page, its files, the state and images."""
         path = urlsplit(self.path).path
         if not self._known_host():
             return
@@ -112,7 +112,7 @@ class PanelRequests(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def do_POST(self) -> None:
-        """Stops, the PIN."""
+        """Handle stops and the PIN."""
         path = urlsplit(self.path).path
         self._connection.presses = path == "/estop"
         if not self._known_host() or not self._own_origin():
@@ -163,14 +163,14 @@ class PanelRequests(BaseHTTPRequestHandler):
         self._json(HTTPStatus.OK, {}, self._cookie(secret, int(LASTS_S)))
 
     def _send_result(self, told: StopResult) -> None:
-        """As JSON to our script; as text to a form, which works where the script does not."""
+        """Answer with JSON to our script, with text to a form, which works without the script."""
         status = HTTPStatus.OK if told.done else HTTPStatus.BAD_GATEWAY
         if HEADER in self.headers:
             self._json(status, {"done": told.done, "text": told.text})
         else:
             self._answer(status, f"{told.text}\n".encode(), "text/plain; charset=utf-8")
 
-    # --- who asks ----------------------------------------------------------------------------------------------
+    # --- permission ----------------------------------------------------------------------------------------------
 
     def _known_host(self) -> bool:
         hosts = self.headers.get_all("Host", [])
@@ -203,7 +203,7 @@ class PanelRequests(BaseHTTPRequestHandler):
         return found.value if found is not None else ""
 
     def _posted_fields(self) -> dict[str, Any]:
-        """What was posted, {} where it cannot be read: no press is lost for what is in it."""
+        """Return the posted object, {} if it is unreadable: no press is lost because of its content."""
         length = self.headers.get("Content-Length", "0")
         if "Transfer-Encoding" in self.headers or not length.isascii() or not length.isdigit():
             self.close_connection = True
@@ -211,9 +211,11 @@ class PanelRequests(BaseHTTPRequestHandler):
         if (wanted := int(length[:9])) > _LARGEST:
             self.close_connection = True
         if self._connection.presses:
-            self.connection.settimeout(_PRESS_S)  # a press whose end does not come is one all the same
+            self.connection.settimeout(_PRESS_S)  # a press with an incomplete body counts all the same
         try:
-            said = self.rfile.read(min(wanted, _DROPPED))  # who is not heard out does not hear the answer
+            said = self.rfile.read(
+                min(wanted, _DROPPED)
+            )  # a client whose body is not read may not receive the answer
             self.connection.settimeout(REQUEST_S)
             found = json.loads(said) if wanted <= _LARGEST else {}
         except (ValueError, RecursionError):
@@ -231,7 +233,7 @@ class PanelRequests(BaseHTTPRequestHandler):
         return {"Set-Cookie": value}
 
     def _refuse(self, status: HTTPStatus, why: str) -> None:
-        self.close_connection = True  # what was posted is not read
+        self.close_connection = True  # the body has not been read
         self._json(status, {"done": False, "text": why})
 
     def _json(self, status: HTTPStatus, content: Any, more: dict[str, str] | None = None) -> None:
@@ -253,16 +255,16 @@ class PanelRequests(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """What cannot be read as a request is answered as anything else, and is the connection's last."""
+        """Answer an unreadable request in the same form as others, and close the connection."""
         self._refuse(HTTPStatus(code), message or HTTPStatus(code).phrase)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """A line a request, for who looks for something."""
+        """Log the request at debug level."""
         log.debug("%s %s", self._connection.source, format % args)
 
 
 def _uuid(said: dict[str, Any]) -> str:
-    """The page's own, so that what it sends again is no second press; else a new one."""
+    """Return the uuid that the page sent, so that a repetition is not a second press; else a new one."""
     try:
         return str(uuid.UUID(str(said.get("uuid"))))
     except ValueError:

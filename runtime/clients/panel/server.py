@@ -1,7 +1,7 @@
-"""The panel's server: few connections, each with a deadline, and always room for one more.
+"""HTTP server of the panel: few connections, each with a deadline, and always room for another.
 
-Knows nothing of stations. A connection is a thread; where there are too many, the oldest that presses nothing is cut
-off for the newest, so that slow or greedy clients keep nobody from the e-stop.
+Independent of stations. Each connection has a thread; if there are too many, the oldest that is not pressing the
+e-stop is cut off for the newest, so that slow or greedy clients cannot block the e-stop.
 """
 
 from __future__ import annotations
@@ -22,35 +22,38 @@ from runtime.clients.panel.settings import PanelPlace
 from runtime.core.errors import ConfigurationError, TransportError
 
 log = logging.getLogger(__name__)
-REQUEST_S = 10.0  # for one request from its first byte to the end of the answer; and between two
+REQUEST_S = 10.0  # for one request, from its first byte to the end of the answer, and between two [s]
 MOST, MOST_OF_ONE, MOST_THREADS = 32, 12, 64
 _LOOK_S = 0.25
-_RENEWED_S = 30.0  # between two looks at the certificate's files
+_RENEWED_S = 30.0  # between two checks of the certificate's files [s]
 
 
 @dataclass(eq=False, slots=True)
 class Connection:
-    """One connection: of which address, until when [s], and whether it presses the e-stop just now."""
+    """Connection with its source address, its deadline [s], and whether it is pressing the e-stop now."""
 
     socket: socket.socket
     source: str
     until: float
     presses: bool = False
-    gone: bool = False  # it was cut off, and its thread has not noticed yet
+    gone: bool = False  # cut off, but its thread has not ended yet
 
     def cut(self) -> None:
-        """End what it waits for; its thread closes it. Not SSLSocket's own shutdown, which its thread may be in."""
+        """Shut the connection down; its thread then closes it.
+
+        Uses the plain socket's shutdown, because its thread may be inside that of SSLSocket.
+        """
         self.gone = True
         with suppress(OSError):
             socket.socket.shutdown(self.socket, socket.SHUT_RDWR)
 
 
 class PanelServer(ThreadingHTTPServer):
-    """Serves `handler` at the panel's place; `turn` again and again. TransportError where it cannot listen."""
+    """Server at the panel's address; call `turn` repeatedly. Raises: TransportError if it cannot listen."""
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 1024  # a flood that waits to be taken in keeps nobody waiting for a second
+    request_queue_size = 1024  # a flood of waiting connections does not delay others by a second
     timeout = _LOOK_S
 
     def __init__(self, place: PanelPlace, handler: type[BaseHTTPRequestHandler]) -> None:
@@ -68,12 +71,12 @@ class PanelServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Where it listens."""
+        """URL of the panel."""
         host = f"[{self.place.host}]" if ":" in self.place.host else self.place.host
         return f"{self.place.scheme}://{host}:{self.server_address[1]}"
 
     def turn(self) -> None:
-        """Take a connection, or wait a moment for one; cut off those whose time is over."""
+        """Accept a connection or wait a moment; cut off those past their deadline, except during a press."""
         self.handle_request()
         now = time.monotonic()
         with self._lock:
@@ -85,7 +88,7 @@ class PanelServer(ThreadingHTTPServer):
             self._load_renewed(self._tls)
 
     def _load_renewed(self, tls: ssl.SSLContext) -> None:
-        """A certificate that was renewed on the disk is taken as it is, without a restart."""
+        """Load a certificate that was renewed on disk, without a restart."""
         if (written := self.place.written) == self._written:
             return
         self._written = written
@@ -97,22 +100,22 @@ class PanelServer(ThreadingHTTPServer):
     # --- connections -------------------------------------------------------------------------------------------
 
     def server_bind(self) -> None:
-        """As a plain TCP server: its base asks a name server for our own name."""
+        """Bind like a plain TCP server: HTTPServer would ask a name server for our own name."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = self.place.host, int(self.server_address[1])
 
     def get_request(self) -> tuple[Any, Any]:
-        """The next connection; its handshake is its own thread's."""
+        """Accept the next connection; the TLS handshake is left to its thread."""
         found, address = self.socket.accept()
         found.settimeout(REQUEST_S)
-        # else answers wait 40 ms for each other
+        # without it the parts of an answer are delayed by 40 ms (Nagle and delayed ACK)
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
         if self._tls is not None:
             return self._tls.wrap_socket(found, server_side=True, do_handshake_on_connect=False), address
         return found, address
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Give it a thread, and where there are too many take that of another."""
+        """Start a thread for the connection; if there are too many, cut off another."""
         source = str(client_address[0]).removeprefix("::ffff:")
         made = Connection(request, source, time.monotonic() + REQUEST_S)
         with self._lock:
@@ -121,18 +124,18 @@ class PanelServer(ThreadingHTTPServer):
                 self._serving += 1
                 surplus = self._surplus(source)
                 self._connections.append(made)
-        if full:  # all of them are busy with what cannot be cut off
+        if full:  # all threads are in use and none has ended yet
             self.shutdown_request(request)
             return
         if surplus is not None:
             surplus.cut()
         try:
             threading.Thread(target=self._serve, args=(made, client_address), daemon=True).start()
-        except RuntimeError:  # the machine gives no more
+        except RuntimeError:  # the machine cannot start another thread
             self._ended(made)
 
     def _surplus(self, source: str) -> Connection | None:
-        """The oldest connection that has to make room for one more of that source."""
+        """Return the oldest connection that must be cut off to admit another of that source, None if none."""
         going = [one for one in self._connections if not one.gone]
         of_it = [one for one in going if one.source == source]
         among = of_it if len(of_it) >= MOST_OF_ONE else going
@@ -149,7 +152,7 @@ class PanelServer(ThreadingHTTPServer):
         except OSError as error:
             log.debug("%s went away: %s", connection.source, error)
         except Exception:
-            if not connection.gone:  # a file of a connection that was cut off is closed under its thread
+            if not connection.gone:  # errors are expected after a cut: its files were closed under its thread
                 log.exception("a request to the panel failed")
         finally:
             self._ended(connection)

@@ -1,4 +1,4 @@
-"""Browsers that have given the PIN: for half a day, until another PIN is set, or the panel is started again."""
+"""Browser sessions after the PIN was entered: valid for LASTS_S, until another PIN is set or the panel restarts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST = 32
 
 
 class Refusal(ConfigurationError):
-    """The PIN was not taken; `wait_s` is how long none of this source is looked at."""
+    """The PIN is not accepted; `wait_s`: time until another from this source is checked [s]."""
 
     def __init__(self, why: str, wait_s: float = 0.0) -> None:
         super().__init__(why)
@@ -25,7 +25,7 @@ class Refusal(ConfigurationError):
 
 
 class Sessions:
-    """Who has given the PIN; for any thread."""
+    """Open sessions of browsers that have entered the PIN; thread-safe."""
 
     def __init__(self, pin: PinFile, attempts: Attempts, now: Callable[[], float] = time.monotonic) -> None:
         self._pin, self._attempts, self._now = pin, attempts, now
@@ -33,9 +33,9 @@ class Sessions:
         self._trying, self._lock = threading.Lock(), threading.Lock()
 
     def begin(self, pin: str, source: str) -> str:
-        """The secret of a new session; raises Refusal.
+        """Check the PIN and return the secret of a new session. Raises: Refusal.
 
-        One PIN is looked at at a time: who tries many at once gains nothing, and costs little.
+        One PIN is checked at a time: parallel tries gain nothing and cost little.
         """
         if not self._trying.acquire(blocking=False):
             raise Refusal("another PIN is being looked at: try again", 1.0)
@@ -61,13 +61,13 @@ class Sessions:
         return secret
 
     def holds(self, secret: str) -> bool:
-        """True if this is the secret of a session that goes on."""
+        """Return True if the secret belongs to an open session."""
         with self._lock:
             until, version = self._open.get(_digest(secret), (0.0, (0, 0)))
         return self._now() < until and version == self._pin.version != (0, 0)
 
     def end(self, secret: str) -> None:
-        """End it."""
+        """End the session."""
         with self._lock:
             self._open.pop(_digest(secret), None)
 

@@ -1,4 +1,4 @@
-"""Where a station's panel listens: as the deployment says, read without any of what that names."""
+"""Address of a station's panel, read from the resolved deployment without loading anything that it names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _HOST = re.compile(r"([a-z0-9.-]+|\[[0-9a-f:.]+\])(?::\d{1,5})?")
 
 @dataclass(frozen=True, slots=True)
 class PanelPlace:
-    """Address, port, names of hosts in lower case, and the files of a certificate, "" without."""
+    """Address, port, host names in lower case, and the certificate's files, "" without TLS."""
 
     host: str
     port: int
@@ -29,7 +29,7 @@ class PanelPlace:
         return "https" if self.certificate else "http"
 
     def context(self) -> ssl.SSLContext | None:
-        """For TLS, None without; ConfigurationError where its files are of no use."""
+        """Return the TLS context, None without a certificate. Raises: ConfigurationError if its files are invalid."""
         if not self.certificate:
             return None
         made = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -38,7 +38,7 @@ class PanelPlace:
         return made
 
     def load(self, context: ssl.SSLContext) -> None:
-        """Read certificate and key, also anew; raises ConfigurationError."""
+        """Load certificate and key; also after a renewal. Raises: ConfigurationError."""
         try:
             context.load_cert_chain(self.certificate, self.key)
         except (OSError, ssl.SSLError) as error:
@@ -48,14 +48,14 @@ class PanelPlace:
 
     @property
     def written(self) -> tuple[int, ...]:
-        """When the files of the certificate were written: others where it was renewed."""
+        """Modification times of the certificate's files, which change with a renewal."""
         files = [Path(name) for name in (self.certificate, self.key) if name]
         return tuple(file.stat().st_mtime_ns for file in files if file.exists())
 
     def knows(self, host: str) -> bool:
-        """True if a browser that says this Host came by one of the panel's own names, or by an address in numbers.
+        """Return True if the Host header is one of the panel's names or a numeric address.
 
-        A page of another name that is made to lead here (DNS rebinding) says that other name.
+        A page that reaches the panel through DNS rebinding sends its own name.
         """
         said = _HOST.fullmatch(host.strip().lower())
         if said is None:
@@ -71,7 +71,11 @@ class PanelPlace:
 
 
 def place_of(station_dir: Path) -> PanelPlace:
-    """What the deployment of the station that runs, or ran, says; ConfigurationError where it says nothing."""
+    """Return the panel's address from the deployment of a station that runs or has run.
+
+    Raises:
+        ConfigurationError: The station is unknown or its deployment has no panel.
+    """
     path = station_dir / "resolved.json"
     try:
         said = json.loads(path.read_text("utf-8"))["panel"]

@@ -1,4 +1,4 @@
-"""What the panel can do: press the e-stop, and stop a run. Nothing that moves a robot, and no release."""
+"""Actions of the panel: press the e-stop and stop a run. It can neither move a robot nor release the e-stop."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _GUARD_S, _COORDINATOR_S = 1.0, 1.0
 
 @dataclass(frozen=True, slots=True)
 class StopResult:
-    """What became of it: whether the station has done it, and the sentence that says so."""
+    """Result of an action: whether the station has done it, and the text for the page."""
 
     done: bool
     text: str
 
 
 class Stops:
-    """Commands of one station's panel; for any thread, each over a connection of its own."""
+    """Stop commands of one station's panel; thread-safe, because each uses a connection of its own."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
         self._context, self._endpoints = context, Endpoints(station_dir)
 
     def press(self, source: str, uuid: str) -> StopResult:
-        """Press the e-stop: at the guard, and where that does not answer at the coordinator, which has the flag too."""
+        """Press the e-stop at the guard; if it does not answer, at the coordinator, which can set the latch too."""
         command = self._command(
             uuid, "estop", source, {"why": sanitize_text(f"at the station's panel, from {source}")}
         )
@@ -50,7 +50,7 @@ class Stops:
         return StopResult(False, text)
 
     def stop(self, source: str, uuid: str) -> StopResult:
-        """Stop the run, whoever holds the lease."""
+        """Stop the run, regardless of the lease."""
         command = self._command(uuid, "stop", source, {})
         try:
             ack = self._ask(command, ("coordinator", "commands"), _COORDINATOR_S)

@@ -1,4 +1,4 @@
-"""What the panel shows: the station's newest state and pictures, heard while somebody looks at the page."""
+"""State and images that the panel shows; the station's streams are received only while the page is in use."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from runtime.ipc.session_state import complete_state_meaning
 from runtime.link.uplink import read_uplink
 
 log = logging.getLogger(__name__)
-_LOOKED_AT_S = 5.0  # for which it is listened after somebody looked
+_LOOKED_AT_S = 5.0  # reception after the last use of the page [s]
 _TURN_S, _FIND_S = 0.1, 0.5
 SILENT_S = 1.5
-# Of these families reasons are shown: what a person at the robot needs, and nothing of the policy, which a blind plan
-# hides. A sentence that is an argument is looked at likewise.
+# Families of sentences whose reasons are shown: a person at the robot needs them, and they reveal nothing of the
+# policy, which a blind plan hides. Sentences inside arguments are checked in the same manner.
 _SHOWN = frozenset(
     [
         "cameras",
@@ -50,14 +50,14 @@ _ELSEWHERE = "the console and the station's log say why"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A camera's newest picture, JPEG, numbered from 1."""
+    """A camera's newest image, JPEG, numbered from 1."""
 
     number: int
     jpeg: bytes
 
 
 class Watch:
-    """Hears the station in a thread of its own while it is looked at, and nothing else."""
+    """Thread that receives the station's streams while the page is in use."""
 
     def __init__(
         self, context: zmq.Context[Any], station_dir: Path, clock: Callable[[], float] = time.monotonic
@@ -72,12 +72,12 @@ class Watch:
         self._thread.start()
 
     def note_viewer(self) -> None:
-        """Somebody looks just now."""
+        """Record that the page is in use now."""
         self._looked = self._clock()
         self._wanted.set()
 
     def status(self) -> dict[str, Any]:
-        """What the page shows, for JSON; `silent_s`: for how long nothing was heard [s], 0 where it is."""
+        """Return the content of the page, for JSON; `silent_s`: time without a state [s], 0 if below SILENT_S."""
         silent = self._clock() - self._heard
         told = displayed_state(self._state) if self._state else {}
         told["silent_s"] = 0.0 if silent < SILENT_S else round(min(silent, 1e6), 1)
@@ -85,11 +85,11 @@ class Watch:
         return told | {"station": self._station_dir.name, "lab": read_uplink(self._endpoints)}
 
     def picture(self, camera: str) -> Picture | None:
-        """The newest of a camera, None where there is none."""
+        """Return the newest image of a camera, None if there is none."""
         return self._pictures.get(camera)
 
     def end(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._ended.set()
         self._wanted.set()
         self._thread.join()
@@ -101,11 +101,11 @@ class Watch:
                 self._follow()
             except (
                 Exception
-            ):  # whatever a station publishes: e-stop and stop go on, and the next look tries again
+            ):  # no published message may affect stops; the next request of the page tries again
                 log.exception("what the station publishes cannot be shown")
 
     def _follow(self) -> None:
-        """Listen until nobody has looked for a while."""
+        """Receive the streams until the page has not been used for `_LOOKED_AT_S`."""
         state, cameras = _Ear(self._context, "state"), _Ear(self._context, "camera/")
         found = -float("inf")
         try:
@@ -124,7 +124,7 @@ class Watch:
         finally:
             state.turn_to("")
             cameras.turn_to("")
-            self._state, self._pictures = {}, {}  # old pictures are never shown as new ones
+            self._state, self._pictures = {}, {}  # old images are never shown as new
 
     def _place(self, process: str, socket: str) -> str:
         try:
@@ -134,7 +134,7 @@ class Watch:
 
 
 class _Ear:
-    """A stream, wherever it is published."""
+    """Subscription to a stream, at whichever endpoint it is published."""
 
     def __init__(self, context: zmq.Context[Any], stream: str) -> None:
         self._context, self._stream = context, stream
@@ -159,7 +159,7 @@ class _Ear:
 
 
 def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a snapshot what somebody at the robot needs: state, reason, who commands, how long it runs, the e-stop."""
+    """Return the part of a snapshot that a person at the robot needs: state, reason, holder, run time, e-stop."""
     meaning, run = snapshot["state_is"], snapshot.get("run") or {}
     lease = snapshot.get("lease") or {}
     told: dict[str, Any] = {
@@ -182,7 +182,7 @@ def _reason(snapshot: Mapping[str, Any]) -> str:
 
 
 def _open(said: Any) -> bool:
-    """True if a sentence, as it travels, and all sentences within it, are of families that are shown."""
+    """Return True if a sentence and all sentences in its arguments belong to the families that are shown."""
     if not isinstance(said, Mapping) or str(said.get("id")).split(".")[0] not in _SHOWN:
         return False
     within = said.get("arguments") or {}

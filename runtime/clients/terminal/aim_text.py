@@ -1,4 +1,4 @@
-"""Targets of the robot: joints from the command line, and what a target means for the operator."""
+"""Targets of the robot: joints from the command line, and the description of a target for the operator."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from runtime.clients.client import StationClient
 from runtime.core.errors import RuntimeFault
 
-_STILL = 5e-4  # a joint that changes by less is not worth a line [rad, or the gripper's unit]
+_STILL = 5e-4  # smallest change of a joint that is printed [rad, or the gripper's unit]
 
 
 def aim_arguments(client: StationClient, given: argparse.Namespace) -> dict[str, Any]:
-    """Arguments of `aim`, from the command line; RuntimeFault for a joint that the robot has not."""
+    """Return the arguments of `aim` from the command line. Raises: RuntimeFault if the robot has no such joint."""
     arm = getattr(given, "arm", None)
     if arm is not None:
         return {"jog": _jog(given, arm)}
@@ -51,7 +51,14 @@ def _changed(
 def aim_lines(
     aim: Mapping[str, Any], commanded: Sequence[float], names: Sequence[str], speed: float
 ) -> list[str]:
-    """An answer to `aim` for a person: each joint that would move, how far, how long, and what is not as wished."""
+    """Describe an answer to `aim`: each joint that would move, distance, duration, and deviations from the request.
+
+    Args:
+        aim: Answer of the station.
+        commanded: Commanded joints [D].
+        names: Names of the joints [D].
+        speed: Share of the speed of such motions, up to 1.
+    """
     told = [
         f"  {name:<24} {now:+.4f} -> {then:+.4f}"
         for name, now, then in zip(names, commanded, aim["joints"], strict=True)
@@ -64,7 +71,7 @@ def aim_lines(
 
 
 def aim_problem(aim: Mapping[str, Any]) -> str:
-    """Why the aim is not what was asked for, "" where it is."""
+    """Return why the aim differs from the request, "" if it does not."""
     parts = []
     if aim["clipped"]:
         parts.append(f"stopped by the limits of {', '.join(aim['clipped'])}")

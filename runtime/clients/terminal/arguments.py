@@ -1,4 +1,4 @@
-"""Arguments of a command over the bus, from the command line; what was not said stays out."""
+"""Arguments of a command over the bus, from the command line; omitted options are left out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def arguments(given: argparse.Namespace) -> dict[str, Any]:
-    """The arguments of a command that needs nothing of the station to be known."""
+    """Return the arguments of a command that can be built without asking the station."""
     build = _BUILDERS.get(given.command)
     return {} if build is None else _without_none(build(given))
 

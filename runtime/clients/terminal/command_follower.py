@@ -1,4 +1,4 @@
-"""Stays with a command that goes on: the lease lives as long as this terminal, Ctrl-C stops."""
+"""Follower of a long-running command: it keeps the lease as long as the terminal runs; Ctrl-C stops the command."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.clients.client import Refused, StationClient
 from runtime.clients.terminal.keys import Keys, NoKeys, keys
 from runtime.clients.terminal.status_text import distance_text, status_line
 
-# Commands that go on after they were accepted, and what the session is while they do.
+# Commands that continue after they were accepted, and the condition of the session meanwhile.
 LASTING = {
     "setup": "preparing",
     "home": "preparing",
@@ -23,7 +23,7 @@ LASTING = {
     "resume": "going",
 }
 _KEYS = {"\n": "step", "c": "commit", "x": "cancel", "q": "stop"}
-_KEYED = {  # what the keys are, by the mode of the run
+_KEYED = {  # meaning of the keys, by mode of the run
     "step": "Enter: next chunk, x: cancel, q: stop",
     "preview": "Enter: next chunk, c: commit, x: cancel, q: stop",
     "manual": "x: end the motion, q: stop; move, jog and gripper from another terminal",
@@ -38,9 +38,13 @@ EventCallback = Callable[[str], None]
 def follow_command(
     client: StationClient, kind: str, arguments: dict[str, Any], tell: EventCallback
 ) -> dict[str, Any]:
-    """Give a lasting command and stay until it is over, telling how it goes; returns the status then."""
+    """Send a long-running command and report its progress until it is over; Ctrl-C sends `stop`.
+
+    Returns:
+        The status at the end.
+    """
     pressed = threading.Event()
-    # An exception out of nowhere can be lost in a destructor; a Ctrl-C that stops a robot must not be.
+    # KeyboardInterrupt raised inside a destructor is lost; a Ctrl-C that stops a robot must not be, so it sets a flag.
     before = signal.signal(signal.SIGINT, lambda *_: pressed.set())
     try:
         client.command(kind, **arguments)
@@ -63,14 +67,14 @@ def follow_command(
 
 
 def _keys_of(kind: str, status: dict[str, Any]) -> Keys:
-    """The keyboard of a run that a person drives, where there is one."""
+    """Return the keyboard for a run that a person drives, else NoKeys."""
     if LASTING[kind] != "going" or status["mode"] not in _KEYED:
         return NoKeys()
     return keys()
 
 
 def _press(client: StationClient, key: str) -> None:
-    """Do what a key means, if anything; a refusal is told, and the run goes on."""
+    """Send the command of a key, if it has one; a refusal is printed and the run continues."""
     if key not in _KEYS:
         return
     try:
@@ -80,7 +84,7 @@ def _press(client: StationClient, key: str) -> None:
 
 
 class _PeriodicLine:
-    """A line of figures now and then."""
+    """Line of figures, printed at most every `_SHOW_S`."""
 
     def __init__(self, tell: EventCallback) -> None:
         self._tell = tell
@@ -93,7 +97,7 @@ class _PeriodicLine:
 
 
 class _KeyLine(_PeriodicLine):
-    """A line whenever something else goes on, with the keys where the run waits for one."""
+    """Line printed at each change, with the keys if the run waits for a person."""
 
     def __init__(self, tell: EventCallback, mode: str) -> None:
         super().__init__(tell)

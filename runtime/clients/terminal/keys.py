@@ -1,4 +1,4 @@
-"""Single keys of the terminal, where there is a person at it."""
+"""Single keys of the terminal, if a person uses it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from types import TracebackType
 
 
 class Keys(ABC):
-    """A pause that a key can end; to be entered, and left whatever happens."""
+    """Pause that a key can end. A context manager, which restores the terminal."""
 
     @abstractmethod
     def key(self, seconds: float) -> str:
-        """The key that is pressed within so many seconds, "" for none."""
+        """Return the key pressed within so many seconds, "" if none."""
 
     @abstractmethod
     def __enter__(self) -> Keys: ...
@@ -26,11 +26,11 @@ class Keys(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the terminal as it was found."""
+        """Restore the terminal."""
 
 
 class NoKeys(Keys):
-    """Nobody is there to press one."""
+    """Keys without a keyboard: no key is ever pressed."""
 
     def __enter__(self) -> NoKeys:
         return self
@@ -41,13 +41,13 @@ class NoKeys(Keys):
         return None
 
     def key(self, seconds: float) -> str:
-        """Wait."""
+        """Wait and return ""."""
         time.sleep(seconds)
         return ""
 
 
 class Keyboard(Keys):
-    """Keys of a terminal at once, without Enter and without an echo; Ctrl-C remains Ctrl-C."""
+    """Keys of a terminal, read at once, without Enter and without echo; Ctrl-C keeps its meaning."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -65,7 +65,7 @@ class Keyboard(Keys):
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def key(self, seconds: float) -> str:
-        """The next key, Enter as a newline; a terminal that has hung up presses none."""
+        """Return the next key, Enter as a newline; "" if the terminal has hung up."""
         if self._hung_up:
             time.sleep(seconds)
             return ""
@@ -81,10 +81,10 @@ class Keyboard(Keys):
 
 
 def keys() -> Keys:
-    """The keyboard, where standard input is a terminal that this process is in the foreground of."""
+    """Return the keyboard if this process is in the foreground of a terminal, else NoKeys."""
     try:
         descriptor = sys.stdin.fileno()
         ours = os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
-    except (OSError, ValueError, AttributeError):  # no standard input, or one that is no file
+    except (OSError, ValueError, AttributeError):  # standard input is closed or not a file
         ours = False
     return Keyboard(descriptor) if ours else NoKeys()

@@ -1,4 +1,4 @@
-"""A station's snapshot as words and figures: one line for what goes on, a page for how everything is."""
+"""A station's snapshot as text: one line for its activity, a report for all of its state."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def status_line(status: Mapping[str, Any], me: str | None = None) -> str:
-    """One line for a person; with `me`, a lease that somebody else holds is named too."""
+    """Return the status in one line; with `me`, a lease of another holder is named too."""
     parts = [_headline(status), *_run_figures(status), *_tick_figures(status)]
     holder = status["lease"]["holder"]
     if me is not None and holder not in ("", me):
@@ -46,17 +46,17 @@ def _tick_figures(status: Mapping[str, Any]) -> list[str]:
     parts = [f"tick p99 {control['lateness_p99_ms']:.2f} ms, {control['missed']} missed"]
     rates = [rate for name, rate in status["link"]["rates"].items() if name not in ("joints", "eef")]
     if rates:
-        parts.append(f"cameras {min(rates):.0f} Hz")  # the slowest
+        parts.append(f"cameras {min(rates):.0f} Hz")  # slowest camera
     return parts
 
 
 def format_figure(value: float) -> str:
-    """A whole number, or a dash for what has not been measured."""
+    """Format as a whole number, or as a dash if it has not been measured."""
     return "-" if math.isnan(value) else f"{value:.0f}"
 
 
 def status_report(status: Mapping[str, Any], me: str) -> list[str]:
-    """State of the station, in lines."""
+    """Return the state of the station, as lines."""
     rows = [
         ("lease", _lease(status["lease"], me)),
         ("robot", f"{status['robot']} over {status['transport']}"),
@@ -83,7 +83,7 @@ def _lease(lease: Mapping[str, Any], me: str) -> str:
 
 
 def drive_line(said: Mapping[str, Any]) -> str:
-    """The drives as the node says they are."""
+    """Return the state of the drives as the node reports it."""
     if not said:
         return "not reported by the node"
     faults = "".join(f"; fault: {fault}" for fault in said["faults"])
@@ -118,7 +118,7 @@ def _mode(status: Mapping[str, Any]) -> str:
 
 
 def distance_text(found: Mapping[str, Any], what: str) -> str:
-    """Distance of the robot from an action, in words; "" where there is none."""
+    """Return the distance of the robot from an action as text; "" if there is no action."""
     if not found:
         return ""
     far = ": FAR, approach it first" if found["far"] else ""
@@ -126,7 +126,7 @@ def distance_text(found: Mapping[str, Any], what: str) -> str:
 
 
 def tuning_lines(status: Mapping[str, Any], everything: bool = False) -> list[str]:
-    """The strategy in force and its parameters; those that mean nothing to it only where asked for."""
+    """Return the strategy in force and its parameters; `everything`: also those that it does not use."""
     in_force = status["tuning"]
     uses = status["facts"]["strategies"].get(in_force["kind"], [])
     told = [in_force["kind"]]

@@ -13,7 +13,7 @@ from runtime.core.types import Result
 from runtime.ipc.messages import Mode
 from runtime.ipc.session_state import SessionState
 
-# States of a station, and phases of a run that goes on.
+# States of a station, and phases of a run in progress.
 WORDS = (
     *SessionState,
     *("asking", "executing", "waiting", "proposed", "moving", "approaching", "starved"),
@@ -22,15 +22,15 @@ _TRIPLES = (
     "--xyz",
     "--rpy",
     "--joints",
-)  # their numbers may begin with a minus, which argparse takes for an option
+)  # their numbers may start with a minus, which argparse would parse as an option
 
 _PRESSED = "pressed in a terminal"
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
-    """Parsed command line; ends the process with exit code 2 and a sentence if it is no valid one.
+    """Parse the command line; end the process with exit code 2 and a message if it is invalid.
 
-    A press of the e-stop with whatever else is a press: the sentence is said all the same.
+    An e-stop press with invalid further options still counts as a press; the message is printed as well.
     """
     try:
         return _strictly(words)
@@ -42,7 +42,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _press(words: Sequence[str]) -> argparse.Namespace | None:
-    """STATION estop, in either order, among words that mean nothing; None where it is something else."""
+    """Return the press in an invalid line with STATION and estop, in either order; None if it has none."""
     said, data_dir = [], _data_dir()
     left = iter(words)
     for word in left:
@@ -109,7 +109,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
 
 
 def _check(given: argparse.Namespace, command: argparse.ArgumentParser) -> None:
-    """Check options that go together, which argparse cannot."""
+    """Check combinations of options, which argparse cannot."""
     if given.command == "tune" and not (given.show or given.strategy or given.set or given.task is not None):
         command.error("tune needs --strategy, --set, --task or --show")
     if given.command == "setup" and given.cancel and _setup_says_more(given):
@@ -131,7 +131,7 @@ def _setup_says_more(given: argparse.Namespace) -> bool:
     return any(value is not None for value in said)
 
 
-# --- what each command takes -------------------------------------------------------------------------------
+# --- options of each command -------------------------------------------------------------------------------
 
 
 def _nothing(line: argparse.ArgumentParser) -> None:
@@ -170,7 +170,7 @@ def _waits(line: argparse.ArgumentParser) -> None:
 
 
 def _target(line: argparse.ArgumentParser, *more: str) -> Any:
-    """The ways to say where to go, of which there may be one; also the group, for who has one more."""
+    """Add the exclusive options that name a target; return their group, to which a caller may add."""
     group = line.add_mutually_exclusive_group(required=True)
     group.add_argument("--pose", metavar="NAME", help="a pose of the robot")
     group.add_argument(
@@ -310,7 +310,7 @@ def _triple(text: str) -> list[float]:
 
 
 def _joint(text: str) -> tuple[str, str, float]:
-    """(name, "=" or "+" or "-", value)."""
+    """Parse into (name, "=" or "+" or "-", value)."""
     name, found, value = text.partition("=")
     how = name[-1:] if name[-1:] in ("+", "-") else ""
     name = name[: len(name) - len(how)]
@@ -320,7 +320,7 @@ def _joint(text: str) -> tuple[str, str, float]:
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """(key, value): JSON where it is some, else a word; "none" is no value."""
+    """Parse into (key, value): JSON if valid, else text; "none" becomes None."""
     key, found, value = text.partition("=")
     if not (found and key):
         raise argparse.ArgumentTypeError(f"{text} was given; allowed: KEY=VALUE")

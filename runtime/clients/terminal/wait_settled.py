@@ -1,4 +1,4 @@
-"""Waits until what was asked for is over, so that a script can ask for the next thing."""
+"""Wait for the end of a command, so that a script can send the next."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any
 from runtime.clients.client import StationClient
 
 _BUSY = ("asking", "executing", "moving", "approaching", "starved")
-CALM_TICKS = 3  # an order reaches control, and its answer us, within that many
+CALM_TICKS = 3  # ticks within which an order reaches control and its effect reaches the status
 _LOOK_S = 0.02
 _FAILURES = ("chunk_dropped", "policy_failed", "policy_lost")
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """The state when it was asked for, the status when all was over, and the events until then."""
+    """End of a command: the state when it was sent, the status when it was over, and the events until then."""
 
     began: str
     status: dict[str, Any]
     events: list[dict[str, Any]]
 
     def failure(self, wants: str = "") -> str:
-        """Why it did not go well, "" where it did; `wants` is the kind of the event that belongs to it."""
+        """Return why the command failed, "" if it did not; `wants`: kind of the event that must have occurred."""
         if self.status["state"] != self.began:
             return f"{self.began} no longer: {self.status['state']}, {self.status['reason']}"
         failed = [str(event["text"]) for event in self.events if event["kind"] in _FAILURES]
@@ -38,9 +38,9 @@ class Settled:
 def wait_until_settled(
     client: StationClient, before: dict[str, Any], tell: Callable[[dict[str, Any]], None]
 ) -> Settled:
-    """Stay until nothing moves and nothing is asked any more, or the state of `before` has changed.
+    """Wait until nothing moves and no request is pending, or the state differs from that of `before`.
 
-    Events since the status `before` are told as they come.
+    The lease is renewed meanwhile; events since the status `before` are passed to `tell`.
     """
     began, newest_event = before["state"], before["newest_event"]
     events: list[dict[str, Any]] = []
@@ -65,5 +65,5 @@ def wait_until_settled(
 
 
 def is_busy(status: dict[str, Any]) -> bool:
-    """True if something goes on; a gripper moves also where no run is open."""
+    """Return True if an activity is in progress. A gripper may also move without an open run."""
     return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

@@ -1,4 +1,4 @@
-"""Shows what happens at a station: figures as they change, events by their numbers, so that none is missed."""
+"""Display of a station's activity: figures as they change, and every event, by number."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ _PATIENCE_S = 2.0
 
 
 def watch(client: StationClient, as_json: bool) -> int:
-    """Print until interrupted; the stream only wakes, events are fetched by number so that none is missed."""
+    """Print figures and events until interrupted. Raises: TransportError if the station is gone.
+
+    The stream only wakes the loop; events are fetched by number, so that none is missed.
+    """
     status = client.status()
     boot, seen, shown = status["boot"], status["newest_event"], 0.0
     subscriber = client.subscribe("state")
@@ -25,9 +28,9 @@ def watch(client: StationClient, as_json: bool) -> int:
         if "state" in heard:
             status = complete_state_meaning(heard["state"])
         else:
-            status = client.status()  # raises a sentence where the station is gone
+            status = client.status()  # raises TransportError if the station is gone
             subscriber.close()
-            subscriber = client.subscribe("state")  # a restarted one has other sockets
+            subscriber = client.subscribe("state")  # a restarted station has new sockets
         if status["boot"] != boot:
             boot, seen = status["boot"], 0
         if status["newest_event"] > seen:
@@ -42,12 +45,12 @@ def watch(client: StationClient, as_json: bool) -> int:
 
 
 def print_event(event: dict[str, Any], as_json: bool = False) -> None:
-    """One event as a line."""
+    """Print one event as a line."""
     print(json.dumps(event, default=str) if as_json else f"  {event['kind']}: {event['text']}", flush=True)
 
 
 def list_events(client: StationClient, given: argparse.Namespace) -> int:
-    """Print what has happened since the station was started, with how long ago each was."""
+    """Print the events since the start of the station, each with its age."""
     now = client.status()["clock"]
     events = [
         event
