@@ -1,1 +1,1 @@
-"""Simulated robots: execution nodes of every transport, the bench that they move, and what draws it."""
+"""Simulated robots: execution nodes of every transport, the bench with its objects, and the renderer of cameras."""

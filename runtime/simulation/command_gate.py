@@ -1,7 +1,7 @@
-"""Messages that a careful execution node accepts: one master, fresh finite targets within limits, a deadline.
+"""Command filter of a careful execution node: one master, fresh finite targets within limits, a deadline.
 
-Words that switch the drives of a simulated robot (runtime.simulation.drives) are taken from any client. A node with
-a bench also takes the word "scene_reset", with `id`, `seed` and, if wanted, `positions`.
+Control words that switch the drives of a simulated robot (`runtime.simulation.drives`) are accepted from any client. A
+node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions`.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Control = Literal["collect_start", "collect_stop", "hil_start", "hil_stop"]
-ANONYMOUS = "anonymous"  # older clients do not say who they are
-MASTER_SILENCE = 1.0  # s after which another client may take over
-_TOLERANCE = 1e-5  # limits travel as float32
+ANONYMOUS = "anonymous"  # name of clients that send none, as older versions
+MASTER_SILENCE = 1.0  # [s] silence after which another client may become master
+_TOLERANCE = 1e-5  # limits are transmitted as float32
 _RESET = "scene_reset"
-_LONGEST_ID = 128
-_MESSAGE_LIMIT = 1024 * 1024  # bytes; a command has a few hundred
+_LONGEST_ID = 128  # characters
+_MESSAGE_LIMIT = 1024 * 1024  # [bytes]; a command has a few hundred
 
 
 @dataclass(frozen=True, slots=True)
 class AcceptedCommand:
-    """A message that counts: a target [D] to go to, a control word, a wish to lay the bench anew, a switch."""
+    """Accepted message; exactly one field is set: a target [D], a control word, a bench reset or a drive switch."""
 
     target: Float64 | None = None
     control: Control | None = None
@@ -43,27 +43,32 @@ class AcceptedCommand:
 
 
 class CommandGate:
-    """Judges commands by their arrival on our own clock; `refused` counts what it sent away, by reason.
+    """Filter that decides which command messages take effect, by their arrival time on the node's own clock.
 
-    A target that was sent more than `deadline` seconds ago is refused as well, by the master's own clock, where that
-    goes on. `ack` is the `seq` of the master's newest message that took effect, None where it does not number.
-    `bench` says whether there is one that could be laid anew.
+    `refused` counts rejected messages by reason. A target is also refused if it was sent more than `deadline` [s] ago
+    according to the master's own clock, provided that this clock advances. `ack` is the `seq` of the master's newest
+    message that took effect, None if the master does not number its messages. `bench` is whether the node has a bench
+    that can be reset.
     """
 
     def __init__(self, robot: Robot, deadline: float, bench: bool = False) -> None:
         self._robot = robot
         self._deadline = deadline
         self._bench = bench
-        self._heard = float("-inf")  # the master's last message, accepted or not
+        self._heard = float("-inf")  # arrival of the master's last message, accepted or not
         self._accepted = float("-inf")
-        self._stamp = float("-inf")  # of the master's newest command, on its clock
+        self._stamp = float("-inf")  # stamp of the master's newest command, on its clock
         self._clock = ClockMap()
         self.master: str | None = None
         self.ack: int | None = None
         self.refused: Counter[str] = Counter()
 
     def accept(self, payload: bytes, arrival: float) -> AcceptedCommand | None:
-        """The message if it may take effect, else None and one more in `refused`."""
+        """Return the command in a message if it may take effect, else None.
+
+        A rejected message is counted in `refused`. Messages with target "sim" have no effect and are not counted.
+        `arrival` is the time of reception on the node's clock [s].
+        """
         message = self._message(payload)
         if message is None:
             return None
@@ -90,7 +95,7 @@ class CommandGate:
         return None
 
     def is_silent(self, now: float) -> bool:
-        """True if no target was accepted within the deadline: the robot has to hold."""
+        """Return True if no target was accepted within the deadline, so that the robot has to hold."""
         return now - self._accepted > self._deadline
 
     def _message(self, payload: bytes) -> dict[Any, Any] | None:
@@ -104,7 +109,7 @@ class CommandGate:
         return message
 
     def _rules(self, message: dict[Any, Any], arrival: float) -> bool:
-        """The first to speak rules until it is silent for a second."""
+        """Return True if the sender is the master: the first sender, until it is silent for MASTER_SILENCE."""
         name = message.get("master")
         name = name if isinstance(name, str) else ANONYMOUS
         if self.master != name and self.master is not None and arrival - self._heard <= MASTER_SILENCE:
@@ -112,12 +117,12 @@ class CommandGate:
             return False
         if self.master != name:
             self.master, self.ack = name, None
-            self._stamp, self._clock = float("-inf"), ClockMap()
+            self._stamp, self._clock = float("-inf"), ClockMap()  # every master has its own clock
         self._heard = arrival
         return True
 
     def _switch(self, word: str, message: dict[Any, Any]) -> AcceptedCommand | None:
-        """Whoever stands at the robot switches its drives; that does not make them its master."""
+        """Accept a drive switch from any client, because operators at the robot send it; the master does not change."""
         switch = drives.parse_switch(word, message)
         if switch is None:
             self.refused["malformed"] += 1
@@ -148,12 +153,12 @@ class CommandGate:
         )
 
     def _late(self, stamp: object, arrival: float) -> bool:
-        """True if the target was sent too long ago; never where the sender's clock says nothing."""
+        """Return True if the target was sent too long ago; False if it has no stamp, or the clock does not advance."""
         if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
             return False
         before, self._stamp = self._stamp, cast(float, stamp)
         if before == self._stamp:
-            return False  # a clock that stands still
+            return False  # the clock does not advance, so age is unknown
         return arrival - self._clock.map(self._stamp, arrival) > self._deadline
 
     def _wrong(self, action: object) -> str:

@@ -1,7 +1,7 @@
-"""The drives of a simulated robot: on or off, with faults; `python -m runtime.simulation.drives` switches them.
+"""Drives of a simulated robot, on or off, with faults; `python -m runtime.simulation.drives` switches them.
 
-Words on the node's command socket: "drives_disable", "drives_enable" (which clears all faults), "drives_fault"
-with a `fault`, a sentence. They come from whoever stands at the robot, so they ask for no mastery.
+Control words on the node's command socket: "drives_disable", "drives_enable" (which clears all faults), and
+"drives_fault" with a `fault`, a sentence. Operators at the robot send them, so the sender need not be the master.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from runtime.core import msgpack_arrays
 from runtime.transports.node_messages import DRIVE_FAULT_LENGTH, DRIVE_FAULTS_LIMIT
 
 WORDS = ("drives_disable", "drives_enable", "drives_fault")
-_PATIENCE_S = 5.0
+_PATIENCE_S = 5.0  # wait for a node, and for the message to be sent
 
 
 @dataclass(frozen=True, slots=True)
 class DriveSwitch:
-    """Switching of the drives: on, which clears all faults; off; off because of `fault`."""
+    """Request to switch the drives: on, which clears all faults; off; or off because of `fault`."""
 
     on: bool
     fault: str = ""
 
 
 def parse_switch(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
-    """Switch that one of WORDS asks for; None if its fault is invalid."""
+    """Return the switch that one of WORDS requests; None if its fault is missing, empty or too long."""
     if word != "drives_fault":
         return DriveSwitch(word == "drives_enable")
     fault = message.get("fault")
@@ -40,30 +40,32 @@ def parse_switch(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
 
 
 class Drives:
-    """Off while there is a fault; what is off moves nothing."""
+    """State of the drives: off while there is a fault; disabled drives do not move the robot."""
 
     def __init__(self, enabled: bool = True, faults: Sequence[str] = ()) -> None:
         self._faults = list(faults)
         self.enabled = enabled and not faults
 
     def apply(self, switch: DriveSwitch) -> None:
-        """Go on, off, or off with one more fault, of which the newest are kept."""
+        """Switch on, off, or off with one more fault; only the newest DRIVE_FAULTS_LIMIT faults are retained."""
         self.enabled = switch.on
         faults = [] if switch.on else [*self._faults, *([switch.fault] if switch.fault else [])]
         self._faults = faults[-DRIVE_FAULTS_LIMIT:]
 
     def status(self) -> dict[str, object]:
-        """The node's report of its drives."""
+        """Return the state of the drives for the node's observation message."""
         return {"enabled": self.enabled, "faults": list(self._faults)}
 
 
 def send_word(endpoint: str, word: str, fault: str = "") -> bool:
-    """Say one of WORDS to the node that takes commands at `endpoint`; False where no node came to listen."""
+    """Send one of WORDS to the node that receives commands at `endpoint`; return False if no node connects in time."""
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XPUB)
     try:
         socket.setsockopt(zmq.LINGER, int(_PATIENCE_S * 1000))
         socket.connect(endpoint)
-        if not socket.poll(int(_PATIENCE_S * 1000)):  # the node's subscription: from now on it hears us
+        if not socket.poll(
+            int(_PATIENCE_S * 1000)
+        ):  # the node's subscription; messages sent before it would be lost
             return False
         socket.send(msgpack_arrays.pack({"t": 0.0, "target": word, "fault": fault}))
         return True
@@ -73,7 +75,7 @@ def send_word(endpoint: str, word: str, fault: str = "") -> bool:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where the node was told, 1 where none listens."""
+    """Switch the drives of a node; exit code 0 if the word was sent, 1 if no node listens."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.simulation.drives", description="Switches the drives of a simulated robot."
     )

@@ -1,4 +1,4 @@
-"""A simulated node's surroundings: test pictures, a bench with blocks and a plate, or one with a belt."""
+"""Environments of a simulated node: test patterns, a bench with blocks and a plate, or a bench with a belt."""
 
 from __future__ import annotations
 
@@ -22,87 +22,96 @@ NAMES = ("none", "tabletop", "conveyor")
 
 
 class Environment(ABC):
-    """Effects of time on everything but the node itself, and the pictures of its cameras."""
+    """Environment of a simulated robot: advances the robot and everything that it touches, and renders the cameras."""
 
     @abstractmethod
     def move(self, plant: Plant, seconds: float) -> None:
-        """Let time pass for the plant and all that it touches."""
+        """Advance the plant and everything that it touches by `seconds`."""
 
     @abstractmethod
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """One BGR uint8 [H, W, 3] per camera key; whoever has them may not write to them."""
+        """Return a BGR uint8 [H, W, 3] image per camera key; callers must not write to them."""
 
     @abstractmethod
     def truth(self) -> dict[str, object] | None:
-        """Ground truth of the bench; None where there is none."""
+        """Return the ground truth of the bench; None if there is no bench."""
 
     @abstractmethod
     def reset(self, wish: ResetRequest) -> None:
-        """Lay the bench anew; BenchError where that cannot be."""
+        """Reset the bench.
+
+        Raises:
+            BenchError: If the requested layout is not possible.
+        """
 
 
 class TestPatternEnvironment(Environment):
-    """Moving test pictures and nothing to touch."""
+    """Environment without a bench: moving test patterns, and no objects."""
 
-    __test__ = False  # no test case, whatever its name begins with
+    __test__ = False  # not a test case, despite the prefix of its name
 
     def __init__(self, robot: Robot, options: argparse.Namespace) -> None:
         self._scene = Scene(robot, options.height, options.width, options.seed)
 
     def move(self, plant: Plant, seconds: float) -> None:
-        """The plant moves freely."""
+        """Advance the plant, which moves freely."""
         plant.advance(seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """Test pictures with the frame's number in them."""
+        """Return test patterns that contain the frame number."""
         return self._scene.draw(frame, seconds, q)
 
     def truth(self) -> None:
-        """Nothing lies anywhere."""
+        """Return None: there is no bench."""
 
     def reset(self, wish: ResetRequest) -> None:
-        """There is nothing to lay; the gate lets no wish come here."""
+        """Raise AssertionError: there is no bench, and the command gate refuses such requests."""
         raise AssertionError(f"reset {wish.id} of a bench that is not there")
 
 
 class BenchEnvironment(Environment):
-    """A tabletop, and its pictures."""
+    """Environment with a simulated bench, and the renderer of its cameras."""
 
     def __init__(self, robot: Robot, options: argparse.Namespace, tabletop: Tabletop) -> None:
-        import cv2  # which no other node needs
+        import cv2  # no other environment needs it
 
         from runtime.simulation.render import Renderer
 
         cv2.setNumThreads(1)  # the other cores belong to the station
         self._tabletop = tabletop
         self._renderer = Renderer(robot, tabletop.bench, options.width, options.height)
-        self._drawn: tuple[bytes, dict[str, UInt8]] = (b"", {})  # the last moment, and how it looks
+        self._drawn: tuple[bytes, dict[str, UInt8]] = (b"", {})  # state that was drawn last, and its images
 
     def move(self, plant: Plant, seconds: float) -> None:
-        """The plant moves, and what its fingers touch."""
+        """Advance the plant, and the objects that its fingers touch."""
         self._tabletop.advance(plant, seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """The bench as the cameras see it; drawn anew only where something has moved, which is most of the work."""
+        """Return the rendered images; they are drawn only if something has moved, as drawing is most of the work."""
         state = self._tabletop.state()
         moment = np.concatenate([q, state.plate, *(block.pose.ravel() for block in state.blocks)]).tobytes()
         if moment != self._drawn[0]:
             self._drawn = moment, self._renderer.draw(q, state)
             for picture in self._drawn[1].values():
-                picture.setflags(write=False)  # it may be shown again
+                picture.setflags(write=False)  # the same arrays may be returned again
         return dict(self._drawn[1])
 
     def truth(self) -> dict[str, object]:
-        """Places of things on the bench, and progress of the task."""
+        """Return the places of objects on the bench, and the progress of the task."""
         return self._tabletop.truth()
 
     def reset(self, wish: ResetRequest) -> None:
-        """Lay the bench as wished."""
+        """Reset the bench."""
         self._tabletop.reset(wish)
 
 
 def make_environment(robot: Robot, options: argparse.Namespace) -> Environment:
-    """Those that `options.bench` names; SetupError for more blocks than it takes."""
+    """Return the environment that `options.bench` names.
+
+    Raises:
+        SetupError: If --blocks is not 1 with a conveyor.
+        BenchError: If the blocks do not fit on the tabletop.
+    """
     if options.bench == "conveyor":
         if options.blocks != 1:
             raise SetupError(

@@ -1,4 +1,4 @@
-"""The simulated node within this process, for lockstep: its real messages both ways, and no sockets."""
+"""Simulated node within this process, for lockstep: its real messages in both directions, without sockets."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _NAME = "lockstep"
 
 
 class InProcessNode(Source, Sink):
-    """Both halves of a transport around a node that is not opened.
+    """Source and sink of a transport around a `Node` whose sockets are not opened.
 
-    The node moves when it is looked at: it obeys what was sent since the last time, then lets that time pass. So
-    an observation shows what came of the commands of all earlier ticks. Everything passes the codec, the node's
-    own gate, and the check of its messages.
+    The node advances in `receive`: it executes the commands sent since the previous observation, then lets the elapsed
+    time pass. An observation therefore shows the effect of the commands of all earlier ticks. Messages pass through the
+    codec, the node's command gate and the transport's message check, as with sockets.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class InProcessNode(Source, Sink):
         clock: Clock,
         seen: Callable[[Observation], None] = lambda observation: None,
     ) -> None:
-        """`seen` is given every observation too: somebody else looks at the bench."""
+        """Wrap `node`; `seen` is also called with every observation, for example by a simulated leader."""
         self._node, self._clock, self._seen = node, clock, seen
         self._messages = NodeMessages(robot, "bgr", frozenset(), MESSAGE_LIMIT)
         self._commands: list[bytes] = []
@@ -45,12 +45,13 @@ class InProcessNode(Source, Sink):
         self._looked: float | None = None
 
     def connect(self) -> None:
-        """There is nothing to open."""
+        """Do nothing: there is no connection."""
 
     def receive(self, timeout: float) -> Observation | None:
-        """Present observation of the node; None if no time has passed since the last one. It never waits.
+        """Return an observation of the node; None if no time has passed since the previous one. Never waits.
 
-        Raises MessageRefused for an invalid message: this node has no excuse.
+        Raises:
+            MessageRefused: If the node's message is invalid, which would be a defect of the simulation.
         """
         now = self._clock.now()
         if self._looked is not None and now <= self._looked:
@@ -74,15 +75,15 @@ class InProcessNode(Source, Sink):
         return observation
 
     def send(self, command: RobotCommand) -> None:
-        """The node obeys it when it is looked at next."""
+        """Queue a command, which the node executes at the next `receive`."""
         self._queue_message({"t": command.time, "target": "real", "action": command.action})
 
     def send_control_word(self, word: str, data: Mapping[str, Any]) -> None:
-        """The same for a control word."""
+        """Queue a control word, which the node executes at the next `receive`."""
         self._queue_message({**data, "t": self._clock.now(), "target": word})
 
     def close(self) -> None:
-        """Release what the node has."""
+        """Release the node's resources."""
         self._node.close()
 
     def _queue_message(self, message: dict[str, Any]) -> None:
@@ -90,5 +91,5 @@ class InProcessNode(Source, Sink):
 
 
 def _rgb(bgr: UInt8) -> UInt8:
-    """A picture of a node as one of ours."""
+    """Convert a node's BGR image to RGB."""
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

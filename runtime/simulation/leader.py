@@ -1,7 +1,7 @@
-"""A simulated leader: `python -m runtime.simulation.leader --robot NAME`; a person's arm that shows the robot the task.
+"""Simulated leader: `python -m runtime.simulation.leader --robot NAME`; stands in for a person's arm that demonstrates.
 
-It listens to a simulated execution node and publishes, over ZMQ, where the tabletop's own script would have the
-robot a moment later: as somebody does who looks at the bench and moves a leader arm. What it says is what
+It subscribes to a simulated execution node and publishes over ZMQ the joints that the script of the tabletop task would
+reach a moment later, as a person does who watches the bench and moves a leader arm. Its messages are those that
 `runtime.teleoperators.zmq` reads.
 """
 
@@ -34,13 +34,16 @@ if TYPE_CHECKING:
     from robots import Robot
     from runtime.core.types import Observation
 
-_ASKS_S = 0.2  # the script is asked anew; between that it goes on along its rows
+_ASKS_S = 0.2  # [s] period at which the script plans anew; in between, its rows are followed
 _HORIZON_S = 1.0
-_AHEAD_S = 0.1  # a hand is ahead of the robot that follows it
+_AHEAD_S = 0.1  # [s] lead: a leader is ahead of the robot that follows it
 
 
 class SimulatedLeader:
-    """Stands at `start` [D] until the node is seen, then does what the script does from where the robot is."""
+    """Leader joints from a script: at `start` [D] until the first observation, then along the script's rows.
+
+    `rate` is that of the script's rows [Hz].
+    """
 
     def __init__(self, robot: Robot, script: Script, task: str, rate: float, start: Float64) -> None:
         self._robot, self._task, self._rate = robot, task, rate
@@ -50,7 +53,7 @@ class SimulatedLeader:
         self._asked = float("-inf")
 
     def update(self, observation: Observation, now: float) -> None:
-        """The bench and the robot now; the script is asked five times a second."""
+        """Update the script's rows from an observation, at most every _ASKS_S seconds; `now` is the time [s]."""
         if now - self._asked < _ASKS_S:
             return
         q = np.asarray(observation.qpos, np.float64)
@@ -58,14 +61,14 @@ class SimulatedLeader:
         self._asked = now
 
     def joints_at(self, now: float) -> Float64:
-        """The leader's joints [D]."""
+        """Return the leader's joints [D] at time `now` [s], slightly ahead of the robot that follows."""
         if self._rows is not None:
             row = int((now - self._asked + _AHEAD_S) * self._rate)
             self._joints = self._rows[min(row, len(self._rows) - 1)]
         return self._joints
 
     def message(self, now: float) -> bytes:
-        """The leader's message, packed."""
+        """Return the leader's message at time `now` [s], packed."""
         parts = self._robot.split(self.joints_at(now)).items()
         return msgpack_arrays.pack(
             {"t": now, "state": {name: part.astype(np.float32) for name, part in parts}}
@@ -73,7 +76,7 @@ class SimulatedLeader:
 
 
 class AttachedLeader(Leader):
-    """A simulated leader within the station's own process, for lockstep: at each observation it says where it is."""
+    """Simulated leader within the station's process, for lockstep; it reports its joints at each observation."""
 
     def __init__(self, robot: Robot, clock: Clock, simulated: SimulatedLeader) -> None:
         super().__init__(robot, clock)
@@ -84,22 +87,28 @@ class AttachedLeader(Leader):
         return "the simulated leader"
 
     def connect(self) -> None:
-        """There is nothing to open."""
+        """Do nothing: there is no connection."""
 
     def update(self, observation: Observation) -> None:
-        """The bench and the robot now."""
+        """Update the simulated leader from an observation, and report its joints."""
         now = self._clock.now()
         self._simulated.update(observation, now)
         self._set_pose(self._simulated.joints_at(now), now)
 
     def close(self) -> None:
-        """There is nothing to release."""
+        """Do nothing: there are no resources."""
 
 
 def demonstrator(
     robot: Robot, task: str, seed: int, behaviour: str = "pick_place", start: str = "home"
 ) -> SimulatedLeader:
-    """Who shows the robot the task, by the script of that behaviour; before it sees the bench at the pose `start`."""
+    """Return a simulated leader that performs `task` by the script of `behaviour` ("pick_place", else a gesture).
+
+    Before the first observation it is at the pose `start`.
+
+    Raises:
+        SetupError: If the robot has no such pose, or no arm of it can pick objects up.
+    """
     rate = robot.control_rate
     horizon = round(_HORIZON_S * rate)
     script: Script = WavingScript(robot, horizon, rate, seed)
@@ -109,7 +118,7 @@ def demonstrator(
 
 
 class LeaderPublisher:
-    """A leader on its socket; `tick` hears the node and says where the leader is."""
+    """Publisher of a simulated leader; each `tick` reads the node's observation and sends one message."""
 
     def __init__(self, leader: SimulatedLeader, source: NodeSource, endpoint: str, clock: Clock) -> None:
         self._leader, self._source, self._clock = leader, source, clock
@@ -117,26 +126,26 @@ class LeaderPublisher:
 
     @property
     def address(self) -> str:
-        """Bound address of its publisher."""
+        """Bound address of the publisher."""
         return address(self._socket)
 
     def tick(self, seconds: float) -> None:
-        """One message."""
+        """Update the leader from the node's newest observation if there is one, and publish its joints."""
         now = self._clock.now()
         seen = self._source.receive(0.0)
         if seen is not None:
             self._leader.update(seen, now)
-        with contextlib.suppress(zmq.Again):  # the next one is newer
+        with contextlib.suppress(zmq.Again):  # dropped for a slow subscriber: the next message is newer
             self._socket.send(self._leader.message(now), zmq.NOBLOCK)
 
     def close(self) -> None:
-        """Release the socket and the node."""
+        """Release the socket and the connection to the node."""
         self._socket.close(linger=0)
         self._source.close()
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.simulation.leader", description="A simulated leader arm."
     )

@@ -1,10 +1,10 @@
-"""A simulated execution node: `python -m runtime.simulation.node --robot NAME`; speaks what real nodes speak.
+"""Simulated execution node: `python -m runtime.simulation.node --robot NAME`; uses the protocol of real nodes.
 
-Each tick: take the newest command, move the plant, publish one observation. Beyond the plain protocol it
-says its frame number (`seq`), colour order (`encoding`), whom it obeys (`master`) and the number of what it obeyed
-last (`ack`), what it `refused`, by reason, whether it is `holding` because nobody commands it, and how its `drives`
-are. With `--bench tabletop` or `conveyor` there is something to touch, which the word "scene_reset" lays anew and of
-which the field `truth` says how it really is.
+Each tick executes the newest command, moves the plant and publishes one observation. Beyond the plain protocol an
+observation contains the frame number (`seq`), colour order (`encoding`), current master (`master`), number of the
+master's last message that took effect (`ack`), refused messages by reason (`refused`), whether the robot is `holding`
+for lack of commands, and the state of its `drives`. With `--bench tabletop` or `conveyor` there are objects; the word
+"scene_reset" resets them, and the field `truth` is their ground truth.
 """
 
 from __future__ import annotations
@@ -37,22 +37,26 @@ if TYPE_CHECKING:
     from robots import Robot
     from runtime.simulation.environments import Environment
 
-LONGEST_STEP = 0.2  # s; a node that was stopped does not make up for it in one leap
-_GARBAGE = b"\x85\xa1t"  # a map of five that ends after half an entry
+LONGEST_STEP = 0.2  # [s] longest time step, so that a suspended node does not jump
+_GARBAGE = b"\x85\xa1t"  # map of five entries, truncated within the first
 _NO_LEADER = "the simulated node has no leader arm"
 
 
 class Ticking(Protocol):
-    """Node that `run` advances."""
+    """Object that `run` advances."""
 
     def tick(self, seconds: float) -> None:
-        """Let `seconds` pass."""
+        """Advance by `seconds`."""
 
 
 class Node:
-    """One robot behind two sockets; `open`, then `tick` at the rate, then `close`.
+    """Simulated node of one robot with two sockets; call `open`, then `tick` at the rate, then `close`.
 
-    Who has its messages without sockets calls `exchange` instead. `around` stands in for what the options name.
+    To exchange messages without sockets, call `exchange` instead. `around` replaces the environment that the options
+    name.
+
+    Raises:
+        SetupError: If a camera or pose of the options does not exist.
     """
 
     def __init__(
@@ -70,7 +74,7 @@ class Node:
         self._gate = CommandGate(robot, options.deadline, bench=options.bench != "none")
         self._surroundings = around or environments.make_environment(robot, options)
         self._leader = Gesture(robot, options.seed)
-        self._leader_phase: float | None = None  # None unless it collects
+        self._leader_phase: float | None = None  # of the leader's gesture; None unless it collects
         self._hil_error = ""
         self._frozen: UInt8 | None = None
         self._holding = True
@@ -78,18 +82,18 @@ class Node:
         self._sockets: Sockets | None = None
 
     def open(self) -> dict[str, str]:
-        """Bind both sockets and return their real addresses."""
+        """Bind both sockets and return their actual addresses."""
         options = self._options
         self._sockets = Sockets(options.obs_endpoint, options.action_endpoint, options.insecure_link)
         return self._sockets.addresses
 
     def tick(self, seconds: float) -> None:
-        """Obey, move for `seconds`, publish."""
+        """Execute the received commands, move for `seconds`, publish an observation."""
         assert self._sockets is not None
         self._sockets.publish(self.exchange(self._sockets.received(), seconds))
 
     def exchange(self, payloads: Sequence[bytes], seconds: float) -> bytes:
-        """Obey what has come and move for `seconds`; returns the observation that is then to be published."""
+        """Execute received messages and move for `seconds`; return the packed observation to publish."""
         self._obey(payloads)
         self._move(seconds)
         every = self._options.malformed_every
@@ -106,7 +110,7 @@ class Node:
         self._sockets = None
 
     def _obey(self, payloads: Sequence[bytes]) -> None:
-        """Judge everything that has come; of the targets only the newest counts."""
+        """Filter all received messages and execute them; of several targets only the newest takes effect."""
         newest = None
         for payload in payloads:
             accepted = self._gate.accept(payload, self._clock.now())
@@ -124,7 +128,7 @@ class Node:
             self._plant.target = newest
 
     def _control(self, accepted: AcceptedCommand) -> None:
-        """Control words come several times; a repetition changes nothing."""
+        """Execute a control word; words are sent several times, so repetitions change nothing."""
         if accepted.control == "collect_start" and self._leader_phase is None:
             self._leader_phase = self._leader.phase_of(self._plant.q)
         elif accepted.control == "collect_stop" and self._leader_phase is not None:
@@ -188,9 +192,9 @@ class Node:
 
 
 def run(node: Ticking, clock: Clock, rate: float, told: Event) -> None:
-    """Tick on absolute deadlines until told to end; missed ticks are skipped, not made up for.
+    """Call `tick` at absolute deadlines until `told` is set; missed ticks are skipped.
 
-    One that is late by less than half a period is done at once: the next one is on time again.
+    A tick that is late by less than half a period still runs at once, so that the next one is on time again.
     """
     period = 1.0 / rate
     due = last = clock.now()
@@ -203,7 +207,7 @@ def run(node: Ticking, clock: Clock, rate: float, told: Event) -> None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.simulation.node", description="A simulated execution node."
     )
@@ -271,14 +275,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def start_pose(robot: Robot, name: str) -> Float64:
-    """The joints [D] of a pose; SetupError lists the poses where there is none of that name."""
+    """Return the joints [D] of a pose.
+
+    Raises:
+        SetupError: If the robot has no such pose; the message lists its poses.
+    """
     if name not in robot.poses:
         raise SetupError(f"{robot.name} has no pose {name!r}; it has {', '.join(robot.poses)}")
     return robot.poses[name]
 
 
 def positive(text: str) -> float:
-    """A number above zero, of a command line."""
+    """Return a number of the command line that is above zero and below 1e6."""
     number = float(text)
     if not 0 < number < 1e6:
         raise argparse.ArgumentTypeError(f"{text} is not above zero")

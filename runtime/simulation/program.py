@@ -1,4 +1,4 @@
-"""Common parts of every stand-in process: it says where it is, and ends when it is told or left alone."""
+"""Common parts of simulation and stand-in programs: options, announcement of addresses, orderly end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from runtime.core.durable_files import write_durably
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options that all stand-ins share."""
+    """Add the options that all these programs share."""
     parser.add_argument(
         "--ready-file", type=Path, help="write the addresses there as JSON, once they are open"
     )
@@ -22,12 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def names(text: str) -> list[str]:
-    """Names, separated by commas."""
+    """Split names that are separated by commas."""
     return [name.strip() for name in text.split(",")]
 
 
 def announce_ready(ready: Mapping[str, object], path: Path | None) -> None:
-    """Write the addresses to `path`, whole or not at all, then print them as one JSON line."""
+    """Write the addresses to `path` atomically, then print them as one JSON line."""
     line = json.dumps(dict(ready))
     if path is not None:
         write_durably(path, f"{line}\n".encode())
@@ -35,7 +35,7 @@ def announce_ready(ready: Mapping[str, object], path: Path | None) -> None:
 
 
 def stop_event(lifeline: bool) -> threading.Event:
-    """An event that SIGTERM, SIGINT and, if asked for, the end of standard input set; main thread only."""
+    """Return an event that SIGTERM and SIGINT set, and the end of standard input if `lifeline`; main thread only."""
     told = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: told.set())

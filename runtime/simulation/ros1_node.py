@@ -1,8 +1,8 @@
-"""A simulated robot behind its own ROS 1 topics: `python -m runtime.simulation.ros1_node --robot NAME`.
+"""Simulated robot with its own ROS 1 topics: `python -m runtime.simulation.ros1_node --robot NAME`.
 
-A stand-in for the drivers of a robot, on rospy and its own messages; a master has to run. It says where its joints
-and what its cameras see, and goes where it is told, as long as it is told. Topics are those of the robot's
-description, or for a robot that has none /GROUP/joint_states, /GROUP/command and /CAMERA/image_raw/compressed.
+It replaces the drivers of a robot, with rospy and its own messages; a ROS master has to run. It publishes joints and
+camera images and follows commands until they stop for longer than the deadline. Topics are those of the robot's
+description; for a robot without them /GROUP/joint_states, /GROUP/command and /CAMERA/image_raw/compressed.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from runtime.simulation.ros.ros_robot import ReceivedCommand, RosRobot
 if TYPE_CHECKING:
     from robots import Robot
 
-_COMMANDS_KEPT = 32
-_QUEUE = 10
+_COMMANDS_KEPT = 32  # newest commands between two ticks
+_QUEUE = 10  # messages per topic
 _LOGGING = "version: 1\ndisable_existing_loggers: false\n"
 
 
 class Ros1Node(RosRobot):
-    """One robot; `open`, then `tick` at the rate, then `close`. A process can open but one."""
+    """ROS 1 node of one simulated robot; `open`, then `tick` at the rate, then `close`. A process can open only one."""
 
     VERSION = 1
 
@@ -47,9 +47,13 @@ class Ros1Node(RosRobot):
         self._inbox: deque[ReceivedCommand] = deque(maxlen=_COMMANDS_KEPT)
 
     def open(self) -> dict[str, object]:
-        """Register with the master, and return it with the topics of the pictures."""
+        """Register with the master; return its address, the node's name and the image topics.
+
+        Raises:
+            SetupError: If no master runs at the address.
+        """
         master = self._options.master
-        try:  # rospy would wait for it for ever
+        try:  # rospy itself would wait for the master for ever
             xmlrpc.client.ServerProxy(master).getPid("/sim")
         except OSError as error:
             raise SetupError(f"no ROS master is at {master}: {error}; start roscore") from error
@@ -68,7 +72,7 @@ class Ros1Node(RosRobot):
         return {"master": master, "node": rospy.get_name(), "cameras": self._pictures}
 
     def close(self) -> None:
-        """Take leave of the master; safe to call twice."""
+        """Unregister from the master; safe to call twice."""
         import rospy
 
         rospy.signal_shutdown("the end")
@@ -124,7 +128,7 @@ def _header(stamp: int, frame: str = "") -> Any:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.simulation.ros1_node", description="A simulated robot behind ROS 1 topics."
     )
@@ -137,7 +141,7 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
+    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the ground truth of the bench as JSON."""
     import robots
 
     options = parser().parse_args(arguments)

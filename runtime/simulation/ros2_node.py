@@ -1,8 +1,8 @@
-"""A simulated robot behind its own ROS 2 topics: `python -m runtime.simulation.ros2_node --robot NAME`.
+"""Simulated robot with its own ROS 2 topics: `python -m runtime.simulation.ros2_node --robot NAME`.
 
-A stand-in for the drivers of a robot, over DDS without a ROS installation: it says where its joints and what its
-cameras see, and goes where it is told, as long as it is told. Topics are those of the robot's description, or for a
-robot that has none /GROUP/joint_states, /GROUP/command and /CAMERA/image_raw/compressed.
+It replaces the drivers of a robot, over DDS without a ROS installation: it publishes joints and camera images and
+follows commands until they stop for longer than the deadline. Topics are those of the robot's description; for a robot
+without them /GROUP/joint_states, /GROUP/command and /CAMERA/image_raw/compressed.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _LOOPBACK = (
     "<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
     "</Domain></CycloneDDS>"
 )
-_COMMANDS_TAKEN = 32
+_COMMANDS_TAKEN = 32  # samples per topic and tick
 
 
 class Ros2Node(RosRobot):
-    """One robot; `open`, then `tick` at the rate, then `close`."""
+    """ROS 2 node of one simulated robot; `open`, then `tick` at the rate, then `close`."""
 
     VERSION = 2
 
@@ -47,7 +47,7 @@ class Ros2Node(RosRobot):
         self._entities: list[Any] = []
 
     def open(self) -> dict[str, object]:
-        """Join the domain, and return it with the topics of the pictures."""
+        """Join the DDS domain; return its id and the image topics."""
         from cyclonedds.domain import Domain, DomainParticipant
 
         domain = self._options.domain
@@ -58,13 +58,13 @@ class Ros2Node(RosRobot):
     def close(self) -> None:
         """Leave the domain; safe to call twice."""
         for entity in reversed(self._entities):
-            entity.__del__()  # with all that it has made, whoever still holds that
+            entity.__del__()  # deletes its children too, even if they are still referenced
         self._entities, self._writers, self._readers = [], {}, []
 
     def _received_commands(self) -> Iterator[ReceivedCommand]:
         for outlet, reader in self._readers:
             for sample in reader.take(_COMMANDS_TAKEN):
-                if hasattr(sample, "position"):  # else a publisher has gone
+                if hasattr(sample, "position"):  # otherwise the sample reports that a publisher has left
                     yield ReceivedCommand(outlet, tuple(sample.name), sample.position)
 
     def _publish_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
@@ -108,7 +108,7 @@ class Ros2Node(RosRobot):
         return DataWriter(self._entities[1], channel, Qos(how, Policy.History.KeepLast(10)))
 
     def _reader(self, topic: str) -> Any:
-        """As a driver with ROS 2's default quality of service: reliable, which hears no best-effort commands."""
+        """Return a reader with the default QoS of ROS 2 drivers: reliable, so best-effort commands do not match."""
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
@@ -128,7 +128,7 @@ def _header(stamp: int, frame: str = "") -> Any:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.simulation.ros2_node", description="A simulated robot behind ROS 2 topics."
     )
@@ -139,7 +139,7 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the truth of the bench as JSON."""
+    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the ground truth of the bench as JSON."""
     import robots
 
     options = parser().parse_args(arguments)

@@ -1,4 +1,4 @@
-"""The two sockets of a simulated node: observations go out, commands come in."""
+"""ZMQ sockets of a simulated node: one publishes observations, one receives commands."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from runtime.core.errors import SetupError
 from runtime.transports.zmq import is_loopback
 
 _QUEUED_FRAMES = 4
-_QUEUED_COMMANDS = 64  # what waits while the node stands still is old when it goes on
-_DRAINED_COMMANDS = 1000  # at once; a flood must not stop the publishing
+_QUEUED_COMMANDS = 64  # few, because commands that queue while the node is suspended are old when it resumes
+_DRAINED_COMMANDS = 1000  # per tick; a flood must not stop publishing
 
 
 class Sockets:
-    """Bound on construction; SetupError where an address is taken, or open to others without `insecure`."""
+    """Publisher of observations and subscriber of commands, bound on construction.
+
+    Raises:
+        SetupError: If an address is in use, or reachable from other machines without `insecure`.
+    """
 
     def __init__(self, observations: str, commands: str, insecure: bool) -> None:
         self._publisher = bound(zmq.PUB, observations, insecure)
@@ -32,7 +36,7 @@ class Sockets:
         return {"obs_endpoint": address(self._publisher), "action_endpoint": address(self._subscriber)}
 
     def received(self) -> list[bytes]:
-        """The commands that have come, in order."""
+        """Return the commands received since the last call, in order; at most _DRAINED_COMMANDS."""
         payloads: list[bytes] = []
         with contextlib.suppress(zmq.Again):
             while len(payloads) < _DRAINED_COMMANDS:
@@ -40,20 +44,25 @@ class Sockets:
         return payloads
 
     def publish(self, payload: bytes) -> None:
-        """Send one observation; dropped where nobody takes them fast enough, because the next one is newer."""
-        # libzmq by itself notes only once a millisecond what was taken, and drops while a queue looks full.
+        """Send one observation; it is dropped if subscribers are too slow, because the next one is newer."""
+        # libzmq notices deliveries only once a millisecond, and drops messages while a queue appears full; polling
+        # makes it process pending notices.
         self._publisher.poll(0, zmq.POLLOUT)
         with contextlib.suppress(zmq.Again):
             self._publisher.send(payload, zmq.NOBLOCK, copy=False)
 
     def close(self) -> None:
-        """Release them; safe to call twice."""
+        """Close both sockets; safe to call twice."""
         for socket in (self._publisher, self._subscriber):
             socket.close(linger=0)
 
 
 def bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
-    """A socket of that kind at that address; SetupError where it is taken, or open to others without `insecure`."""
+    """Return a socket of type `kind`, bound to `endpoint`.
+
+    Raises:
+        SetupError: If the address is in use, or reachable from other machines without `insecure`.
+    """
     if not insecure and not is_loopback(endpoint):
         raise SetupError(f"{endpoint} can be reached from other machines; add --insecure-link to allow it")
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
@@ -68,7 +77,7 @@ def bound(kind: int, endpoint: str, insecure: bool) -> zmq.Socket[bytes]:
 
 
 def address(socket: zmq.Socket[bytes]) -> str:
-    """Bound address of a socket."""
+    """Return the bound address of a socket."""
     raw = socket.getsockopt(zmq.LAST_ENDPOINT)
     assert isinstance(raw, bytes)
     return raw.rstrip(b"\0").decode()

@@ -1,1 +1,1 @@
-"""Stand-ins of other people's servers: policies of every protocol, and cameras."""
+"""Stand-ins for external servers: policy servers of every protocol, and network cameras."""

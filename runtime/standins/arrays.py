@@ -1,4 +1,4 @@
-"""Arrays on the wire as openpi's own package writes them: the stand-ins' half, written apart from the clients'."""
+"""Codec of arrays in openpi's own format for stand-ins; independent of the client's codec, so that it can test it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,18 @@ import numpy as np
 
 
 def packed(value: object) -> bytes:
-    """One message; arrays as a map of four binary keys."""
+    """Pack a value as one message; an array becomes a map with four binary keys."""
     made: bytes = msgpack.packb(value, default=_written)
     return made
 
 
 def unpacked(payload: bytes) -> Any:
-    """The value of one message; ValueError where it is none."""
+    """Unpack one message.
+
+    Raises:
+        ValueError: If it is malformed, or contains an array of objects or of another size than it declares.
+        KeyError, TypeError: If an array lacks a field or has an unknown type.
+    """
     return msgpack.unpackb(payload, object_hook=_read)
 
 

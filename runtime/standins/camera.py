@@ -17,7 +17,7 @@ KINDS: dict[str, type[CameraServer]] = {"mjpeg": MjpegServer, "rtsp": RtspServer
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.standins.camera",
         description="A stand-in camera.",
@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until told to end; 2 where the port is taken."""
+    """Serve until SIGTERM, SIGINT or the end of the lifeline; exit code 2 if the port is in use."""
     options = parser().parse_args(arguments)
     told = program.stop_event(options.lifeline)
     server = KINDS[options.kind](options.width, options.height, options.rate, options.port)

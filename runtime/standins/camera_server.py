@@ -1,4 +1,4 @@
-"""Common base of stand-in cameras on the network: a port, pictures at a rate, faults on demand."""
+"""Base class of stand-in network cameras: a port, images at a rate, faults on demand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from runtime.core.types import UInt8
 
-_TRICKLE_S = 0.02
+_TRICKLE_S = 0.02  # between two bytes
 FAULTS = {
     "mute": "accepts and says nothing",
     "garbage": "answers with bytes that are no video",
@@ -26,7 +26,7 @@ FAULTS = {
 
 
 def picture(number: int, width: int, height: int) -> UInt8:
-    """Red on the left, blue on the right, below a bar that is wider in every picture: [height, width, 3] RGB."""
+    """Return an RGB image [height, width, 3]: red left, blue right, above a white bar that grows per image."""
     made = np.zeros((height, width, 3), np.uint8)
     made[:, : width // 2, 0] = 220
     made[:, width // 2 :, 2] = 220
@@ -35,7 +35,7 @@ def picture(number: int, width: int, height: int) -> UInt8:
 
 
 class CameraServer(ABC):
-    """Serves one camera on loopback, each client by a thread; `size`, `rate` and `fault` may change meanwhile."""
+    """Server of one camera on loopback, with a thread per client; `size`, `rate` and `fault` may change any time."""
 
     scheme: str
 
@@ -43,7 +43,7 @@ class CameraServer(ABC):
         self.size = (width, height)
         self.rate = rate
         self.fault = ""
-        self.sent = 0  # pictures, to all clients
+        self.sent = 0  # images sent to all clients
         self._port = port
         self._listening: socket.socket | None = None
         self._clients: set[socket.socket] = set()
@@ -54,14 +54,18 @@ class CameraServer(ABC):
         return f"{self.scheme}://127.0.0.1:{self._port}/camera"
 
     def start(self) -> str:
-        """Listen, on the same port as before where there was one; returns where."""
+        """Listen, on the same port as before if there was one; return the URL.
+
+        Raises:
+            OSError: If the port is in use.
+        """
         self._listening = socket.create_server(("127.0.0.1", self._port))
         self._port = self._listening.getsockname()[1]
         threading.Thread(target=self._accept, args=(self._listening,), daemon=True).start()
         return self.url
 
     def close(self) -> None:
-        """Stop listening and hang up; `start` takes it up again."""
+        """Stop listening and close all connections; `start` may be called again."""
         listening, self._listening = self._listening, None
         if listening is not None:
             with contextlib.suppress(OSError):  # wakes accept
@@ -70,7 +74,7 @@ class CameraServer(ABC):
         self.hang_up()
 
     def hang_up(self) -> None:
-        """Close every connection."""
+        """Close all connections."""
         with self._lock:
             clients = list(self._clients)
         for client in clients:
@@ -97,14 +101,14 @@ class CameraServer(ABC):
             else:
                 self._speak(client)
         except OSError:
-            return  # the client is gone, or we hung up
+            return  # the client has disconnected, or `hang_up` was called
         finally:
             with self._lock:
                 self._clients.discard(client)
             client.close()
 
     def _send_picture(self, client: socket.socket, data: bytes) -> None:
-        """All of it, or byte by byte."""
+        """Send encoded data, byte by byte with the fault "trickle"."""
         if self.fault != "trickle":
             client.sendall(data)
             return
@@ -114,4 +118,8 @@ class CameraServer(ABC):
 
     @abstractmethod
     def _speak(self, client: socket.socket) -> None:
-        """Serve one client until one of both has enough; OSError where it is gone."""
+        """Serve one client until either side ends the connection.
+
+        Raises:
+            OSError: If the connection is lost.
+        """

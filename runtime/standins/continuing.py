@@ -1,4 +1,7 @@
-"""A stand-in policy's continuation of the chunk before: a copy. That is RTC's contract, no model of it."""
+"""Continuation of the previous chunk by a stand-in policy: a copy of the prefix, as RTC's contract demands.
+
+It is no evidence for how well a model continues chunks.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,15 @@ if TYPE_CHECKING:
     from robots import Robot
 
 STAND_IN = "honours the prefix by copying it; no evidence for a model"
-_MODEL_WIDTH = 32
-_TRANSITION = 8  # rows over which its own plan takes over
+_MODEL_WIDTH = 32  # least numbers per row of the model
+_TRANSITION = 8  # rows of the transition from the prefix to the plan
 
 
 @dataclass(frozen=True, slots=True)
 class CommittedPrefix:
-    """The robot's commitment: joint rows [L, D], of which the first `delay` will have been executed.
+    """Committed joint rows [L, D] of a request, of which the first `delay` will have been executed.
 
-    `end` is the row from which on nothing of it shows, at the latest.
+    From row `end` on, the chunk is independent of them.
     """
 
     rows: Float64
@@ -32,9 +35,9 @@ class CommittedPrefix:
 
 
 def continue_prefix(plan: Float32, prefix: CommittedPrefix, switched: Sequence[int] = ()) -> Float32:
-    """`plan` [H, D] with the prefix's first rows in place of its own, and over to its own rows after them.
+    """Return `plan` [H, D] with the first `delay` rows of the prefix, followed by a transition to its own rows.
 
-    Dimensions in `switched` (binary grippers) are the plan's own after the delay.
+    Dimensions in `switched` (binary grippers) are those of the plan after the delay, without a transition.
     """
     delay = min(prefix.delay, len(prefix.rows), len(plan))
     end = max(delay, min(prefix.end, delay + _TRANSITION, len(prefix.rows), len(plan)))
@@ -47,7 +50,10 @@ def continue_prefix(plan: Float32, prefix: CommittedPrefix, switched: Sequence[i
 
 
 class ModelSpace:
-    """A model's own space: joints as -1 .. 1 of their range (of a turn where they have none), padded with zeros."""
+    """Space of a model's rows: joints scaled to -1 .. 1 of their range, padded with zeros.
+
+    The range of a joint without limits is one turn.
+    """
 
     def __init__(self, robot: Robot) -> None:
         endless = ~np.isfinite(robot.lower) | ~np.isfinite(robot.upper)
@@ -57,17 +63,21 @@ class ModelSpace:
 
     @property
     def dim(self) -> int:
-        """Numbers of a joint row."""
+        """Number of joints in a row."""
         return len(self._centre)
 
     def encode(self, joints: Float32) -> Float32:
-        """Model rows [H, width] of joint rows [H, D]."""
+        """Convert joint rows [H, D] to model rows [H, width]."""
         made = np.zeros((len(joints), self.width), np.float32)
         made[:, : joints.shape[1]] = (joints - self._centre) / self._half
         return made
 
     def joints(self, rows: ArrayLike) -> Float64:
-        """Joint rows [H, D] of model rows, or of joint rows, which pass; ValueError for others."""
+        """Convert model rows to joint rows [H, D]; joint rows are returned unchanged.
+
+        Raises:
+            ValueError: If the rows have another width, or there are none.
+        """
         given = np.asarray(rows, np.float64)
         dim = len(self._centre)
         if given.ndim != 2 or not len(given) or given.shape[1] not in (dim, self.width):

@@ -1,4 +1,4 @@
-"""`python -m runtime.standins.demo`: a station on this machine, with stand-ins for node and policy server beside it."""
+"""`python -m runtime.standins.demo`: a station on this machine with a simulated node and a stand-in policy server."""
 
 from __future__ import annotations
 
@@ -22,13 +22,17 @@ _READY_S = 30.0
 
 
 class StandIns:
-    """The node and the policy server; they end when their standard input does, so they never outlive us."""
+    """Child processes of the demo: node and policy server; they end with their standard input, so with the demo."""
 
     def __init__(self) -> None:
         self._children: list[subprocess.Popen[str]] = []
 
     def start(self, module: str, *arguments: str) -> dict[str, Any]:
-        """Start `python -m module`, and return what its first line of output says of its endpoints."""
+        """Start `python -m module`; return its addresses from the first line of its output.
+
+        Raises:
+            SetupError: If it ends before it is ready.
+        """
         child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments, "--lifeline"],
             stdin=subprocess.PIPE,
@@ -45,7 +49,7 @@ class StandIns:
         return ready
 
     def end(self) -> None:
-        """Close their lifelines and wait; what does not end is killed."""
+        """Close the lifelines and wait; processes that do not end within 5 s are killed."""
         for child in self._children:
             assert child.stdin is not None
             child.stdin.close()
@@ -59,7 +63,7 @@ class StandIns:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where the run went well."""
+    """Run the demo; return the run's exit code, 0 if it was successful; 1 after an error, 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(prog="python -m runtime.standins.demo", description=__doc__)
     parser.add_argument("--once", action="store_true", help="one episode, then end; else until Ctrl-C")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of the run there")
@@ -83,7 +87,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def start_standins(standins: StandIns, robot: str) -> list[str]:
-    """Start node and policy server on free ports; returns the settings that lead a deployment to them."""
+    """Start node and policy server on free ports; return the settings that connect a deployment to them."""
     free = "tcp://127.0.0.1:0"
     node = standins.start(
         "runtime.simulation.node", "--robot", robot, "--obs-endpoint", free, "--action-endpoint", free
@@ -101,7 +105,10 @@ def start_standins(standins: StandIns, robot: str) -> list[str]:
 
 
 def run_station(option: str, assignments: Sequence[str]) -> tuple[int, dict[str, Any]]:
-    """Run the demo's supervisor to its end, also after Ctrl-C; returns its exit code and the run's result."""
+    """Run the demo's supervisor until it ends; return its exit code and the run's result, {} if it wrote none.
+
+    Ctrl-C is passed on to it, and raised again after it has ended.
+    """
     result = deployment.load(_DEPLOYMENT, assignments).deployment.station_dir / RESULT_NAME
     result.unlink(missing_ok=True)
     sets = [part for assignment in assignments for part in ("--set", assignment)]

@@ -1,4 +1,4 @@
-"""A robot as DROID's policies see it: joints apart, grippers 0 open and 1 closed, rows as positions or velocities."""
+"""Robot in the conventions of DROID's policies: grippers separate, 0 open and 1 closed; positions or velocities."""
 
 from __future__ import annotations
 
@@ -14,11 +14,17 @@ from runtime.simulation.bench.bench import camera_arm
 if TYPE_CHECKING:
     from robots import Robot
 
-_JOINT_STEP = 0.2  # rad per row at a velocity of 1
+_JOINT_STEP = 0.2  # [rad] per row at a velocity of 1
 
 
 class DroidRobot:
-    """Translates between requests and a script that speaks the robot's own joints; SetupError for other spaces."""
+    """Converter between requests in DROID's format and a script that uses the robot's own joints.
+
+    `numbering` is the number of the first exterior view in requests, 0 or 1.
+
+    Raises:
+        SetupError: If `space` is not joint_position or joint_velocity.
+    """
 
     def __init__(self, robot: Robot, space: str, numbering: int) -> None:
         if space not in ("joint_position", "joint_velocity"):
@@ -33,7 +39,12 @@ class DroidRobot:
         self._above = [camera.key for camera in robot.cameras if camera_arm(robot, camera) is None]
 
     def joints(self, message: Mapping[str, Any]) -> Float64:
-        """The robot's vector [D]; KeyError, ValueError where the request has it not."""
+        """Return the robot's joints [D] of a request.
+
+        Raises:
+            KeyError: If the request lacks them.
+            ValueError: If their number is that of another robot.
+        """
         angles = np.asarray(message["observation/joint_position"], np.float64)
         grips = np.asarray(message["observation/gripper_position"], np.float64)
         if angles.shape != (len(self._joints),) or grips.shape != (max(1, len(self._ends)),):
@@ -47,7 +58,7 @@ class DroidRobot:
         return q
 
     def pictures(self, message: Mapping[str, Any]) -> dict[str, UInt8]:
-        """The newest picture of each view under the robot's own camera key."""
+        """Return the newest image of each view by the robot's own camera key."""
         pairs = [
             (f"observation/exterior_image_{self._first + n}_left", key) for n, key in enumerate(self._above)
         ]
@@ -56,7 +67,7 @@ class DroidRobot:
         return {key: picture if picture.ndim == 3 else picture[-1] for key, picture in found.items()}
 
     def rows(self, targets: Float32, q: Float64) -> Float32:
-        """The script's targets [H, D] as this server's rows."""
+        """Convert the script's targets [H, D], planned from joints `q` [D], to rows of this server."""
         rows = targets.astype(np.float64)
         if self._velocity:
             before = np.concatenate([q[None], rows[:-1]])[:, self._joints]

@@ -1,4 +1,4 @@
-"""The ways in which a stand-in policy server can misbehave on purpose."""
+"""Deliberate faults of stand-in policy servers."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ NAMES = {
     "other_rate": "lerobot: rows at twice the rate",
     "no_name": "lerobot: has its classes where version 0.3 had them",
 }
-TOO_LARGE = 64 * 1024 * 1024 + 1  # bytes
+TOO_LARGE = 64 * 1024 * 1024 + 1  # [bytes] of an oversized message
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One of NAMES; `argument` is what stood after the colon."""
+    """Fault of a server, one of NAMES or "none"; `argument` is the text after the colon."""
 
     name: str
     argument: str = ""
 
     def number(self, default: float) -> float:
-        """The argument as a number."""
+        """Return the argument as a number, `default` if there is none."""
         return float(self.argument) if self.argument else default
 
 
@@ -65,7 +65,11 @@ NONE = Fault("none")
 
 
 def parse(text: str) -> Fault:
-    """A fault from NAME[:ARG], for argparse."""
+    """Parse NAME[:ARG] of a command line.
+
+    Raises:
+        argparse.ArgumentTypeError: If the name is unknown, or the argument should be a number.
+    """
     name, _, argument = text.partition(":")
     if name not in NAMES:
         raise argparse.ArgumentTypeError(f"{name!r} is no fault; allowed: {', '.join(NAMES)}")

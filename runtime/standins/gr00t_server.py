@@ -1,4 +1,4 @@
-"""A stand-in for a GR00T policy server: the wire of three versions, a script for a policy, faults on demand."""
+"""Stand-in for a GR00T policy server: the protocol of three versions, a script as policy, faults on demand."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 Version = Literal["n1.5", "n1.6", "n1.7", "n1.7-early", "starvla"]
 
-_LATE = 3.0  # s
-_SPELL_MS = 20
-_REBIND = 5.0  # s
+_LATE = 3.0  # [s] default delay of the fault "late_reply"
+_SPELL_MS = 20  # between two checks for the end
+_REBIND = 5.0  # [s] limit for binding the port again
 LANGUAGE = "annotation.human.task_description"
 
 
 @dataclass(frozen=True, slots=True)
 class Gr00tBehaviour:
-    """The server's answers: rows per chunk, their rate [Hz], time of an inference [s], fault.
+    """Behaviour of the server: rows per chunk, their rate [Hz], duration of an inference [s], fault.
 
-    `flat` is what --use-sim-policy-wrapper makes of N1.6 and N1.7. `seen` are the steps of which it wants pictures.
-    "n1.7-early" is N1.7's early access, which reads MNP alone; "starvla" StarVLA's server of this protocol, which has
-    no modality configurations.
+    `flat` is the option --use-sim-policy-wrapper of N1.6 and N1.7. `seen` are the time steps of which images are
+    required. "n1.7-early" is the early access of N1.7, which reads arrays of msgpack_numpy only; "starvla" is StarVLA's
+    server of this protocol, which has no modality configurations.
     """
 
     version: Version = "n1.6"
@@ -52,10 +52,10 @@ class Gr00tBehaviour:
 
 
 class Gr00tServer:
-    """Serves on loopback in a thread of its own; plays `script`, a gesture where none is given.
+    """Server on loopback in a thread of its own; plays `script`, or a gesture by default.
 
-    The model's video keys are the robot's cameras, its state and action keys the robot's groups; of a script that
-    answers in poses, one action "poses".
+    The model's video keys are the robot's cameras; its state and action keys are the robot's groups, or the single
+    action "poses" if the script answers in poses.
     """
 
     def __init__(
@@ -70,11 +70,15 @@ class Gr00tServer:
         self._asked = 0
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
-        self.requests: list[dict[str, Any]] = []  # as they came, newest last; the last hundred
+        self.requests: list[dict[str, Any]] = []  # the last hundred, newest last
         self.failures: list[str] = []
 
     def start(self) -> dict[str, object]:
-        """Listen, and return the address."""
+        """Listen; return the address.
+
+        Raises:
+            SetupError: If the port is in use.
+        """
         self._wire = self._bound()
         self._thread = threading.Thread(target=self._serve, name="gr00t", daemon=True)
         self._thread.start()
@@ -110,20 +114,20 @@ class Gr00tServer:
             if not self._wire.poll(_SPELL_MS):
                 continue
             frames = self._replies(self._wire.recv())
-            if frames is None:  # an answer is owed for ever, so another socket has to take over
+            if frames is None:  # a REP socket must answer before it can receive again: replace it
                 self._wire.close(linger=0)
-                self._wire = self._bound(_REBIND)  # ZMQ lets the port go in its own time
+                self._wire = self._bound(_REBIND)  # ZMQ releases the port asynchronously
             else:
                 self._wire.send_multipart(frames)
         self._wire.close(linger=0)
 
     def _replies(self, payload: bytes) -> Sequence[bytes] | None:
-        """The frames that answer; None where the connection is to end without."""
+        """Return the frames that answer a request; None if the connection has to end without an answer."""
         fault = self._behaviour.fault
         try:
             message = wire.unpacked(payload, self._behaviour.version != "n1.7-early", self._modern)
             endpoint, reply = str(message.get("endpoint", "get_action")), self._result(message)
-        except Exception as error:  # a policy's errors are told to the client, as GR00T does it
+        except Exception as error:  # errors are sent to the client, as by GR00T
             self.failures.append(str(error))
             endpoint, reply = "error", {"error": str(error)}
         if endpoint == "get_modality_config" and fault.name == "mute_on_connect":
@@ -137,11 +141,11 @@ class Gr00tServer:
 
     @property
     def _modern(self) -> bool:
-        """True if the server knows MNP, in which it then answers."""
+        """Whether the server supports arrays of msgpack_numpy, in which it then answers."""
         return self._behaviour.version.startswith("n1.7")
 
     def _spoilt_frames(self) -> Sequence[bytes] | None:
-        """Frames that the fault sends in place of an answer; `_RIGHT` where the answer itself is right."""
+        """Return the frames that a fault sends instead of the answer, None for no answer; `_RIGHT` if none applies."""
         fault, number = self._behaviour.fault, self._asked
         self._asked += 1
         due = number >= fault.number(0)
@@ -180,7 +184,7 @@ class Gr00tServer:
         return self._action(message["data"])
 
     def _contract(self) -> dict[str, object]:
-        """StarVLA's contract: keys with their prefix, and each one's count of numbers; no pictures."""
+        """Return StarVLA's contract: prefixed state and action keys with their numbers of dimensions; no images."""
         groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
         actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
         said: dict[str, object] = {"unnorm_key": "stand_in"}
@@ -229,7 +233,11 @@ class Gr00tServer:
         return [named, {}]
 
     def _read(self, data: Mapping[str, Any]) -> tuple[dict[str, UInt8], Float64, str]:
-        """Pictures, joints and instruction of a request, checked as strictly as GR00T does."""
+        """Return images, joints [D] and instruction of a request, checked as strictly as by GR00T.
+
+        Raises:
+            AssertionError: If a part is missing, or has another type or shape.
+        """
         early, flat = (
             self._behaviour.version == "n1.5",
             self._behaviour.flat or self._behaviour.version == "n1.5",
@@ -255,7 +263,7 @@ class Gr00tServer:
         return pictures, joints, str(spoken[0])
 
     def _parts(self, rows: Float32) -> dict[str, Any]:
-        """The rows by action key, or what the fault makes of them."""
+        """Return the rows by action key, modified by the fault."""
         fault = self._behaviour.fault.name
         if fault == "nan":
             rows[min(3, len(rows) - 1), 2] = np.nan

@@ -1,6 +1,6 @@
-"""Messages as GR00T's servers write and read them: arrays are numpy's own files, or maps made by hand.
+"""Codec of GR00T's messages for its stand-in: arrays are .npy files, or maps in the format of msgpack_numpy.
 
-Nothing of the client's code is used.
+It is independent of the client's codec, so that it can test it.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import numpy as np
 
 
 class Pickled:
-    """Stands for an array of pickled objects."""
+    """Placeholder for an array of pickled objects."""
 
 
 def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
-    """One message; arrays as the package msgpack_numpy has them (N1.7, `modern`), as .npy files, or as openpi does."""
+    """Pack one message; arrays as openpi does if `foreign`, as msgpack_numpy does if `modern` (N1.7), else as .npy."""
 
     def written(given: object) -> object:
         if isinstance(given, Pickled):
@@ -42,7 +42,7 @@ def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
 
 
 def unpacked(payload: bytes, npy: bool = True, mnp: bool = True) -> Any:
-    """The value of one message, with arrays of the forms that the server reads; others stay maps, as with GR00T's."""
+    """Unpack one message; arrays in formats that the server does not read remain maps, as in GR00T's server."""
 
     def read(fields: dict[Any, Any]) -> object:
         if npy and "__ndarray_class__" in fields:

@@ -1,4 +1,4 @@
-"""A stand-in for LeRobot's policy server: gRPC with its rules and silences, a script for a policy, faults on demand."""
+"""Stand-in for LeRobot's policy server: gRPC with its rules and silences, a script as policy, faults on demand."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from runtime.standins.faults import NONE, TOO_LARGE, Fault
 if TYPE_CHECKING:
     from robots import Robot
 
-_LATE = 3.0  # s
-_SIMILAR = 1.0  # rad; an observation that is nearer to the last one is skipped unless it must go
+_LATE = 3.0  # [s] default delay of the fault "late_reply"
+_SIMILAR = 1.0  # [rad] distance below which an observation is skipped, unless it is marked `must_go`
 _KINDS = ("act", "smolvla", "diffusion", "tdmpc", "vqbet", "pi0", "pi05", "groot")
 
 
 @dataclass(frozen=True, slots=True)
 class LerobotBehaviour:
-    """The server's answers: rows per chunk, their rate [Hz], time of an inference [s], fault.
+    """Behaviour of the server: rows per chunk, their rate [Hz], duration of an inference [s], fault.
 
-    `patience` [s] is its wait for an observation before it answers with nothing.
+    `patience` [s] is the time that it waits for an observation before it sends an empty answer.
     """
 
     horizon: int = 50
@@ -44,7 +44,7 @@ class LerobotBehaviour:
 
 
 class LerobotServer:
-    """Serves on loopback in threads of its own; plays `script`, a gesture where none is given."""
+    """Server on loopback in threads of its own; plays `script`, or a gesture by default."""
 
     def __init__(
         self, robot: Robot, behaviour: LerobotBehaviour, port: int = 0, script: Script | None = None
@@ -61,11 +61,15 @@ class LerobotServer:
         self._asked = 0
         self._ended = threading.Event()
         self._server: Any = None
-        self.failures: list[str] = []  # what the real one writes to its log
+        self.failures: list[str] = []  # errors that the real server writes only to its log
         self.loads = 0
 
     def start(self) -> dict[str, object]:
-        """Listen, and return the address."""
+        """Listen; return the address.
+
+        Raises:
+            SetupError: If the port is in use.
+        """
         options = [("grpc.so_reuseport", 0)]
         self._workers = ThreadPoolExecutor(8, "lerobot")
         self._server = grpc.server(self._workers, options=options)
@@ -134,6 +138,7 @@ class LerobotServer:
     def _observed(self, messages: Iterator[Any], context: Any) -> Any:
         data = b""
         for message in messages:
+            # Transfer state 1 begins an observation, the others continue it.
             data = message.data if message.transfer_state == 1 else data + message.data
         observation = wire.unpickle(data)
         if observation.must_go or self._last is None or self._is_news(observation):
@@ -151,14 +156,14 @@ class LerobotServer:
         return np.array([observation.observation[name] for name in names], np.float32)
 
     def _act(self, request: Any, context: Any) -> Any:
-        """The actions for the observation that waits; nothing where none comes, and where anything goes wrong."""
+        """Return the actions for the pending observation; empty if none arrives in time, and after any error."""
         try:
             observation = self._waiting.get(timeout=self._behaviour.patience)
             self._predicted.add(observation.timestep)
             data = self._data(observation)
         except queue.Empty:
             data = b""
-        except Exception as error:  # the real one tells its log alone
+        except Exception as error:  # the real server only logs it
             self.failures.append(f"{type(error).__name__}: {error}")
             data = b""
         return wire.MESSAGES["Actions"](data=data)
@@ -206,7 +211,7 @@ class LerobotServer:
         return rows[: self._told.actions_per_chunk]
 
     def _actions(self, observation: Any, rows: Float32) -> bytes:
-        """The pickle of the rows, or of what the fault makes of them."""
+        """Return the pickled rows, modified by the fault."""
         fault = self._behaviour.fault.name
         if fault == "nan":
             rows[min(3, len(rows) - 1), 2] = np.nan

@@ -1,7 +1,7 @@
-"""Messages that LeRobot's server sends and takes, made apart from the client's code.
+"""Codec of LeRobot's messages for its stand-in, independent of the client's codec, so that it can test it.
 
-Messages are protobuf's own; pickles are written instruction by instruction, as torch and LeRobot would, and read
-with Python's machine and a table of names.
+Messages use protobuf. Pickles are written instruction by instruction, as torch and LeRobot would write them, and read
+by Python's unpickler restricted to a table of names.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from runtime.core.types import Float32
 
 HELPERS = "lerobot.async_inference.helpers"
 _MAGIC = 0x1950A86A20F9469CFC6C
-_KEY = "93988870496288"  # of a storage: any number
+_KEY = "93988870496288"  # key of a storage, arbitrary
 
 
 def _messages() -> dict[str, Any]:
-    """The classes of the service's four messages."""
+    """Return the classes of the service's four messages by name."""
     file = descriptor_pb2.FileDescriptorProto(name="standin.proto", package="transport", syntax="proto3")
     kinds = descriptor_pb2.FieldDescriptorProto
     for name, fields in (
@@ -46,7 +46,7 @@ MESSAGES = _messages()
 
 
 class UnpickledObject:
-    """Whatever class of LeRobot's a pickle has: its fields as attributes."""
+    """Instance of a LeRobot class from a pickle, with its fields as attributes."""
 
 
 class _Reader(pickle.Unpickler):
@@ -65,12 +65,19 @@ class _Reader(pickle.Unpickler):
 
 
 def unpickle(data: bytes, helpers: str = HELPERS) -> Any:
-    """The instance that a client pickled."""
+    """Return the object that a client pickled; `helpers` is the module of LeRobot's classes.
+
+    Raises:
+        ModuleNotFoundError: If the pickle contains any other class or function.
+    """
     return _Reader(data, helpers).load()
 
 
 def timed_actions(rows: Float32, timesteps: list[int], timestamps: list[float]) -> bytes:
-    """list[TimedAction] of row views of one tensor: each carries the whole storage, as those of the real server do."""
+    """Return a pickled list[TimedAction] whose rows are views of one tensor.
+
+    Each action contains the whole storage, as those of the real server do.
+    """
     storage = _storage(rows)
     return b"\x80\x04](" + b"".join(
         _name(HELPERS, "TimedAction") + b")\x81}("
@@ -83,7 +90,7 @@ def timed_actions(rows: Float32, timesteps: list[int], timestamps: list[float]) 
 
 
 def command_pickle(line: str) -> bytes:
-    """A pickle that runs a command where it is read without care."""
+    """Return a pickle that runs a command if it is read without restrictions."""
     return b"\x80\x04" + _name("os", "system") + b"(" + _text(line) + b"tR."
 
 
@@ -106,7 +113,7 @@ def _tensor(storage: bytes, offset: int, width: int) -> bytes:
 
 
 def _storage(rows: Float32) -> bytes:
-    """A torch file of the old form."""
+    """Return a torch file of the old format with the rows as its storage."""
     machine = {
         "protocol_version": 1001,
         "little_endian": True,

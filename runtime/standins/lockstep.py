@@ -1,9 +1,9 @@
-"""A station at its simulated bench on a virtual clock: `python -m runtime.standins.lockstep DEPLOYMENT`.
+"""Station with a simulated bench on a virtual clock: `python -m runtime.standins.lockstep DEPLOYMENT`.
 
-Node, bench, policy servers and station are one process and have one time; people, pages and programs find the station
-as they find any other. With the same seeds the same commands in the same order give the same course, to the tick, on
-any machine however busy it is. A run ends by itself once the bench's own truth has said success for a second; with
---paced, the station is no faster than life and nothing ends a run but what ends a real one.
+Node, bench, policy servers and station are one process with one clock; pages and programs connect to the station as to
+any other. With the same seeds, the same commands in the same order have the same result, to the tick, on any machine
+and under any load. A run ends by itself once the bench's ground truth has reported success for a second; with --paced,
+the station is at most as fast as real time, and runs end only as on a real bench.
 """
 
 from __future__ import annotations
@@ -38,13 +38,16 @@ from runtime.standins import serve
 from runtime.station.checks import check_deployment
 from runtime.station.spec import StationSpec
 
-REST_S = 1.0  # of success, after which nothing more is to be seen
-# Deadlines are in real seconds; a server of this process is not lost because the machine is busy.
+REST_S = 1.0  # duration of success after which a run ends
+# Deadlines count real seconds; a server in this process must not be declared lost because the machine is busy.
 _PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
 class SuccessDetector:
-    """Says when a run is over: the bench's truth has said success for a while."""
+    """Detector of the end of a run: the bench's ground truth has reported success for REST_S.
+
+    Call it regularly with whether a run is active; it returns the reason why the run is over, "" if it is not.
+    """
 
     def __init__(self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock) -> None:
         self._truth, self._clock = truth, clock
@@ -63,9 +66,10 @@ class SuccessDetector:
 def in_process_peers(
     made: StationSpec, clock: Clock, around: Environment, options: argparse.Namespace
 ) -> Peers:
-    """A simulated node in this process in the place of the transport, and a simulated leader in that of the leader.
+    """Return peers with a simulated node in this process instead of the transport, and a simulated leader.
 
-    SetupError where the deployment declares no simulated node.
+    Raises:
+        SetupError: If the deployment does not declare a simulated node with a bench.
     """
     transport = made.deployment.transport
     if not made.capabilities.resets_bench or transport.kind != "zmq":
@@ -84,8 +88,12 @@ def in_process_peers(
 def station(
     path: Path, assignments: Sequence[str], clock: VirtualClock, *bench_options: str, paced: bool = False
 ) -> ServedLockstep:
-    """The station of a deployment at its bench, which has the options of a simulated node; RuntimeFault where it
-    cannot be. A paced one is no faster than life, and the bench's truth ends none of its runs.
+    """Return the station of a deployment with its bench; `bench_options` are options of a simulated node.
+
+    If `paced`, it is at most as fast as real time, and success does not end a run.
+
+    Raises:
+        RuntimeFault: If the deployment is invalid, or its bench is not possible.
     """
     made = check_deployment(loader.load(path, assignments))
     given = ("--robot", made.robot.name, "--bench", "tabletop", *bench_options)
@@ -97,7 +105,7 @@ def station(
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.standins.lockstep", description="A station at a simulated bench, in lockstep."
     )

@@ -1,4 +1,4 @@
-"""A stand-in for a camera that sends MJPEG over HTTP."""
+"""Stand-in for a camera that sends MJPEG over HTTP."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _ERRORS = {"not_found": "404 Not Found", "no_login": "401 Unauthorized"}
 
 
 class MjpegServer(CameraServer):
-    """multipart/x-mixed-replace, one part per picture, described by `headers`, in which {length} is its own.
+    """Server of multipart/x-mixed-replace with one part per image.
 
-    The fault "html" answers with a page, "png" with parts of another kind, "still" with one picture.
+    `headers` are the lines of each part; {length} stands for its size [bytes]. Further faults: "html" answers with a
+    page, "png" with parts of another type, "still" with a single image.
     """
 
     scheme = "http"
@@ -47,7 +48,7 @@ class MjpegServer(CameraServer):
         while True:
             time.sleep(max(0.0, due - time.monotonic()))
             if self.fault == "silent":
-                client.recv(1)  # until it gives up
+                client.recv(1)  # until the client disconnects
                 return
             jpeg = simplejpeg.encode_jpeg(picture(number, *self.size), quality=90)
             if self.fault in ("nonsense", "png"):

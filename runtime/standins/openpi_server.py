@@ -1,4 +1,4 @@
-"""A stand-in for an openpi policy server: the real wire, a script for a policy, faults on demand."""
+"""Stand-in for an openpi policy server: the real protocol, a script as policy, faults on demand."""
 
 from __future__ import annotations
 
@@ -27,11 +27,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """The server's answers: rows per chunk, their rate [Hz], time of an inference [s], fault.
+    """Behaviour of the server: rows per chunk, their rate [Hz], duration of an inference [s], fault.
 
-    `rtc` is the dialect in which it is told what the robot is committed to; the flat one takes plain requests
-    too. With `declared` no time is spent on `latency`: answers state it, for clients that count it in
-    lockstep.
+    `rtc` is the dialect of committed rows in requests; "prev_action" accepts plain requests too. With `declared` the
+    server does not spend `latency`: its answers state it, for clients that account for it in lockstep.
     """
 
     horizon: int = 50
@@ -44,7 +43,7 @@ class Behaviour:
 
 
 class OpenpiServer(WebsocketServer):
-    """Serves on loopback in threads of its own; plays `script`, a gesture where none is given."""
+    """Server on loopback in threads of its own; plays `script`, or a gesture by default."""
 
     says_well = True
 
@@ -59,23 +58,23 @@ class OpenpiServer(WebsocketServer):
         self._wire = WIRES[behaviour.rtc](self._space, behaviour.horizon, behaviour.fault)
 
     def greeting(self) -> Frames | None:
-        """The metadata."""
+        """Return the metadata."""
         metadata = dict(self._script.metadata) | self._wire.metadata()
         if self._behaviour.fault.name == "action_mode":
             metadata["action_mode"] = self._behaviour.fault.argument
         return packed(metadata)
 
     def begin(self) -> Answering:
-        """One connection of the script."""
+        """Return the answers of a new connection."""
         return _Conversation(self, self._script.begin())
 
     def on_answered(self, answer: Answering, seconds: float) -> None:
-        """The next answer says how long this one took."""
+        """Store the duration of an answer, which the next answer reports."""
         assert isinstance(answer, _Conversation)
         answer.previous_ms = 1e3 * seconds
 
     def failure(self, traceback: str, request: Frames) -> Frames:
-        """Text, or an envelope with the number of the request, where it has one."""
+        """Return the error as text, or with RTC envelopes as an envelope with the request's number if it has one."""
         try:
             message = unpacked(request) if isinstance(request, bytes) else None
         except ValueError:
@@ -83,7 +82,7 @@ class OpenpiServer(WebsocketServer):
         return self._wire.failure(traceback, message)
 
     def reply(self, request: Frames, answer: Answer, previous_ms: float | None) -> bytes:
-        """The frame that answers a request; an exception where it cannot be answered."""
+        """Return the frame that answers a request; an exception is raised if it cannot be answered."""
         if isinstance(request, str):
             raise TypeError("the request is a text frame; expected a binary one")
         asked = self._wire.read(unpacked(request))
@@ -97,7 +96,7 @@ class OpenpiServer(WebsocketServer):
         if asked.prefix is not None:
             actions = continue_prefix(actions, asked.prefix, self._robot.binary_dims)
         took = 1e3 * self._took(started)
-        timing = {} if self._behaviour.declared else {"infer_ms": took}  # nobody measures what is declared
+        timing = {} if self._behaviour.declared else {"infer_ms": took}  # a declared duration is not measured
         timing |= {} if previous_ms is None else {"prev_total_ms": previous_ms}
         own = {"origin_actions": self._space.encode(actions)} if self._behaviour.rtc != "none" else {}
         return {
@@ -108,7 +107,7 @@ class OpenpiServer(WebsocketServer):
         }
 
     def _took(self, started: float) -> float:
-        """Duration of an answer begun at `started` [s]; returns once that is over."""
+        """Return the duration [s] of an answer begun at `started` [s]: as declared, or measured after the latency."""
         if self._behaviour.declared:
             return self._behaviour.latency
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))
@@ -132,7 +131,7 @@ class OpenpiServer(WebsocketServer):
 
 @dataclass(slots=True)
 class _Conversation:
-    """Answers the requests of one connection; `previous_ms` is how long the last one took."""
+    """Answers to the requests of one connection; `previous_ms` is the duration of the previous answer."""
 
     server: OpenpiServer
     answer: Answer

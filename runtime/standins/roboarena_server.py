@@ -1,4 +1,4 @@
-"""A stand-in for a policy server of the RoboArena family: RoboArena and DreamZero, or vLLM-Omni."""
+"""Stand-in for a policy server of the RoboArena family: RoboArena and DreamZero, or vLLM-Omni."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from robots import Robot
 
 VLLM_PATH = "/v1/realtime/robot/openpi"
-_IDLE = 30.0  # s, vLLM-Omni's own
+_IDLE = 30.0  # [s] default of vLLM-Omni
 
 
 @dataclass(frozen=True, slots=True)
 class RoboarenaBehaviour:
-    """Behaviour of the server: its wants, its answers, its fault.
+    """Behaviour of the server: its requirements, its answers, its fault.
 
-    `reply` is the form of an answer: a map with `actions`, the bare array, or named parts. `numbering` is the
-    number of its first exterior view. `idle` [s] ends a silent connection, None never.
+    `reply` is the form of an answer: a map with `actions`, the bare array, or named parts. `numbering` is the number of
+    the first exterior view. `idle` [s] is the silence after which a connection is closed; None: never, 30 s for vllm.
     """
 
     horizon: int = 24
@@ -55,14 +55,14 @@ class RoboarenaBehaviour:
 
 @dataclass
 class RequestLog:
-    """Requests so far, in order: (endpoint, session) pairs, and the frames that each session has sent."""
+    """Requests so far, in order: (endpoint, session) pairs, and the number of frames that each session has sent."""
 
     calls: list[tuple[str, str | None]] = field(default_factory=list)
     frames: dict[str | None, int] = field(default_factory=dict)
 
 
 class RoboarenaServer(WebsocketServer):
-    """Serves on loopback; plays `script`, a gesture where none is given. `heard` is for tests."""
+    """Server on loopback; plays `script`, or a gesture by default. `heard` logs requests for tests."""
 
     def __init__(
         self, robot: Robot, arena: RoboarenaBehaviour, port: int = 0, script: Script | None = None
@@ -75,17 +75,17 @@ class RoboarenaServer(WebsocketServer):
         self._script = script or WavingScript(robot, arena.horizon, arena.rate, arena.seed)
 
     def start(self) -> dict[str, object]:
-        """Listen, and return the address; vLLM-Omni has a path."""
+        """Listen; return the address, with a path for vLLM-Omni."""
         found = super().start()
         path = VLLM_PATH if self._arena.variant == "vllm" else ""
         return found | {"url": f"{found['url']}{path}"}
 
     def serves_path(self, path: str) -> bool:
-        """RoboArena's server takes any path."""
+        """Return True for any path of RoboArena's server, and for the path of vLLM-Omni."""
         return self._arena.variant == "roboarena" or path == VLLM_PATH
 
     def greeting(self) -> Frames | None:
-        """The six fields."""
+        """Return the six fields of the metadata; None with the fault "not_loaded"."""
         arena = self._arena
         if arena.fault.name == "not_loaded":
             return None
@@ -102,16 +102,16 @@ class RoboarenaServer(WebsocketServer):
         )
 
     def refusal(self) -> Frames:
-        """A model that is none for robots."""
+        """Return the error of a server whose model is not for robots."""
         return json.dumps({"type": "error", "error": "Robot policy not available", "code": "unsupported"})
 
     def begin(self) -> Answering:
-        """One connection of the script."""
+        """Return the answers of a new connection."""
         answer = self._script.begin()
         return lambda request: self._reply(answer, request)
 
     def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
-        """vLLM-Omni says little, in binary, and stays."""
+        """Report an error; vLLM-Omni sends a short binary message and keeps the connection open."""
         if self._arena.variant == "roboarena":
             return super().failed(connection, error, request)
         known = "Invalid request payload" if isinstance(error, ValueError) else "Internal inference error"
@@ -154,7 +154,7 @@ class RoboarenaServer(WebsocketServer):
         return {"actions": rows}
 
     def _check(self, message: dict[str, Any]) -> None:
-        """Refuse mistakes that a policy would fall over, and those that it would not notice."""
+        """Raise an exception for mistakes in a request, including those that a real policy would not notice."""
         arena = self._arena
         names = [f"exterior_image_{arena.numbering + n}" for n in range(arena.externals)]
         names += ["wrist_image"] if arena.wrist else []

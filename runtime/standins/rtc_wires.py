@@ -1,4 +1,4 @@
-"""The ways in which the stand-in policy server is told what the robot is committed to."""
+"""Wire formats in which the stand-in policy server receives the rows that the robot is committed to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runtime.standins.continuing import STAND_IN, CommittedPrefix, ModelSpace
 from runtime.standins.faults import Fault
 
 Name = Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"]
-_SHIFT, _FROZEN = 25, 10  # rows that openpi-rtc takes off, and that it keeps to
+_SHIFT, _FROZEN = 25, 10  # rows that openpi-rtc drops, and rows that it continues exactly
 _ENVELOPE, _VERSION = "openpi-async-rtc", 2
 _FIELDS = (
     "prev_chunk_left_over",
@@ -26,7 +26,7 @@ _FIELDS = (
 
 @dataclass(frozen=True, slots=True)
 class ParsedRequest:
-    """A request, read: the observation, what it is to continue, its number where it has one."""
+    """Parsed request: the observation, the prefix to continue if any, and its number if it has one."""
 
     observation: dict[str, Any]
     prefix: CommittedPrefix | None = None
@@ -34,7 +34,7 @@ class ParsedRequest:
 
 
 class Wire(ABC):
-    """Reads requests and frames answers; `fault` may have it say or answer something else."""
+    """Wire format: parses requests and builds answers; `fault` may change either."""
 
     def __init__(self, space: ModelSpace, horizon: int, fault: Fault) -> None:
         self._space = space
@@ -43,19 +43,19 @@ class Wire(ABC):
 
     @abstractmethod
     def metadata(self) -> dict[str, object]:
-        """The server's metadata of the wire, sent on connect."""
+        """Return the metadata of the format, sent on connection."""
 
     @abstractmethod
     def read(self, message: Any) -> ParsedRequest:
-        """The request; an exception where it is none."""
+        """Parse a request; an invalid request raises an exception that depends on the mistake."""
 
     @abstractmethod
     def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
-        """The frame that answers it."""
+        """Return the frame that answers a request."""
 
     @abstractmethod
     def failure(self, traceback: str, message: Any) -> str | bytes:
-        """The frame that says what went wrong with it."""
+        """Return the frame that reports an error in a request."""
 
     @property
     def _continues(self) -> bool:
@@ -63,7 +63,7 @@ class Wire(ABC):
 
 
 class NoRtcWire(Wire):
-    """Wire of most servers: keys that they do not know are dropped, without a word."""
+    """Format of most servers, without RTC: unknown keys are ignored silently."""
 
     def metadata(self) -> dict[str, object]:
         return {}
@@ -79,7 +79,7 @@ class NoRtcWire(Wire):
 
 
 class PrevActionWire(NoRtcWire):
-    """Keys of the observation; it names no delay, so as many rows are kept as were consumed since the last request."""
+    """Format with RTC keys in the observation; it has no delay: as many rows are fixed as were consumed last."""
 
     def metadata(self) -> dict[str, object]:
         dialect = "prev_action" if self._continues else "none"
@@ -97,7 +97,7 @@ class PrevActionWire(NoRtcWire):
 
 
 class OpenpiRtcWire(NoRtcWire):
-    """openpi-rtc: takes a fixed number of rows off the chunk before, whatever the robot has executed."""
+    """Format of openpi-rtc: the server drops a fixed number of rows of the previous chunk, whatever was executed."""
 
     @property
     def _shift(self) -> int:
@@ -116,7 +116,7 @@ class OpenpiRtcWire(NoRtcWire):
 
 
 class Kai0Flat(NoRtcWire):
-    """kai0: row n of the chunk before is row n of the new one."""
+    """Format of kai0: row n of the previous chunk corresponds to row n of the new chunk."""
 
     def metadata(self) -> dict[str, object]:
         return {"rtc": {"dialect": "kai0" if self._continues else "none", "stand_in": STAND_IN}}
@@ -137,7 +137,7 @@ class Kai0Flat(NoRtcWire):
 
 
 class Envelope(Wire):
-    """openpi-async-rtc, version 2."""
+    """Format of openpi-async-rtc, version 2: requests and answers in versioned envelopes."""
 
     def metadata(self) -> dict[str, object]:
         return {

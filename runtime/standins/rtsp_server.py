@@ -1,4 +1,4 @@
-"""A stand-in for a camera that speaks RTSP: H.264 over RTP within the RTSP connection (RFC 2326, 3550, 6184)."""
+"""Stand-in for an RTSP camera: H.264 over RTP interleaved in the RTSP connection (RFC 2326, 3550, 6184)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Any
 
 from runtime.standins.camera_server import CameraServer, picture
 
-_CLOCK = 90_000  # RTP's, for video [Hz]
-_PAYLOAD = 96
-_LARGEST = 1400  # bytes of a NAL unit in one packet; longer ones are cut (FU-A)
+_CLOCK = 90_000  # [Hz] clock of RTP for video
+_PAYLOAD = 96  # dynamic payload type
+_LARGEST = 1400  # [bytes] of a NAL unit in one packet; longer units are fragmented (FU-A)
 _ERRORS = {"not_found": "404 Not Found", "no_login": "401 Unauthorized"}
 
 
 class RtspServer(CameraServer):
-    """One H.264 track; `stamp_offset` [s] is added to what its pictures say of their time, and may change."""
+    """Server of one H.264 track; `stamp_offset` [s] is added to the images' time stamps and may change any time."""
 
     scheme = "rtsp"
     stamp_offset = 0.0
@@ -87,11 +87,11 @@ class RtspServer(CameraServer):
             self.sent += 1
 
     def _still_wanted(self, client: socket.socket) -> bool:
-        """Keep-alives are answered; False where the client hangs up."""
+        """Answer keep-alives; return False if the client ends the session."""
         got = client.recv(4096).decode("latin-1")
         if not got or got.startswith("TEARDOWN"):
             return False
-        if got[0] != "$":  # else a report of its own over RTCP
+        if got[0] != "$":  # "$" begins an interleaved RTCP report of the client
             self._answer(client, got)
         return True
 
@@ -105,7 +105,7 @@ class RtspServer(CameraServer):
         return encoder
 
     def _units(self, encoder: Any, number: int) -> Iterator[tuple[bytes, bool]]:
-        """The NAL units of a picture, and whether each is the last one."""
+        """Yield the NAL units of an image, each with True if it is the last."""
         import av
 
         frame = av.VideoFrame.from_ndarray(picture(number, *self.size), format="rgb24")
@@ -126,7 +126,7 @@ class RtspServer(CameraServer):
 
 
 def _payloads(unit: bytes, last: bool) -> Iterator[tuple[bytes, bool]]:
-    """Payloads that carry one NAL unit, itself or fragments (FU-A), each with True if it ends a picture."""
+    """Yield the payloads that carry one NAL unit, whole or in fragments (FU-A), each with True if it ends an image."""
     if len(unit) <= _LARGEST:
         yield unit, last
         return

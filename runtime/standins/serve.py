@@ -1,4 +1,4 @@
-"""Stand-in policy servers: `python -m runtime.standins.serve openpi --robot NAME`; one file per protocol."""
+"""Stand-in policy servers: `python -m runtime.standins.serve openpi --robot NAME`; one module per protocol."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class StandInServer(Protocol):
-    """Interface of every stand-in server to this command: it starts, says where it is, and ends."""
+    """Interface of stand-in servers: `start` listens and returns the address, `close` stops."""
 
     def start(self) -> dict[str, object]: ...
 
@@ -30,7 +30,7 @@ class StandInServer(Protocol):
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the command line's parser."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.standins.serve",
         description="A stand-in policy server.",
@@ -100,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
     groot.add_argument("--token-env", metavar="NAME", help="environment variable with the API token it wants")
     line.add_argument("--fault", type=faults.parse, default=faults.NONE, metavar="NAME[:ARG]")
     program.add_arguments(line)
-    line.set_defaults(declared=False)  # by `made`
+    line.set_defaults(declared=False)  # set by `made`
     return line
 
 
@@ -122,10 +122,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def build_server(options: argparse.Namespace, clock: Clock | None = None) -> StandInServer:
-    """The server that a command line asks for, not yet started; RuntimeFault, RobotError where it cannot be.
+    """Return the server that a command line describes, not yet started.
 
-    With a virtual `clock` it lives by that, and its answers say how long they took without anybody waiting for it;
-    openpi with pick_place alone can do so.
+    With a virtual `clock` the server uses it, and its answers declare their duration instead of spending it; only
+    openpi with pick_place supports this.
+
+    Raises:
+        RuntimeFault: If an option is invalid.
+        RobotError: If the robot cannot be loaded.
     """
     import robots
 
@@ -220,7 +224,11 @@ _PROTOCOLS: dict[str, Callable[[Robot, float, Script, argparse.Namespace], Stand
 
 
 def _rtc(options: argparse.Namespace) -> Name:
-    """RTC dialect of the server; SetupError where it could not continue a chunk."""
+    """Return the RTC dialect of the server.
+
+    Raises:
+        SetupError: If the server could not continue a chunk.
+    """
     if options.space == "eef" and options.rtc not in (None, "none"):
         raise SetupError(
             f"--rtc {options.rtc} with --space eef: it continues joint rows alone; allowed: none"
@@ -230,7 +238,7 @@ def _rtc(options: argparse.Namespace) -> Name:
 
 
 def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespace) -> Script:
-    """The script, in the space that was asked for."""
+    """Return the script, converted to poses if requested."""
     if options.space == "joint":
         if options.pose:
             raise SetupError(f"--pose {' '.join(options.pose)}: allowed with --space eef")
@@ -258,17 +266,17 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
 
 
 def _length(text: str) -> float:
-    """Millimetres from 0 to 100."""
+    """Parse millimetres from 0 to 100."""
     return _number(text, 100.0)
 
 
 def _share(text: str) -> float:
-    """A probability."""
+    """Parse a probability."""
     return _number(text, 1.0)
 
 
 def _resolution(text: str) -> tuple[int, int] | None:
-    """Height and width, None for "none"."""
+    """Parse height and width; None for "none"."""
     if text == "none":
         return None
     height, _, width = text.partition("x")

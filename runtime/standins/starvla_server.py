@@ -1,4 +1,4 @@
-"""A stand-in for a StarVLA policy server: typed envelopes, a list of views, errors as maps."""
+"""Stand-in for a StarVLA policy server: typed envelopes, a list of views, errors as maps."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StarvlaBehaviour:
-    """Behaviour of the server: `views` are the robot's cameras in the order of the request, all where None.
+    """Behaviour of the server; `views` are the robot's cameras in the order of a request, None for all.
 
-    `size` is the picture size of its training, as it states it; `batched`: answers are [1, T, D]. `old`: as
-    servers were until May 2026, which say next to nothing of themselves and leave statistics to the client.
+    `size` is the image size of training that the server declares; `batched` is whether answers are [1, T, D]. `old` is
+    the behaviour of servers until May 2026, which declare almost nothing and leave statistics to the client.
     """
 
     horizon: int = 16
@@ -44,7 +44,7 @@ class StarvlaBehaviour:
 
 
 class StarvlaServer(WebsocketServer):
-    """Serves on loopback; plays `script`, a gesture where none is given. `seen` and `pings` are for tests."""
+    """Server on loopback; plays `script`, or a gesture by default. `seen` and `pings` log requests for tests."""
 
     def __init__(
         self, robot: Robot, star: StarvlaBehaviour, port: int = 0, script: Script | None = None
@@ -56,12 +56,12 @@ class StarvlaServer(WebsocketServer):
         self._robot = robot
         self._views = star.views or tuple(camera.key for camera in robot.cameras)
         self._script = script or WavingScript(robot, star.horizon, star.rate, star.seed)
-        # What -1 and 1 stand for; without limits a turn.
+        # Joints at normalised values -1 and 1; the range of a joint without limits is one turn.
         self.low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
         self.high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
 
     def greeting(self) -> Frames | None:
-        """Greeting of a server of its age."""
+        """Return the greeting of an old or a present server."""
         star = self._star
         if star.old:
             return packed({"env": "simpler_env"})
@@ -77,7 +77,7 @@ class StarvlaServer(WebsocketServer):
         )
 
     def begin(self) -> Answering:
-        """One connection of the script."""
+        """Return the answers of a new connection."""
         answer = self._script.begin()
         return lambda request: packed(self._reply(answer, unpacked(_binary(request))))
 

@@ -1,4 +1,4 @@
-"""Common parts of websocket stand-ins: listening on loopback, conversing with clients, faults on demand."""
+"""Common parts of websocket stand-ins: listening on loopback, serving connections, faults on demand."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from runtime.standins.faults import TOO_LARGE, Fault
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
-_LATE = 3.0  # s
+_LATE = 3.0  # [s] default delay of the fault "late_reply"
 Frames = str | bytes
 Answering = Callable[[str | bytes], Frames]
 
 
 class WebsocketServer(ABC):
-    """Serves in threads of its own; one inference at a time, as on one GPU.
+    """Websocket server in threads of its own; one inference at a time, as on one GPU.
 
-    A request that cannot be answered is told to the client as a traceback in text, and then code 1011.
+    If a request cannot be answered, the client receives a traceback as text, followed by close code 1011.
     """
 
-    says_well = False  # whether GET /healthz is answered
+    says_well = False  # whether GET /healthz is answered with 200
 
     def __init__(self, name: str, fault: Fault, port: int = 0, idle: float | None = None) -> None:
         self._name = name
         self._fault = fault
         self._port = port
-        self._idle = idle  # s after which a silent client is left
+        self._idle = idle  # [s] silence after which a connection is closed, None for never
         self._device = threading.Lock()
         self._asked = 0
         self._before: Frames = b""  # the newest answer
@@ -51,18 +51,22 @@ class WebsocketServer(ABC):
 
     @abstractmethod
     def greeting(self) -> Frames | None:
-        """The first frame; None where nothing is served, after which the client is left."""
+        """Return the first frame; None if nothing is served, after which the connection is closed."""
 
     @abstractmethod
     def begin(self) -> Answering:
-        """Answers to the requests of one connection."""
+        """Return a function that answers the requests of one connection."""
 
     def serves_path(self, path: str) -> bool:
-        """True if a policy is served at this path."""
+        """Return True if a policy is served at this path."""
         return True
 
     def start(self) -> dict[str, object]:
-        """Listen, and return the address."""
+        """Listen; return the address.
+
+        Raises:
+            SetupError: If the port is in use.
+        """
         try:
             self._server = serve(
                 self._converse,
@@ -113,32 +117,32 @@ class WebsocketServer(ABC):
                 self.on_answered(answer, time.monotonic() - started)
 
     def on_answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
-        """An answer has been sent, so long after its request."""
+        """Handle the end of a request, `seconds` after it was received; the default does nothing."""
 
     def refusal(self) -> Frames:
-        """Frames that are sent where nothing is served."""
+        """Return the frame that is sent if nothing is served."""
         return "nothing is served here"
 
     def _answer(self, connection: ServerConnection, answer: Answering, request: str | bytes) -> bool:
-        """Answer one request, rightly or as the fault has it; False where the conversation is over."""
+        """Answer one request, correctly or as the fault demands; return False if the connection is over."""
         with self._device:
             number, self._asked = self._asked, self._asked + 1
             try:
                 if self._fault.name == "exception":
                     raise RuntimeError("CUDA out of memory (on purpose)")
                 reply = answer(request)
-            except Exception as error:  # whatever goes wrong in a policy is told to the client
+            except Exception as error:  # any error of a policy is reported to the client
                 return self.failed(connection, error, request)
         return self._send(connection, reply, number)
 
     def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
-        """Tell the client; False where it is left then."""
+        """Report an error to the client; return False if the connection is then closed."""
         connection.send(self.failure("".join(traceback.format_exception(error)), request))
         connection.close(1011, "Internal server error. Traceback included in previous frame.")
         return False
 
     def failure(self, traceback: str, request: Frames) -> Frames:
-        """The frame that says what went wrong with a request."""
+        """Return the frame that reports an error in a request."""
         return traceback
 
     def _send(self, connection: ServerConnection, reply: Frames, number: int) -> bool:
@@ -165,7 +169,7 @@ class WebsocketServer(ABC):
 
 
 def apply_fault(fault: Fault, actions: Float32) -> Any:
-    """Rows [T, D], or what the fault makes of them."""
+    """Return rows [T, D], modified by the fault."""
     name = fault.name
     if name == "nan":
         actions[min(3, len(actions) - 1), 2] = np.nan
@@ -185,7 +189,7 @@ def apply_fault(fault: Fault, actions: Float32) -> Any:
 
 
 def _send_half(connection: ServerConnection, reply: Frames) -> None:
-    """Half a frame, then the end of the TCP connection: what a killed server leaves."""
+    """Send half a frame and end the TCP connection, as after a crash of the server."""
     payload = reply.encode() if isinstance(reply, str) else reply
     raw = Frame(Opcode.BINARY, payload).serialize(mask=False)
     connection.socket.sendall(raw[: len(raw) // 2])

@@ -1,1 +1,1 @@
-"""The simulated bench: what lies on the table, how it moves, and how fingers move it."""
+"""Simulated bench: objects on a table, their motion, and the effect of fingers on them."""

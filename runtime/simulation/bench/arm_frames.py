@@ -20,15 +20,17 @@ if TYPE_CHECKING:
     from robots.urdf import Joint, Urdf
 
 
-_UPRIGHT = 0.999  # of a unit vector, along the vertical
+_UPRIGHT = 0.999  # least vertical part of the unit axis of an upright joint
 
 
 class ArmFrames:
-    """One arm; everything is a transform [4, 4] in the world, the robot's scene, for the robot's joints q [D].
+    """Forward kinematics of one arm: transforms [4, 4] in the world, the robot's scene, for joints q [D].
 
-    What no joint moves is computed once, so that an arm on a base that stands still costs its own chain alone.
-    `upright` is 1 where the arm's first joint turns it about the vertical, -1 where it does so the other way round,
-    else 0.
+    Fixed parts are computed once, so that an arm on a fixed base costs only its own chain. `upright` is 1 if the arm's
+    first joint turns it about the vertical, -1 if it does so in the opposite direction, else 0.
+
+    Raises:
+        SetupError: If the group has no end effector.
     """
 
     def __init__(self, robot: Robot, arm: Group) -> None:
@@ -46,25 +48,25 @@ class ArmFrames:
         self.upright = round(float(axis[2])) if abs(axis[2]) > _UPRIGHT else 0
 
     def frame(self, q: Float64) -> Float64:
-        """The arm's declared frame."""
+        """Return the arm's declared frame."""
         return self._base if self._below is None else self._base @ self._below.forward(q[self._dims])
 
     def eef(self, q: Float64) -> Float64:
-        """The end-effector link."""
+        """Return the end-effector link."""
         return np.asarray(self.frame(q) @ self.arm.transform(q))
 
     def tip(self, q: Float64) -> Float64:
-        """The fingertips: z ahead, y the way they open; the end-effector link where there are no fingers."""
+        """Return the fingertips (z ahead, y the opening direction), or the end-effector link without fingers."""
         return self.eef(q) if self.arm.tip is None else np.asarray(self.eef(q) @ self.arm.tip)
 
     def shoulder(self, q: Float64) -> Float64:
-        """The link behind the arm's first joint."""
+        """Return the link behind the arm's first joint."""
         return np.asarray(self._body.poses(q)[self._first])
 
 
 @lru_cache(maxsize=32)  # cache: reads the description of a robot, which does not change
 def arm_frames(robot: Robot) -> Mapping[str, ArmFrames]:
-    """The robot's arms by name."""
+    """Return the frames of the robot's arms by name."""
     return MappingProxyType({arm.name: ArmFrames(robot, arm) for arm in robot.arms})
 
 
@@ -74,7 +76,7 @@ def _body_of(robot: Robot) -> Body:
 
 
 def _chain_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
-    """The chain from the root to an arm's frame and the places of the joints that drive it; None where none does."""
+    """Return the chain from the root to an arm's frame and the dimensions of its joints; None, [] if it is fixed."""
     tree, members = urdf.read(robot.urdf), copy_of(arm, robot.groups)
     movers = {
         name: int(dim)
@@ -92,7 +94,7 @@ def _chain_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
 
 
 def _leader(tree: Urdf, joint: Joint) -> str:
-    """The joint that this one follows; itself, unless it is a mimic."""
+    """Return the joint that a mimic joint follows, through several mimics; any other joint itself."""
     while joint.mimic is not None:
         joint = tree.joint(joint.mimic.joint)
     return joint.name

@@ -1,4 +1,4 @@
-"""Course of a belt: strokes to and fro of random lengths and speeds, drawn by a seed, not foreseeable."""
+"""Motion of a belt: strokes to and fro of random lengths and speeds, drawn from a seed, unpredictable to a policy."""
 
 from __future__ import annotations
 
@@ -10,32 +10,33 @@ import numpy as np
 from runtime.core.types import Float64
 from runtime.simulation.bench.bench import Belt, BenchError
 
-SPEED = (0.06, 0.10)  # m/s, of a stroke
-SHORTEST = 0.10  # m, of a stroke
-ACCELERATION = 0.6  # m/s^2, with which the belt changes its speed
+SPEED = (0.06, 0.10)  # [m/s] of a stroke, lowest and highest
+SHORTEST = 0.10  # [m] of a stroke
+ACCELERATION = 0.6  # [m/s^2] of the belt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeltMotion:
-    """Pieces of constant acceleration, one after the other: `knots` [n, 4] of time [s], x [m], speed, acceleration.
+    """Consecutive pieces of constant acceleration, described by `knots` [n, 4].
 
-    The belt stands before the first and after the last.
+    The columns are time [s], x [m], speed [m/s] and acceleration [m/s^2]. The belt is at rest before the first and
+    after the last knot.
     """
 
     knots: Float64
 
     @property
     def duration(self) -> float:
-        """Seconds until it stands for good."""
+        """Time until the belt stops for good [s]."""
         return float(self.knots[-1, 0])
 
     @property
     def changes(self) -> tuple[float, ...]:
-        """When it begins to change its speed [s]."""
+        """Times at which the belt begins to change its speed [s]."""
         return tuple(self.knots[self.knots[:, 3] != 0.0, 0].tolist())
 
     def x(self, seconds: float) -> float:
-        """Position of a block on the belt [m], `seconds` after its start."""
+        """Return the position of a block on the belt [m], `seconds` after its start."""
         seconds = min(max(seconds, 0.0), self.duration)
         start, x, speed, acceleration = self.knots[
             int(np.searchsorted(self.knots[:, 0], seconds, "right")) - 1
@@ -45,12 +46,13 @@ class BeltMotion:
 
 
 def draw_belt_motion(seed: int, belt: Belt, seconds: float) -> BeltMotion:
-    """The course of a seed, always the same one for the same arguments; BenchError for a belt that is too short.
+    """Return the motion of a seed, the same for the same arguments; after `seconds` the belt brakes to a stop.
 
-    After so many seconds it comes to a stand.
+    Raises:
+        BenchError: If the belt is too short for two of the shortest strokes and its stopping distances.
     """
     low, high = belt.x
-    room = SPEED[1] ** 2 / ACCELERATION  # twice what it needs to stop
+    room = SPEED[1] ** 2 / ACCELERATION  # twice the longest stopping distance
     if high - low < 2 * (SHORTEST + room):
         raise BenchError(
             f"a belt of {high - low:.3f} m was given; allowed: {2 * (SHORTEST + room):.3f} m or more"
@@ -71,7 +73,7 @@ def draw_belt_motion(seed: int, belt: Belt, seconds: float) -> BeltMotion:
 
 @dataclass(slots=True)
 class _BeltMotionBuilder:
-    """A course that is being drawn, up to `time`, where the block is at `x` and has `speed`."""
+    """Motion that is being drawn, up to `time` [s], at which the block is at `x` [m] and has `speed` [m/s]."""
 
     knots: list[tuple[float, float, float, float]]
     time: float
@@ -79,13 +81,13 @@ class _BeltMotionBuilder:
     speed: float
 
     def change(self, speed: float) -> None:
-        """Go over to another speed."""
+        """Accelerate or brake to another speed [m/s]."""
         seconds = abs(speed - self.speed) / ACCELERATION
         self._piece(seconds, math.copysign(ACCELERATION, speed - self.speed))
         self.speed = speed
 
     def cruise(self, seconds: float) -> None:
-        """Go on as fast as now."""
+        """Continue at the present speed."""
         self._piece(seconds, 0.0)
 
     def _piece(self, seconds: float, acceleration: float) -> None:

@@ -1,7 +1,7 @@
-"""The simulated bench: what lies on its table and where, and where its cameras are; no robot, no physics.
+"""Objects of the simulated bench with their sizes and places, and its cameras; without robot and physics.
 
-World frame: the robot's scene, z up, the table's surface at z = 0; metres, radians. Robots stand at its near side,
-where y is below that of the area.
+World frame: the robot's scene, z up, the table's surface at z = 0; metres, radians. Robots are at the near side of the
+table, where y is below that of the area.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ if TYPE_CHECKING:
 Colour = tuple[int, int, int]
 
 _OVERHEAD_EYE, _OVERHEAD_AIM = (0.0, 0.36, 0.85), (0.0, 0.27, 0.0)
-_OVERHEAD_FOCAL = 1.0  # per picture width
+_OVERHEAD_FOCAL = 1.0  # focal length in image widths
 _WRIST_FOCAL = 0.75
 
 
 class BenchError(RuntimeFault):
-    """A layout was asked for that the bench cannot have."""
+    """A requested layout is not possible on the bench."""
 
 
 @dataclass(frozen=True, slots=True)
 class Belt:
-    """A belt along x: where it lies, and where beside a block that rides on it fingertips are to be [m].
+    """Belt along x: its place, and the place of fingertips relative to a block that rides on it [m].
 
-    The block's centre rides between both ends of `x` at `y`. `beside` is from the block's foot to the place of
-    the fingertips: nearer to the arms, so that no arm hides the block from the camera above, and clear of it.
+    The block's centre rides between both ends of `x` at `y`. `fingertip_offset` is from the centre of the block's
+    bottom face to the place of the fingertips: nearer to the arms, so that no arm hides the block from the overhead
+    camera, and clear of the block.
     """
 
     x: tuple[float, float] = (-0.10, 0.30)
@@ -50,8 +51,8 @@ class Belt:
 class Bench:
     """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table.
 
-    `area` is where things may lie: x from, x to, y from, y to. The first block, the task's, has the first of
-    `block_colours`, the others the next ones in turn.
+    `area` is where objects may be placed: x from, x to, y from, y to. The first block belongs to the task and has the
+    first of `block_colours`; the other blocks have the next colours in turn.
     """
 
     block_edge: float = 0.04
@@ -67,7 +68,7 @@ class Bench:
 
 @dataclass(frozen=True, slots=True)
 class BenchLayout:
-    """Places of blocks (x, y, yaw) and plate (x, y) after a reset; the first block is the task's."""
+    """Places of blocks (x, y, yaw) and plate (x, y) after a reset; the first block belongs to the task."""
 
     blocks: tuple[tuple[float, float, float], ...]
     plate: tuple[float, float]
@@ -75,7 +76,7 @@ class BenchLayout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockState:
-    """A block's centre and axes in the world, `pose` [4, 4], and the name of the arm that holds it, or ""."""
+    """Pose [4, 4] of a block's centre and axes in the world, and the name of the arm that holds it, or ""."""
 
     pose: Float64
     held_by: str = ""
@@ -83,7 +84,7 @@ class BlockState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BenchState:
-    """Everything on the table that can move, at one instant."""
+    """State of every movable object on the table at one moment."""
 
     blocks: tuple[BlockState, ...]
     plate: tuple[float, float]
@@ -91,9 +92,9 @@ class BenchState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PinholeCamera:
-    """A camera without distortion; `pose` [4, 4] is its frame in the world: z ahead, x right, y down.
+    """Camera without distortion; `pose` [4, 4] is its frame in the world: z ahead, x right, y down.
 
-    Pixels are (u, v), columns and rows; whole numbers are the centres of pixels.
+    Pixels are (u, v), columns and rows; integers are the centres of pixels.
     """
 
     fx: float
@@ -105,13 +106,17 @@ class PinholeCamera:
     pose: Float64
 
     def project(self, points: Float64) -> Float64:
-        """Pixels [..., 2] of world points [..., 3]; NaN for those not in front of the camera."""
+        """Return the pixels [..., 2] of world points [..., 3]; NaN for points that are not in front of the camera."""
         inside = (np.asarray(points, np.float64) - self.pose[:3, 3]) @ self.pose[:3, :3]
         depth = np.where(inside[..., 2:] > 1e-6, inside[..., 2:], np.nan)
         return np.asarray(inside[..., :2] / depth * (self.fx, self.fy) + (self.cx, self.cy))
 
     def pixel_to_table(self, u: float, v: float, z: float = 0.0) -> tuple[float, float]:
-        """World x, y of what a pixel shows at height `z`; BenchError where its ray never gets there."""
+        """Return the world x, y at which a pixel's ray reaches height `z`.
+
+        Raises:
+            BenchError: If the ray never reaches that height.
+        """
         ray = self.pose[:3, :3] @ [(u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0]
         way = (z - self.pose[2, 3]) / ray[2] if abs(ray[2]) > 1e-9 else -1.0
         if way <= 0:
@@ -121,7 +126,7 @@ class PinholeCamera:
 
 
 def block_pose(block: tuple[float, float, float], bench: Bench) -> Float64:
-    """The pose [4, 4] of a block that lies flat on the table at (x, y, yaw)."""
+    """Return the pose [4, 4] of a block that lies flat on the table at (x, y, yaw)."""
     x, y, yaw = block
     pose = np.eye(4)
     pose[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
@@ -130,21 +135,22 @@ def block_pose(block: tuple[float, float, float], bench: Bench) -> Float64:
 
 
 def yaw_of(pose: Float64) -> float:
-    """The turn about z of a pose [4, 4], or of its y axis where x points up or down."""
+    """Return the rotation about z of a pose [4, 4], or that of its y axis if x points up or down."""
     if math.hypot(pose[0, 0], pose[1, 0]) > 0.1:
         return math.atan2(pose[1, 0], pose[0, 0])
     return math.atan2(-pose[0, 1], pose[1, 1])
 
 
 def tip_in_world(robot: Robot, arm: Group, q: Float64) -> Float64:
-    """An arm's fingertips in the world, [4, 4], at the robot's joints q [D]: z ahead, y the way they open."""
+    """Return an arm's fingertips in the world [4, 4] at the robot's joints q [D]: z ahead, y the opening direction."""
     return arm_frames(robot)[arm.name].tip(q)
 
 
 def camera_arm(robot: Robot, camera: Camera) -> Group | None:
-    """The arm that carries a camera; None for one that looks from above, which all others do.
+    """Return the arm that carries a camera; None for an overhead camera, which all others are.
 
-    The arm's name without "_arm" begins the camera's, or the camera is called after a wrist and there is one arm.
+    A camera belongs to an arm if its name begins with the arm's name without "_arm", or if it is named after a wrist
+    and the robot has one arm.
     """
     for arm in robot.arms:
         if camera.name.startswith(arm.name.removesuffix("_arm")):
@@ -153,7 +159,7 @@ def camera_arm(robot: Robot, camera: Camera) -> Group | None:
 
 
 def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, PinholeCamera]:
-    """All cameras of the robot by key, where they are at joints q [D]; what is on no arm looks from above."""
+    """Return all cameras of the robot by key, placed for joints q [D]; a camera without an arm is overhead."""
     carriers = {camera.key: camera_arm(robot, camera) for camera in robot.cameras}
     return {
         key: overhead_camera(width, height)
@@ -164,13 +170,13 @@ def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, Pinh
 
 
 def overhead_camera(width: int, height: int) -> PinholeCamera:
-    """The camera above the bench: the arms reach into its picture from below."""
+    """Return the camera above the bench; arms reach into its image from below."""
     pose = _looking(_OVERHEAD_EYE, _OVERHEAD_AIM, up=(0.0, 1.0, 0.0))
     return _camera(pose, _OVERHEAD_FOCAL, width, height)
 
 
 def wrist_camera(tip: Float64, width: int, height: int, eye: CameraPlacement | None = None) -> PinholeCamera:
-    """The camera beside the fingers of an arm whose fingertips are at `tip` [4, 4]."""
+    """Return the camera next to the fingers of an arm with fingertips at `tip` [4, 4]."""
     eye = eye or CameraPlacement()
     return _camera(tip @ _looking(eye.place, eye.aim, eye.up), _WRIST_FOCAL, width, height)
 
@@ -180,7 +186,7 @@ def _camera(pose: Float64, focal: float, width: int, height: int) -> PinholeCame
 
 
 def _looking(eye: tuple[float, ...], aim: tuple[float, ...], up: tuple[float, ...]) -> Float64:
-    """A camera frame [4, 4] at `eye` that looks at `aim`, with `up` towards the top of its picture."""
+    """Return a camera frame [4, 4] at `eye` that is aimed at `aim`, with `up` towards the top of its image."""
     ahead = np.subtract(aim, eye) / math.dist(aim, eye)
     right = np.cross(ahead, up)
     right /= np.linalg.norm(right)

@@ -1,10 +1,10 @@
-"""The simulated conveyor: a block rides to and fro on a belt, and fingertips are to stay beside it.
+"""Simulated conveyor: a block rides to and fro on a belt, and fingertips have to stay next to it.
 
-The belt stands until fingertips are beside the block for the first time: whoever follows it begins from the same
-situation, however long the way there took. Then it runs its course, which the seed decides and nothing foretells.
-All that counts is where the fingertips are meanwhile, at every step of the physics: a block's half edge from
-their place beside it they point past it. Pushed off the belt or taken from it the block rides no more, and the
-task cannot be done.
+The belt starts when fingertips are next to the block for the first time, so that every attempt begins from the same
+situation, however long its approach took. It then runs a motion that the seed decides and that cannot be predicted. The
+score is the share of physics steps in which fingertips are within tolerance of their place beside the block: half a
+block's edge away they point past it. A block that was pushed or picked off the belt does not ride on, and the task
+cannot be done any more.
 """
 
 from __future__ import annotations
@@ -29,50 +29,50 @@ from runtime.simulation.bench.tabletop import ResetRequest, Tabletop
 if TYPE_CHECKING:
     from robots import Robot
 
-COURSE_S = 20.0
-TOLERANCE_M = 0.02  # half of a block's edge
-REQUIRED = 2 / 3  # of the time of the course, within the tolerance
+COURSE_S = 20.0  # from the start of the belt until it brakes
+TOLERANCE_M = 0.02  # half of a block's edge length
+REQUIRED = 2 / 3  # share of steps within the tolerance
 CONVEYOR = Bench(belt=Belt())
-_PLATE = (-0.05, 0.18)  # aside: nothing is to be put there
-_ON_BELT = 1e-3  # m above the belt, at most
+_PLATE = (-0.05, 0.18)  # out of the way: the task does not use it
+_ON_BELT = 1e-3  # [m] greatest height above the belt at which a block rides
 
 
 @dataclass(slots=True)
 class TrackingErrors:
-    """Fingertips' tracking of the block: distances [m] from their place beside it, in order of size."""
+    """Sorted distances of the fingertips from their place beside the block [m]."""
 
     distances: list[float] = field(default_factory=list)
-    total: float = 0.0  # m
+    total: float = 0.0  # [m]
 
     def add(self, distance: float) -> None:
-        """One more step of the physics."""
+        """Add the distance [m] of one physics step."""
         insort(self.distances, distance)
         self.total += distance
 
     @property
     def on_target_share(self) -> float:
-        """Of the time, within the tolerance; 0 before there was any."""
+        """Share of steps within the tolerance; 0 before the first."""
         return bisect_right(self.distances, TOLERANCE_M) / max(1, len(self.distances))
 
     @property
     def mean(self) -> float:
-        """Of the distances [m]; 0 before there were any."""
+        """Mean distance [m]; 0 before the first step."""
         return self.total / max(1, len(self.distances))
 
     def quantile(self, part: float) -> float:
-        """The distance [m] that is not exceeded for this part of the time; 0 before there were any."""
+        """Return the distance [m] that is not exceeded in the share `part` of steps; 0 before the first."""
         if not self.distances:
             return 0.0
         return self.distances[max(0, math.ceil(part * len(self.distances)) - 1)]
 
 
 class Conveyor(Tabletop):
-    """A belt, a block on it, a plate aside; what fingers do to the block they do as on any tabletop.
+    """Tabletop with a belt, a block on it and a plate out of the way; fingers act on the block as on any tabletop.
 
-    `escort` is about the course since the last reset.
+    `escort` contains the tracking errors since the last reset.
     """
 
-    step = 1 / 59  # s; nothing is to be grasped here, two steps to a tick at 30 Hz are enough
+    step = 1 / 59  # [s]; without grasping, two steps per tick at 30 Hz are enough
 
     def __init__(self, robot: Robot, seed: int) -> None:
         assert CONVEYOR.belt is not None
@@ -81,21 +81,21 @@ class Conveyor(Tabletop):
 
     @property
     def running(self) -> bool:
-        """True if the belt has been started and still runs."""
+        """Whether the belt has been started and still runs."""
         return self._reached["beside"] and not self.over
 
     @property
     def over(self) -> bool:
-        """True if the course has been run to its end."""
+        """Whether the belt's motion has ended."""
         return self._elapsed >= self._course.duration
 
     @property
     def success(self) -> bool:
-        """True if the course is over and fingertips were in their place for long enough."""
+        """Whether the motion has ended and fingertips were in their place for long enough."""
         return self.over and self.escort.on_target_share >= REQUIRED
 
     def truth(self) -> dict[str, object]:
-        """The node's report of its bench; `chase` covers the course since the last reset, in mm and s."""
+        """Return the ground truth for the node's observation; `chase` covers the time since the reset, in mm and s."""
         distance = self.distance()
         return super().truth() | {
             "milestones": {"reached": self._reached["beside"], "followed": self.success},
@@ -112,7 +112,7 @@ class Conveyor(Tabletop):
         }
 
     def distance(self) -> float:
-        """From the nearest fingertips to their place beside the block [m]; inf before anything has moved."""
+        """Return the distance of the nearest fingertips from their place at the block [m]; inf before any step."""
         block = self._blocks[0].pose[:3, 3] - (0.0, 0.0, self.bench.block_edge / 2)
         place = block + self.belt.fingertip_offset
         tips = [hand.tip[:3, 3] for hand in self._hands.values()]
@@ -140,7 +140,7 @@ class Conveyor(Tabletop):
         self._measure()
 
     def _run(self, seconds: float) -> None:
-        """The belt goes on, and takes the block along where it lies on it."""
+        """Advance the belt, together with the block if it lies on it."""
         before, self._elapsed = self._elapsed, min(self._elapsed + seconds, self._course.duration)
         block = self._blocks[0]
         aside = abs(block.pose[1, 3] - self.belt.y)
@@ -148,10 +148,10 @@ class Conveyor(Tabletop):
             block.shift(np.array([self._course.x(self._elapsed) - self._course.x(before), 0.0]))
 
     def _note(self) -> None:
-        """Nothing is to be lifted or carried here."""
+        """Do nothing: a conveyor has no milestones of lifting and carrying."""
 
     def _measure(self) -> None:
-        """Note where the fingertips are, while the belt runs; start it where they are beside the block."""
+        """Record the fingertips' distance while the belt runs; start the belt once they are beside the block."""
         distance = self.distance()
         if self.running:
             self.escort.add(distance)

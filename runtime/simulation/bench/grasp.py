@@ -1,4 +1,4 @@
-"""Effects of fingers on a block: they push it, turn it straight between the jaws, hold it."""
+"""Effects of fingers on a block: they push it, align it between the jaws, and hold it."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from runtime.core.types import Float64
 from runtime.simulation.bench.block import Block
 from runtime.simulation.bench.hands import FINGER_RADIUS, Hand
 
-TILT = math.radians(25.0)  # beyond which an arm does not come from above: the block slips
-TURN = math.radians(30.0)  # between jaws and block, beyond which the jaws meet its corners: it slips
-SIDE = 0.02  # m from the block's centre to the tip along the fingers' width, at most
-LOW, HIGH = -0.035, 0.015  # m from the tip ahead to the block's centre
-RELEASE = 0.003  # m beyond the block's width at which it falls
-_REACH = 0.005  # m beyond its side at which the fingers' width still meets it
-_DEEPEST = -0.06  # m; farther up between the fingers is the hand
-_BARELY = 0.002  # m by which fingers reach past its top when they touch it
-_SLACK = 1e-4  # m
-_YIELD = 0.3  # m/s with which a block gives way to a finger that comes down on it
+TILT = math.radians(25.0)  # largest tilt of the fingers from vertical; beyond it the block slips
+TURN = math.radians(
+    30.0
+)  # largest angle between jaws and block; beyond it they meet its corners and it slips
+SIDE = 0.02  # [m] largest offset of the block's centre along the fingers' width
+LOW, HIGH = -0.035, 0.015  # [m] from the fingertips ahead to the block's centre, for a grasp
+RELEASE = 0.003  # [m] opening beyond the block's width at which it falls
+_REACH = 0.005  # [m] beyond the block's side at which the fingers' width still meets it
+_DEEPEST = -0.06  # [m] from the fingertips; farther up between the fingers is the palm
+_BARELY = 0.002  # [m] by which fingers must reach past the block's top to touch it
+_SLACK = 1e-4  # [m] tolerance
+_YIELD = 0.3  # [m/s] speed at which a block yields to a finger that presses from above
 
 
 def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
-    """The opening [m] at which a block stops the jaws that close on it; None where it does not.
+    """Move a block between closing jaws; return the opening [m] at which it stops them, None if it does not.
 
-    `before` is the hand one step ago: a block is between the jaws only if they were open wide enough for it.
-    The jaws move the block along and turn it straight; it is taken if they hold it as an arm from above does.
+    `before` is the hand one step ago: a block is between the jaws only if they were open wide enough for it. The jaws
+    shift the block and rotate it into alignment; it is attached to the arm if they hold it from above.
     """
     place = hand.tip[:3, :3].T @ (block.pose[:3, 3] - hand.tip[:3, 3])
     if before.opening < _width(block, _turn(hand, block)) - _SLACK or not _between(hand, block, place):
@@ -43,7 +45,7 @@ def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
 
 
 def push(hand: Hand, block: Block, seconds: float) -> None:
-    """Move a block out of the finger that is deepest in it, not faster than that finger could."""
+    """Move a block out of the finger that penetrates it most, at most at the hand's speed plus _YIELD."""
     deepest, way = 0.0, np.zeros(2)
     for ball in hand.balls():
         if block.bottom - FINGER_RADIUS < ball[2] < block.top + FINGER_RADIUS:
@@ -69,19 +71,19 @@ def _from_above(hand: Hand, place: Float64) -> bool:
 
 
 def _turn(hand: Hand, block: Block) -> float:
-    """From the jaws to the nearest side of the block, about the vertical, in [-pi/4, pi/4]."""
+    """Return the angle from the jaws to the nearest side of the block about the vertical, in [-pi/4, pi/4]."""
     x, y = block.offset(block.pose[:2, 3] + hand.tip[:2, 1])
     angle = -math.atan2(y, x)
     return angle - round(angle / (math.pi / 2)) * math.pi / 2
 
 
 def _width(block: Block, turn: float) -> float:
-    """Between two parallel jaws that touch a block turned by `turn` from them."""
+    """Return the distance of two parallel jaws that touch a block rotated by `turn` from them [m]."""
     return block.edge * (math.cos(turn) + math.sin(abs(turn)))
 
 
 def _straighten(hand: Hand, block: Block) -> float:
-    """Turn the block as far as the jaws that close on it make it turn; returns its width between them."""
+    """Rotate the block as far as the closing jaws force it; return its width between them [m]."""
     turn = _turn(hand, block)
     width = _width(block, turn)
     if hand.opening >= width or abs(turn) > TURN:
@@ -93,7 +95,7 @@ def _straighten(hand: Hand, block: Block) -> float:
 
 
 def _overlap(block: Block, centre: Float64) -> tuple[float, Float64]:
-    """Depth of a ball at `centre` [2] in the block's outline, and the way [2] that takes it out."""
+    """Return the depth of a ball at `centre` [2] in the block's outline, and the direction [2] that frees the block."""
     nearest = block.nearest(centre)
     away = nearest - centre
     distance = float(np.hypot(*away))

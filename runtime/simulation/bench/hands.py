@@ -1,4 +1,4 @@
-"""The fingers of a simulated arm: where they are, how far they are open, and what keeps them from closing."""
+"""Fingers of a simulated arm: their pose, their opening, and the limit that a held block sets to it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from runtime.simulation.bench.bench import BenchError
 if TYPE_CHECKING:
     from robots import Gripper, Group, Robot
 
-FINGER_RADIUS = 0.01  # m; a finger is a row of balls whose inner sides are as far apart as the jaws are open
-_ALONG = np.array([-0.01, -0.03, -0.05, -0.07])  # m from the tip, where these balls are
-_UNMEASURED_JAWS = 0.1  # m
+FINGER_RADIUS = 0.01  # [m]; fingers are rows of balls, with inner sides as far apart as the jaws
+_ALONG = np.array([-0.01, -0.03, -0.05, -0.07])  # [m] places of these balls ahead of the fingertips
+_UNMEASURED_JAWS = 0.1  # [m] opening of grippers that do not declare it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hand:
-    """An arm's fingers at one instant: `tip` [4, 4] in the world (z ahead, y the way they open).
+    """Fingers of an arm at one moment: `tip` [4, 4] in the world (z ahead, y the direction in which they open).
 
-    `opening` [m] lies between them, `speed` [m/s] is the tip's over the table.
+    `opening` [m] is the distance between them, `speed` [m/s] that of the tip over the table.
     """
 
     arm: str
@@ -33,18 +33,22 @@ class Hand:
 
     @property
     def tilt(self) -> float:
-        """Radians between the way the fingers point and straight down."""
+        """Angle between the fingers' direction and straight down [rad]."""
         return float(np.arccos(np.clip(-self.tip[2, 2], -1.0, 1.0)))
 
     def balls(self) -> Float64:
-        """Centres [n, 3] of the balls that make up both fingers."""
+        """Return the centres [n, 3] of the balls that model both fingers."""
         across = self.opening / 2 + FINGER_RADIUS
         inside = [(0.0, side * across, along) for side in (-1, 1) for along in _ALONG]
         return np.asarray(np.array(inside) @ self.tip[:3, :3].T + self.tip[:3, 3])
 
 
 class Jaws:
-    """Turns an arm's place in the robot's vector into a Hand, and holds its gripper up at a width."""
+    """Gripper of an arm: converts the robot's joints to a `Hand`, and stops the gripper at a width.
+
+    Raises:
+        BenchError: If the group has no gripper.
+    """
 
     def __init__(self, robot: Robot, arm: Group) -> None:
         if arm.gripper is None or arm.gripper_dim is None:
@@ -55,7 +59,7 @@ class Jaws:
         self._opening = Opening(arm.gripper)
 
     def hand(self, q: Float64, before: Hand | None, seconds: float) -> Hand:
-        """The fingers at joints q [D]; `before` is where they were `seconds` ago."""
+        """Return the fingers at joints q [D]; `before` is their state `seconds` ago, None at the first step."""
         tip = self._limb.tip(q)
         way = 0.0 if before is None else float(np.linalg.norm(tip[:2, 3] - before.tip[:2, 3]))
         opening = max(0.0, self._opening.metres(float(q[self._dim])))
@@ -67,9 +71,9 @@ class Jaws:
 
 
 class Opening:
-    """Distance between the fingers of a gripper [m], and its number on the wire, in proportion.
+    """Conversion between a gripper's joint value and the distance of its fingers [m], which are proportional.
 
-    Where a description does not say it, they are taken to be 0.1 m apart when open.
+    If the description does not declare the distance, it is 0 when closed and 0.1 m when open.
     """
 
     def __init__(self, gripper: Gripper) -> None:
@@ -78,9 +82,9 @@ class Opening:
         self._most = most - self._least
 
     def metres(self, number: float) -> float:
-        """Between the fingers at a number of the wire."""
+        """Return the distance between the fingers [m] at a joint value."""
         return self._least + (number - self._close) / self._way * self._most
 
     def number(self, metres: float) -> float:
-        """Of the wire, at which the fingers are so far apart."""
+        """Return the joint value at which the fingers are `metres` apart."""
         return self._close + (metres - self._least) / self._most * self._way

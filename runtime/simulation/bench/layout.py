@@ -1,4 +1,4 @@
-"""Places of blocks and plate on the simulated bench: drawn by a seed, near wished places if there are any."""
+"""Layout of blocks and plate on the simulated bench: drawn from a seed, near requested places if there are any."""
 
 from __future__ import annotations
 
@@ -10,22 +10,25 @@ import numpy as np
 
 from runtime.simulation.bench.bench import Bench, BenchError, BenchLayout
 
-NOISE_M = 0.005  # by which things lie beside where they were asked for, at most, in x and in y
+NOISE_M = 0.005  # largest deviation from a requested place, in x and in y
 NOISE_RAD = math.radians(4.0)
-APART_M = 0.15  # block and plate, centre to centre, at least
-_CROWD_M = 0.09  # two blocks, centre to centre, at least
+APART_M = 0.15  # least distance of block and plate, centre to centre
+_CROWD_M = 0.09  # least distance of two blocks, centre to centre
 _TRIES = 1000
-_SIDES = ((-0.25, 0.0), (0.25, 0.0))  # where arms stand, and how far they reach [m] to grasp from above
+_SIDES = ((-0.25, 0.0), (0.25, 0.0))  # [m] places of arms; their reach for grasps from above follows
 _REACH = 0.42
 
 
 def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> BenchLayout:
-    """The layout of a seed: always the same one for the same arguments.
+    """Return the layout of a seed, the same for the same arguments.
 
-    `positions` may say where the task's block ("block": [x, y, yaw in degrees]) and the plate ("plate":
-    [x, y]) are wanted, they then lie within NOISE_M and NOISE_RAD of it; what it leaves out lies anywhere,
-    so that one side of the bench reaches both. BenchError where `positions` is not of this form, lies outside
-    the area or has block and plate closer than APART_M, or where `blocks` do not fit.
+    `positions` may request places of the task's block ("block": [x, y, yaw in degrees]) and of the plate ("plate": [x,
+    y]); they are then placed within NOISE_M and NOISE_RAD of them. An object without a request is placed at random, so
+    that block and plate are reachable from one side of the bench.
+
+    Raises:
+        BenchError: If `positions` has another form, is outside the area or has block and plate closer than APART_M, if
+            `blocks` is below 1 or does not fit, or if the seed is negative.
     """
     block, plate = _parse_positions(positions or {})
     if blocks < 1 or seed < 0:
@@ -39,7 +42,7 @@ def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: i
 
 
 def _parse_positions(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
-    """Block (x, y, yaw in rad) and plate (x, y) as asked for."""
+    """Return the requested block (x, y, yaw in rad) and plate (x, y)."""
     unknown = sorted(str(name) for name in positions if name not in ("block", "plate"))
     if unknown:
         raise BenchError(f"positions name {', '.join(unknown)}; allowed: block, plate")
@@ -76,7 +79,7 @@ def _place(name: str, given: Any, count: int) -> list[float] | None:
 def _pair(
     chance: np.random.Generator, block: list[float] | None, plate: list[float] | None
 ) -> tuple[tuple[float, float, float], tuple[float, float]]:
-    """Block and plate, tried until they are far enough apart and reached from one side."""
+    """Return block and plate, drawn until they are far enough apart and reachable from one side."""
     for _ in range(_TRIES):
         block_x, block_y, yaw = _random_place(chance) if block is None else _random_near(chance, block)
         plate_x, plate_y, _ = _random_place(chance) if plate is None else _random_near(chance, [*plate, 0.0])

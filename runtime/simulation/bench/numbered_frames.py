@@ -1,7 +1,7 @@
-"""Moving test pictures, BGR: a still background, its name, blocks that follow the joints, a frame number.
+"""Moving test patterns, BGR: a fixed background with the camera's name, blocks that follow the joints, a frame number.
 
-The top strip carries the frame number as black and white cells: whoever receives a picture, also after
-compression, can tell which frame it is. The bottom row has a red, a green and a blue patch, in this order.
+The top strip encodes the frame number as black and white cells, so that the receiver of an image can identify the frame
+even after compression. The bottom row has a red, a green and a blue patch, in this order.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from runtime.core.types import Float64, UInt8
 if TYPE_CHECKING:
     from robots import Robot
 
-_BITS = 24
-_STRIP = 1 / 30  # of the height
+_BITS = 24  # of the frame number, lowest first
+_STRIP = 1 / 30  # share of the image height
 _BLUE, _GREEN, _RED = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 _BLOCKS = ((60, 60, 235), (60, 200, 60), (220, 140, 40), (40, 200, 230))  # BGR, one per group in turn
 
 
 class Scene:
-    """Draws all cameras of a robot at [height, width]; `seed` makes the grain of the backgrounds."""
+    """Renderer of test patterns for all cameras of a robot at [height, width]; `seed` sets the backgrounds' noise."""
 
     def __init__(self, robot: Robot, height: int, width: int, seed: int = 0) -> None:
         self._robot = robot
@@ -34,7 +34,7 @@ class Scene:
         }
 
     def draw(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """One BGR uint8 [H, W, 3] per camera key for joints [D] at a time; fresh memory each time."""
+        """Return a newly allocated BGR uint8 [H, W, 3] image per camera key, for joints [D] at a time."""
         places = np.clip((q - self._robot.lower) / self._span, 0.0, 1.0)
         pictures = {}
         for index, (key, background) in enumerate(self._backgrounds.items()):
@@ -46,7 +46,7 @@ class Scene:
         return pictures
 
     def _blocks(self, picture: UInt8, places: Float64, camera: int) -> None:
-        """A block per group in a column of its own, moved by two joints, as wide as its gripper is open."""
+        """Draw a block per group in a column of its own, moved by two joints, as wide as its gripper is open."""
         height, width = picture.shape[:2]
         side = height // 8
         for index, group in enumerate(self._robot.groups):
@@ -58,7 +58,7 @@ class Scene:
 
 
 def frame_number(picture: UInt8) -> int:
-    """The number in the top strip; any size, any colour order."""
+    """Return the number in the top strip of an image of any size and colour order."""
     height, width = picture.shape[:2]
     row = max(0, int(height * _STRIP / 2))
     columns = ((np.arange(_BITS) + 0.5) * width / _BITS).astype(int)
@@ -74,7 +74,7 @@ def _write_number(picture: UInt8, number: int) -> None:
 
 
 def _sweep(picture: UInt8, seconds: float) -> None:
-    """A white bar that crosses the picture in four seconds: it moves also while the robot stands."""
+    """Draw a white bar that crosses the image in four seconds, so that it changes even if the robot is at rest."""
     height, width = picture.shape[:2]
     x = int(width * (seconds % 4.0) / 4.0)
     picture[int(height * 0.86) : int(height * 0.89), x : x + width // 20] = 255

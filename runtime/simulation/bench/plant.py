@@ -1,4 +1,4 @@
-"""A robot of numbers: every joint follows its target with a lag and never faster than its limit."""
+"""Kinematic robot model: every joint follows its target with a lag, within its velocity limit."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from runtime.core.types import EEF_WIDTH, Float32, Float64
 if TYPE_CHECKING:
     from robots import Group, Robot
 
-LAG = 0.06  # s, the time constant of each joint
+LAG = 0.06  # [s] time constant of each joint
 
 
 class Plant:
-    """Joints `q` float64 [D] that start at home, or at `start`; `target` is where they are going."""
+    """Joints `q` float64 [D] that start at home, or at `start`; they move towards `target` [D]."""
 
     def __init__(self, robot: Robot, lag: float = LAG, start: Float64 | None = None) -> None:
         self._robot = robot
@@ -25,18 +25,18 @@ class Plant:
         self.target: Float64 = self.q.copy()
 
     def advance(self, seconds: float) -> None:
-        """Let time pass: first order towards the target, limited in velocity."""
+        """Advance by `seconds`: first-order lag towards the target, limited in velocity."""
         wish = (self.target - self.q) * -math.expm1(-seconds / self._lag)
         reach = self._robot.velocity * seconds
         self.q = self.q + np.clip(wish, -reach, reach)
 
     def hold(self) -> None:
-        """Stay where it is."""
+        """Set the target to the present joints."""
         self.target = self.q.copy()
 
 
 def poses(robot: Robot, q: Float64) -> dict[str, Float32]:
-    """The end-effector vector float32 [8] of each arm at joints [D]: its pose and its gripper, 0 without one."""
+    """Return the end-effector vector float32 [8] of each arm at joints [D]: pose and gripper, 0 without a gripper."""
     return {arm.name: _pose(arm, q) for arm in robot.arms}
 
 

@@ -1,7 +1,7 @@
-"""The simulated tabletop: blocks and a plate that the fingers of any arm push, grasp, carry and drop.
+"""Simulated tabletop: blocks and a plate; the fingers of any arm push, grasp, carry and drop the blocks.
 
-The same commands at the same times from the same reset give the same course. Only fingers touch things; the
-plate stays where it is.
+The simulation is deterministic: the same commands at the same times after the same reset have the same result. Only
+fingers touch objects; the plate is fixed.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from runtime.simulation.bench.plant import Plant
 if TYPE_CHECKING:
     from robots import Robot
 
-STEP = 1 / 120  # s, at most
-REST_S = 0.2  # without moving, after which a block is at rest
-LIFTED_M = 0.03  # between a held block and the table
-MARGIN_M = 0.01  # inside the plate's rim that the block's centre must be
-_APART_SPEED = 0.5  # m/s with which things that ended up in each other part
-_WITHIN = 0.25  # m from fingertips to a block's centre, beyond which no part of a hand touches it
-_RIM = 0.002  # m below the plate's top at which a block stands beside it
+STEP = 1 / 120  # [s] longest step of the physics
+REST_S = 0.2  # time without motion after which a block is at rest
+LIFTED_M = 0.03  # height above the table from which a held block counts as lifted
+MARGIN_M = 0.01  # least distance of the block's centre inside the plate's rim for success
+_APART_SPEED = 0.5  # [m/s] speed at which overlapping objects separate
+_WITHIN = 0.25  # [m] from fingertips to a block's centre; farther blocks cannot be touched
+_RIM = 0.002  # [m] below the plate's top; a block that low is beside the plate
 
 
 @dataclass(frozen=True, slots=True)
 class ResetRequest:
-    """A wish to lay the bench anew; `id` tells repetitions from new wishes."""
+    """Request to lay out the bench anew; `id` distinguishes new requests from repetitions."""
 
     id: str
     seed: int
@@ -50,9 +50,9 @@ class ResetRequest:
 
 
 class Tabletop:
-    """Things on the bench of one robot; `advance` moves the robot's plant and everything it touches.
+    """Objects on the bench of one robot; `advance` moves the robot's plant and everything that it touches.
 
-    Time passes in pieces of at most `step` [s].
+    Time advances in steps of at most `step` [s].
     """
 
     step = STEP
@@ -69,26 +69,30 @@ class Tabletop:
         self._place_objects(self._reset)
 
     def reset(self, wish: ResetRequest) -> None:
-        """Lay the bench as wished; the same `id` again changes nothing. BenchError where that cannot be."""
+        """Lay out the bench as requested; a repetition of the last `id` changes nothing.
+
+        Raises:
+            BenchError: If the layout is not possible; nothing has changed then.
+        """
         if wish.id == self._reset.id:
             return
         self._place_objects(wish)
         self._reset = wish
 
     def advance(self, plant: Plant, seconds: float) -> None:
-        """Let time pass for the plant and the bench together; what is held keeps the jaws open."""
+        """Advance the plant and the bench by `seconds`; a held block limits how far the jaws close."""
         steps = math.ceil(seconds / self.step)
         for _ in range(steps):
             plant.advance(seconds / steps)
             self._step(plant.q, seconds / steps)
 
     def state(self) -> BenchState:
-        """Everything on the table, for pictures."""
+        """Return the state of everything on the table, for rendering."""
         x, y = self._plate
         return BenchState(tuple(block.state() for block in self._blocks), (float(x), float(y)))
 
     def truth(self) -> dict[str, object]:
-        """The node's report of its bench; milestones are those of the first block since the last reset."""
+        """Return the ground truth for the node's observation; milestones are the first block's since the last reset."""
         placed = self._on_plate(0.0)
         return {
             "reset": self._reset.id,
@@ -101,7 +105,11 @@ class Tabletop:
         }
 
     def _layout(self, wish: ResetRequest) -> BenchLayout:
-        """Layout for a reset; BenchError where it cannot be, and then nothing has changed."""
+        """Return the layout for a reset.
+
+        Raises:
+            BenchError: If it is not possible; nothing has changed then.
+        """
         return draw_layout(wish.seed, wish.positions, self._count)
 
     def _place_objects(self, wish: ResetRequest) -> None:
@@ -124,7 +132,7 @@ class Tabletop:
         self._note()
 
     def _handle(self, jaws: Jaws, q: Float64, seconds: float) -> None:
-        """Apply one arm's fingers to every block within this step."""
+        """Apply one arm's fingers to all blocks within this step, and stop its jaws at a block between them."""
         before = self._hands.get(jaws.name)
         hand = jaws.hand(q, before, seconds)
         stops = [
@@ -139,7 +147,7 @@ class Tabletop:
         self._hands[jaws.name] = hand
 
     def _touch(self, hand: Hand, before: Hand, block: Block, seconds: float) -> float | None:
-        """The opening at which the block stops the jaws, if it does."""
+        """Apply one arm's fingers to a block; return the opening at which it stops the jaws [m], else None."""
         if block.held_by not in ("", hand.arm):
             return None
         if block.held_by and hand.opening > block.edge + RELEASE:
@@ -155,7 +163,7 @@ class Tabletop:
         return block.edge
 
     def _support(self, block: Block) -> float:
-        """The height of what is under a block's centre: the table, the plate or another block."""
+        """Return the height of the support under a block's centre [m]: the table, the plate or another block."""
         centre = block.pose[:2, 3]
         on_plate = float(np.hypot(*(centre - self._plate))) < self.bench.plate_radius
         heights = [self.bench.plate_height if on_plate else 0.0]
@@ -166,7 +174,7 @@ class Tabletop:
         return max(heights)
 
     def _separate(self, block: Block, other: Block, seconds: float) -> None:
-        """Slide a block out of another one beside it."""
+        """Slide a block out of another block next to it."""
         if block.held_by or abs(block.pose[2, 3] - other.pose[2, 3]) > 0.9 * block.edge:
             return
         way = block.pose[:2, 3] - other.pose[:2, 3]
@@ -177,7 +185,7 @@ class Tabletop:
             block.shift(direction * min(depth, _APART_SPEED * seconds))
 
     def _clear_rim(self, block: Block, seconds: float) -> None:
-        """Slide a block that stands beside the plate out of its rim."""
+        """Slide a block that touches the plate's side out of its rim."""
         if block.bottom > self.bench.plate_height - _RIM:
             return
         way = block.pose[:2, 3] - self._plate
@@ -186,7 +194,7 @@ class Tabletop:
             block.shift(way / max(float(np.hypot(*way)), 1e-9) * min(depth, _APART_SPEED * seconds))
 
     def _note(self) -> None:
-        """Remember how far the task's block has come."""
+        """Update the milestones of the task's block."""
         block = self._blocks[0]
         lifted = bool(block.held_by) and block.bottom > LIFTED_M
         self._reached["grasped"] |= bool(block.held_by)
@@ -197,7 +205,7 @@ class Tabletop:
         return float(np.hypot(*(self._blocks[0].pose[:2, 3] - self._plate)))
 
     def _on_plate(self, margin: float) -> bool:
-        """True if the task's block lies on the plate at rest, `margin` [m] inside its rim."""
+        """Return True if the task's block is at rest on the plate, `margin` [m] inside its rim."""
         block = self._blocks[0]
         lies = block.still >= REST_S and abs(block.bottom - self.bench.plate_height) < 1e-3
         return lies and not block.held_by and self._from_plate() < self.bench.plate_radius - margin

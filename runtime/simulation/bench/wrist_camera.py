@@ -1,4 +1,4 @@
-"""Place of the camera on an arm: beside its hand, where enough of what lies before the fingers is in view."""
+"""Placement of the camera on an arm: next to its hand, with a sufficient view of the space before the fingers."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _BESIDE = (
     (0.12, -0.05),
     (0.16, -0.06),
     (0.14, 0.0),
-)  # m aside and ahead of the tip
-_AHEAD = 0.03  # m from the fingertips to what the camera is aimed at
-_ENOUGH = 0.8  # of the view, with which the nearest place is taken
+)  # [m] candidate places: sideways and ahead of the fingertips
+_AHEAD = 0.03  # [m] from the fingertips to the aim point
+_ENOUGH = 0.8  # share of visible points that is sufficient
 _SEEN = np.array([(x, y, z) for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05) for z in (0.0, 0.06)])
-_SHORT = 0.995  # of a way, at which it counts as gone: what is looked at does not hide itself
+_SHORT = 0.995  # share of a ray; shapes beyond it do not hide the point, which may be on them
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPlacement:
-    """A camera's place, what it is aimed at, and what is up in its picture, in the frame of the fingertips [m]."""
+    """Place, aim point and up direction of a camera in the frame of the fingertips [m]."""
 
     place: Point = (-0.095, 0.0, -0.125)
     aim: Point = (-0.005, 0.0, _AHEAD)
@@ -41,7 +41,10 @@ class CameraPlacement:
 
 @lru_cache(maxsize=64)  # cache: a search, for robots that do not change
 def place_wrist_camera(robot: Robot, arm: str) -> CameraPlacement:
-    """Of an arm: the nearest place from which enough is in view, else that with most, judged in the ready posture."""
+    """Return the nearest placement on an arm with a sufficient view, else the one with the best view.
+
+    The view is judged in the ready posture, or at home if there is none.
+    """
     q = robot.poses.get("ready", robot.poses["home"])
     tip = arm_frames(robot)[arm].tip(q)
     boxes = _Boxes(scene_of(robot), q)
@@ -58,7 +61,7 @@ def place_wrist_camera(robot: Robot, arm: str) -> CameraPlacement:
 
 
 class _Boxes:
-    """The boxes around a robot's shapes in the world, at joints q [D]."""
+    """Bounding boxes of a robot's visual shapes in the world, at joints q [D]."""
 
     def __init__(self, scene: RobotScene, q: Float64) -> None:
         poses = scene.poses(q)
@@ -68,10 +71,11 @@ class _Boxes:
         self._back = np.linalg.inv(places)
 
     def visible_share(self, eye: Float64, points: Float64) -> float:
-        """The share of points [n, 3] that no box hides from `eye` [3]; none from inside a box."""
+        """Return the share of points [n, 3] that no box hides from `eye` [3]; 0 if `eye` is inside a box."""
         start = self._back[:, :3, :3] @ eye + self._back[:, :3, 3]  # [S, 3]
         if ((start >= self._low) & (start <= self._high)).all(axis=1).any():
             return 0.0
+        # Slab test: where each ray enters and leaves each box, as shares of its length.
         way = np.einsum("sij,nj->nsi", self._back[:, :3, :3], points - eye)
         way = np.where(np.abs(way) < 1e-12, 1e-12, way)
         one, other = (self._low - start) / way, (self._high - start) / way
@@ -81,5 +85,5 @@ class _Boxes:
 
 
 def _placed(tip: Float64, points: Float64) -> Float64:
-    """Points [..., 3] of the fingertips' frame in the world."""
+    """Transform points [..., 3] from the fingertips' frame to the world."""
     return np.asarray(points @ tip[:3, :3].T + tip[:3, 3])

@@ -1,4 +1,4 @@
-"""Pictures of the simulated bench and the robot over it, as its cameras would see them."""
+"""Renderer of the simulated bench and the robot above it, as the robot's cameras would show them."""
 
 from runtime.simulation.render.renderer import Renderer
 

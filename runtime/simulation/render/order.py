@@ -1,8 +1,8 @@
-"""Which of two solids hides the other: the order in which a painter has to draw them.
+"""Occlusion order of convex solids: the order in which a painter has to draw them.
 
-Two convex solids that a plane separates hide each other only one way: the one on the camera's side of the
-plane hides the other. The planes tried are the sides of the boxes around the solids; where the boxes of two
-solids overlap, as at a joint, the side that separates them best decides.
+If a plane separates two convex solids, only the solid on the camera's side of the plane can hide the other. The planes
+tried are the sides of the boxes around the solids; if the boxes of two solids overlap, as at a joint, the side that
+separates them best decides.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ Bool = NDArray[np.bool_]
 
 
 class Order:
-    """The separating sides of solids as they stand; what hides what for an eye.
+    """Separating sides of solids at their present poses; `hides` evaluates them for a viewpoint.
 
-    The box around each has three unit axes, the rows of `axes` [S, 3, 3], its centre [S, 3] and half sizes [S, 3].
+    The box around each solid has three unit axes, the rows of `axes` [S, 3, 3], its centre [S, 3] and half sizes [S,
+    3].
     """
 
     def __init__(self, axes: Float32, centres: Float32, halves: Float32) -> None:
@@ -26,18 +27,18 @@ class Order:
         self._axes, self._centres = axes, centres
         self._halves = halves
         normals = axes.reshape(-1, 3)  # [3 S, 3]
-        reach = np.abs(normals @ normals.T).reshape(-1, count, 3)  # of every axis along every normal
+        reach = np.abs(normals @ normals.T).reshape(-1, count, 3)  # length of every axis along every normal
         radius = (reach * halves).sum(-1).reshape(count, 3, count)
         along = (normals @ centres.T).reshape(count, 3, count)
-        offset = along - along[np.arange(count), :, np.arange(count)][..., None]  # of the others' centres
-        gap = np.abs(offset) - halves[..., None] - radius  # [S, 3, S] between side and other
+        offset = along - along[np.arange(count), :, np.arange(count)][..., None]  # of the other centres
+        gap = np.abs(offset) - halves[..., None] - radius  # [S, 3, S] between a side and the other box
         self._side = gap.argmax(1)  # [S, S]
         take = np.ogrid[:count, :count]
         self._gap = gap[take[0], self._side, take[1]]
         self._sign = offset[take[0], self._side, take[1]] > 0
 
     def hides(self, eye: Float32) -> Bool:
-        """[S, S]: whether the second, as seen from `eye` [3], lies in front of the first."""
+        """Return bool [S, S]: whether the second solid is in front of the first, seen from `eye` [3]."""
         across = np.einsum("skd,sd->sk", self._axes, eye - self._centres)
         beyond = np.stack([-across > self._halves, across > self._halves], -1)  # [S, 3, 2]
         rows = np.arange(len(beyond))[:, None]
@@ -47,11 +48,12 @@ class Order:
 
 
 def painted(hides: Bool, overlap: Bool, distance: Float32) -> list[int]:
-    """The solids from back to front: what is hidden by another comes before it, else the farther first.
+    """Return the solids from back to front: hidden solids before those that hide them, otherwise the farther first.
 
-    `hides` and `overlap` are [S, S], the latter whether two overlap in the picture; a circle is broken at its
+    `hides` and `overlap` are [S, S]; `overlap` is whether two solids overlap in the image. A cycle is broken at its
     farthest solid.
     """
+    # A bit set per solid: the solids that it hides, which have to be drawn before it.
     below = np.packbits((hides & overlap).T, axis=1, bitorder="little")
     waits = [int.from_bytes(row.tobytes(), "little") & ~(1 << solid) for solid, row in enumerate(below)]
     queue = np.argsort(-distance, kind="stable").tolist()

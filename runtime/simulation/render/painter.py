@@ -1,4 +1,4 @@
-"""Paints solids into a camera's picture, back to front, with smooth edges and light from one side."""
+"""Painter of solids into a camera's image: back to front, with smooth edges and light from one side."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from runtime.simulation.bench.bench import PinholeCamera
 from runtime.simulation.render.order import Order, painted
 from runtime.simulation.render.solids import Placed, Solids
 
-LIGHT = np.array([-0.36, 0.28, 0.89], np.float32)  # towards the lamp
+LIGHT = np.array([-0.36, 0.28, 0.89], np.float32)  # direction towards the lamp
 LIGHT /= np.linalg.norm(LIGHT)
-_FILL = np.array([0.75, -0.6, 0.25], np.float32)  # a second, weak one
+_FILL = np.array([0.75, -0.6, 0.25], np.float32)  # direction towards a second, weak lamp
 _FILL /= np.linalg.norm(_FILL)
-_NEAR = 0.012  # m before the camera, nothing nearer is drawn
-_SHIFT = 4  # bits of a pixel's fraction
-_FAR_OUT = 12000.0  # pixels; OpenCV's coordinates end at 32767
-_OUTLINE = 0.62  # brightness of a solid's rim against its faces
-_GLOSS, _SHINE = 0.14, 20
+_NEAR = 0.012  # [m] in front of the camera; nothing nearer is drawn
+_SHIFT = 4  # fractional bits of pixel coordinates
+_FAR_OUT = 12000.0  # [pixels]; OpenCV's coordinates end at 32767
+_OUTLINE = 0.62  # brightness of a solid's outline relative to its faces
+_GLOSS, _SHINE = 0.14, 20  # strength and exponent of highlights
 
 
 class Painter:
-    """Draws one moment of `solids`: made once for it, then used for every camera."""
+    """Painter of `solids` at one moment; create it once per moment and call `paint` for every camera."""
 
     def __init__(self, solids: Solids, placed: Placed) -> None:
         self._solids = solids
@@ -40,7 +40,7 @@ class Painter:
         self._rims: list[list[float]] = rims[:, ::-1].tolist()
 
     def paint(self, picture: UInt8, camera: PinholeCamera) -> None:
-        """Draw everything that the camera sees onto the picture."""
+        """Draw all solids in the camera's view onto the image."""
         solids, placed = self._solids, self._placed
         eye = camera.pose[:3, 3].astype(np.float32)
         inside = (placed.vertices - eye) @ camera.pose[:3, :3].astype(np.float32)
@@ -65,7 +65,7 @@ class Painter:
                 self._paint_solid(picture, corners, solid, facing)
 
     def _facing(self, eye: Float32, chosen: NDArray[np.intp]) -> dict[int, tuple[float, ...]]:
-        """The faces of chosen solids that the eye sees from outside, and in which colour (blue, green, red)."""
+        """Return the colours (blue, green, red) of those faces of chosen solids whose outside is towards `eye`."""
         solids, normals = self._solids, self._placed.normals
         wanted = np.zeros(len(solids.solids), bool)
         wanted[chosen] = True
@@ -107,7 +107,7 @@ class Painter:
         solid: int,
         facing: Mapping[int, tuple[float, ...]],
     ) -> None:
-        """A solid that reaches behind the camera: only what of its faces lies ahead."""
+        """Paint a solid that extends behind the camera: only the parts of its faces that are ahead."""
         for face in self._solids.faces_of[solid]:
             if face in facing:
                 fill_ahead(picture, camera, inside[self._solids.faces[face]], facing[face])
@@ -120,7 +120,7 @@ def fill_ahead(
     colour: tuple[float, ...] | list[float],
     edges: int = cv2.LINE_AA,
 ) -> None:
-    """Fill the part that lies ahead of a flat polygon given in the camera's axes, [n, 3]."""
+    """Fill the part of a flat polygon [n, 3] in camera axes that is in front of the camera."""
     corners = ahead(inside)
     if len(corners) < 3:
         return
@@ -131,7 +131,7 @@ def fill_ahead(
 
 
 def ahead(inside: Float32) -> Float32:
-    """Part before the camera, [m, 3], of a flat polygon [n, 3] in the camera's axes; empty if nothing."""
+    """Return the part [m, 3] of a flat polygon [n, 3] in camera axes that is in front of the camera, or [0, 3]."""
     kept: list[list[float]] = []
     corners: list[list[float]] = inside.tolist()
     before = corners[-1]
@@ -146,7 +146,7 @@ def ahead(inside: Float32) -> Float32:
 
 
 def _in_view(camera: PinholeCamera, inside: Float32, solids: Solids) -> NDArray[np.bool_]:
-    """Which solids [S] are not wholly behind the camera or beyond one side of its picture."""
+    """Return bool [S]: solids that are not entirely behind the camera or beyond one side of its image."""
     x, y, depth = inside.T
     across, down = x * camera.fx, y * camera.fy
     sides = (
@@ -160,12 +160,12 @@ def _in_view(camera: PinholeCamera, inside: Float32, solids: Solids) -> NDArray[
 
 
 def _pixels(camera: PinholeCamera, inside: Float32) -> Float32:
-    """Columns and rows [n, 2] of points in the camera's axes."""
+    """Return the columns and rows [n, 2] of points in camera axes."""
     depth = np.maximum(inside[:, 2:], _NEAR)
     pixels = inside[:, :2] / depth * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return np.asarray(np.clip(pixels, -_FAR_OUT, _FAR_OUT), np.float32)
 
 
 def _overlap(low: Float32, high: Float32) -> NDArray[np.bool_]:
-    """[S, S]: which rectangles have anything in common."""
+    """Return bool [S, S]: rectangles that intersect or touch."""
     return np.asarray(((low[:, None] <= high + 1) & (low <= high[:, None] + 1)).all(-1))

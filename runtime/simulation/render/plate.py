@@ -1,4 +1,4 @@
-"""A round dish on the table: its outer side, its coloured rim, the slope inwards and the flat middle."""
+"""Renderer of the round plate on the table: outer side, coloured rim, inward slope and flat middle."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from runtime.simulation.bench.bench import Bench, PinholeCamera
 from runtime.simulation.render.painter import fill_ahead
 from runtime.simulation.render.solids import circle
 
-_POINTS = 64
-_NEAR = 0.02  # m before the camera
-_INSIDE = (  # share of the radius, of the height, brightness: from the rim inwards
+_POINTS = 64  # per ring
+_NEAR = 0.02  # [m] in front of the camera
+_INSIDE = (  # share of the radius, share of the height, brightness; from the rim inwards
     (0.93, 0.95, 0.97),
     (0.90, 0.90, 0.86),
     (0.72, 0.35, 0.93),
@@ -21,7 +21,7 @@ _INSIDE = (  # share of the radius, of the height, brightness: from the rim inwa
 
 
 class Plate:
-    """Rings of a dish around its middle, each filled over the ones before it."""
+    """Concentric rings of the plate, each filled over the previous ones."""
 
     def __init__(self, bench: Bench) -> None:
         radius, height = bench.plate_radius, bench.plate_height
@@ -38,7 +38,7 @@ class Plate:
         self._colours = [rim.tolist(), *((white * tone).tolist() for _, _, tone in _INSIDE)]
 
     def draw(self, picture: UInt8, camera: PinholeCamera, place: tuple[float, float]) -> None:
-        """Draw it with its middle at x, y onto the picture."""
+        """Draw the plate with its middle at x, y of `place` [m] onto the image."""
         eye = camera.pose[:3, 3] - (*place, 0.0)
         inside = np.asarray((self._rings - eye) @ camera.pose[:3, :3], np.float32)
         if inside[:, 2].max() < _NEAR:

@@ -1,4 +1,4 @@
-"""Every camera's picture of one moment: the robot at its joints, the bench as it lies."""
+"""Renderer of all cameras at one moment: the robot at its joints, the bench in its present state."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 class Renderer:
-    """Draws all cameras of a robot over a bench at [height, width]; `seed` makes the grain of the table.
+    """Renderer of all cameras of a robot above a bench at [height, width]; `seed` decides the grain of the table.
 
-    The same arguments give the same pictures to the last bit. Nothing is kept from one moment to the next
-    but what is always the same.
+    Images are deterministic to the last bit. Only fixed parts are cached between calls: geometry, the table's texture
+    and the background of overhead cameras.
     """
 
     def __init__(self, robot: Robot, bench: Bench, width: int, height: int, seed: int = 0) -> None:
@@ -35,7 +35,7 @@ class Renderer:
         self._table = Table(bench, seed)
         self._plate = Plate(bench)
         self._shadows = Shadows(bench)
-        self._solids: dict[int, Solids] = {}  # by the number of blocks
+        self._solids: dict[int, Solids] = {}  # by number of blocks
         q = robot.poses["home"]
         carriers = {camera.key: benches.camera_arm(robot, camera) for camera in robot.cameras}
         still = {key for key, arm in carriers.items() if arm is None}
@@ -44,7 +44,7 @@ class Renderer:
         }
 
     def draw(self, q: Float64, state: BenchState) -> dict[str, UInt8]:
-        """A BGR uint8 [H, W, 3] per camera key for joints [D]; fresh memory each time."""
+        """Return a newly allocated BGR uint8 [H, W, 3] image per camera key, for joints [D] and a bench state."""
         solids = self._solids_of(len(state.blocks))
         frames = np.array([*self._scene.poses(q), *(block.pose for block in state.blocks)])
         whole = solids.placed(frames)
@@ -57,7 +57,7 @@ class Renderer:
             picture = self._table.draw(camera) if still is None else still.copy()
             self._plate.draw(picture, camera, state.plate)
             darken(picture, camera, light)
-            under = camera.pose[2, 3] < 0  # where no arm should be, but a simulated one can
+            under = camera.pose[2, 3] < 0  # camera below the table: a simulated arm can go there
             (Painter(solids, whole) if under else painter).paint(picture, camera)
             pictures[key] = picture
         return pictures
@@ -66,7 +66,7 @@ class Renderer:
         return benches.cameras(self._robot, q, *self._size)
 
     def _solids_of(self, blocks: int) -> Solids:
-        """The robot's shapes and so many blocks, whose frames follow those of the robot's parts."""
+        """Return the robot's visual shapes and `blocks` blocks; frames of blocks follow those of the robot's parts."""
         if blocks not in self._solids:
             shapes = [
                 Solid(visual.part, visual.kind, visual.size, visual.origin, visual.colour[:3])

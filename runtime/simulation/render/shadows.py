@@ -1,4 +1,4 @@
-"""The shadows on the table, of everything that stands on it or hangs over it."""
+"""Shadows on the table, cast by everything on it or above it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from runtime.simulation.render.table import (
     texels_to_pixels,
 )
 
-_TEXEL = 0.004  # m
-_SOFT_FROM = 0.09  # m above the table from which a shadow is softer
+_TEXEL = 0.004  # [m] per point of the map
+_SOFT_FROM = 0.09  # [m] height above the table from which shadows are soft
 
 
 class Shadows:
-    """Light on the table, uint8 (255 = all), in a map of its own seen from above."""
+    """Map of the light on the table as seen from above, uint8 (255 = full light)."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
@@ -31,7 +31,7 @@ class Shadows:
         self._under_plate: tuple[tuple[float, float], UInt8] | None = None
 
     def cast(self, solids: Solids, placed: Placed, plate: tuple[float, float]) -> UInt8:
-        """The map for solids and a plate: sharp and dark where they touch the table, soft where they are high."""
+        """Return the map for solids and a plate: dark and sharp below low solids, light and soft below high solids."""
         vertices = placed.vertices
         floor = np.where(
             np.hypot(*(placed.centres[:, :2] - np.array(plate)).T) < self._bench.plate_radius * 0.9,
@@ -55,7 +55,7 @@ class Shadows:
         return np.asarray(cv2.min(blurred, self._plate_map(plate)), np.uint8)
 
     def _plate_map(self, plate: tuple[float, float]) -> UInt8:
-        """The plate's own shadow, around it but not upon it."""
+        """Return the plate's own shadow, around it but not on it."""
         if self._under_plate is None or self._under_plate[0] != plate:
             shade = np.full(self._shape, 255, np.uint8)
             height, radius = self._bench.plate_height, self._bench.plate_radius
@@ -73,14 +73,14 @@ class Shadows:
 
 
 def darken(picture: UInt8, camera: PinholeCamera, light: UInt8) -> None:
-    """Darken the picture of a table by a map of the light on it."""
+    """Darken the image of a table by a map of the light on it."""
     half = (camera.width // 2, camera.height // 2)
     matrix = np.diag([0.5, 0.5, 1.0]) @ texels_to_pixels(camera, _TEXEL)
     small = cv2.warpPerspective(
         light, matrix, half, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=255
     )
     outline = outline_of(camera)
-    if not covers(outline, camera):  # a homography also shows what lies behind the camera, above the horizon
+    if not covers(outline, camera):  # above the horizon a homography also maps points behind the camera
         mask = np.full(small.shape, 255, np.uint8)
         if len(outline) > 2:
             cv2.fillConvexPoly(mask, (outline * 8).round().astype(np.int32), 0, cv2.LINE_8, 4)

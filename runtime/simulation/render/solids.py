@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from runtime.core.types import Float32, Float64
 
 Face = tuple[int, ...]
-_SIDES = 16  # of a cylinder
-_MANY_SIDES, _LONG = 24, 0.05  # of one of this length [m] or more
-_RINGS = 6  # of a sphere, from pole to pole
+_SIDES = 16  # of a short cylinder, and of a sphere
+_MANY_SIDES, _LONG = 24, 0.05  # sides of cylinders of this length [m] or more
+_RINGS = 6  # bands of a sphere, from pole to pole
 _BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _BOX_FACES: tuple[Face, ...] = (
     (0, 1, 3, 2),
@@ -28,10 +28,10 @@ _BOX_FACES: tuple[Face, ...] = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """A box (x, y, z), cylinder (radius, length along z) or sphere (radius,) in m, in frame `frame`.
+    """Box (x, y, z), cylinder (radius, length along z) or sphere (radius,) in metres, fixed in frame `frame`.
 
-    `origin` [4, 4] is its centre there; `colour` red, green, blue, 0 to 1. A `painted` one is matt and has its
-    edges drawn lighter; the others are of lacquered metal.
+    `origin` [4, 4] is the pose of its centre in that frame; `colour` is red, green, blue, 0 to 1. A `painted` solid is
+    matt and has lighter edges; other solids have a lacquered finish.
     """
 
     frame: int
@@ -43,12 +43,12 @@ class Solid:
 
 
 class Solids:
-    """All solids in flat arrays: V vertices, F faces (corners counter-clockwise from outside), S solids."""
+    """Solids in flat arrays: V vertices, F faces (corners counter-clockwise seen from outside), S solids."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         meshes = [_mesh(solid) for solid in solids]
         counts = [len(vertices) for vertices, _ in meshes]
-        self.starts = np.cumsum([0, *counts[:-1]])  # [S] of each solid's vertices
+        self.starts = np.cumsum([0, *counts[:-1]])  # [S] first vertex of each solid
         self.stops = self.starts + counts
         self.solids = tuple(solids)
         self.frames = np.array([solid.frame for solid in solids], np.intp)
@@ -84,7 +84,7 @@ class Solids:
         )  # [S, 3] of the box around each
 
     def placed(self, frames: Float64) -> Placed:
-        """The solids in the world where their frames, world <- frame [N, 4, 4], are."""
+        """Return the solids in the world for the poses of all frames, world <- frame [N, 4, 4]."""
         near = frames.astype(np.float32)
         turns, shifts = near[:, :3, :3], near[:, :3, 3]
         vertices = (turns[self._vertex_frames] @ self._vertices)[..., 0] + shifts[self._vertex_frames]
@@ -94,7 +94,7 @@ class Solids:
         return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1), seen)
 
     def above_table(self, placed: Placed) -> Placed:
-        """Parts of solids above the table, z = 0: the rest is cut off; solids wholly under it are unseen."""
+        """Return the solids cut off at the table, z = 0; solids entirely below it are marked as not drawn."""
         above = np.maximum.reduceat(placed.vertices[:, 2], self.starts) > 0
         cut = placed.vertices.copy()
         np.maximum(cut[:, 2], 0, out=cut[:, 2])
@@ -103,10 +103,10 @@ class Solids:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Solids in the world: vertices [V, 3], outward normals [F, 3], and the boxes around them.
+    """Solids in the world: vertices [V, 3], outward normals [F, 3], and the boxes around the solids.
 
-    A box has its centre [S, 3] and its three unit axes as the rows of [S, 3, 3]. `seen` [S] are the solids that
-    are to be drawn.
+    A box has its centre [S, 3] and its three unit axes as the rows of [S, 3, 3]. `seen` [S] is whether a solid is
+    drawn.
     """
 
     vertices: Float32
@@ -123,7 +123,7 @@ def _pairs(
 
 
 def _mesh(solid: Solid) -> tuple[Float64, Sequence[Face]]:
-    """Vertices [n, 3] about the solid's centre, and faces."""
+    """Return the vertices [n, 3] about the solid's centre, and the faces."""
     if solid.kind == "box":
         return _BOX * solid.size, _BOX_FACES
     if solid.kind == "cylinder":
@@ -140,7 +140,7 @@ def _half(solid: Solid) -> tuple[float, float, float]:
 
 
 def circle(radius: float, count: int) -> Float64:
-    """Points [count, 2] around the origin, counter-clockwise."""
+    """Return points [count, 2] on a circle around the origin, counter-clockwise."""
     turn = np.arange(count) * (2 * math.pi / count)
     return np.column_stack([np.cos(turn), np.sin(turn)]) * radius
 
@@ -171,7 +171,7 @@ def _sphere(radius: float) -> tuple[Float64, Sequence[Face]]:
 
 
 def _normal(corners: NDArray[np.float32]) -> Float64:
-    """The unit normal of a flat face [n, 3], counter-clockwise."""
+    """Return the unit normal of a flat face [n, 3] with counter-clockwise corners."""
     corners = corners.astype(np.float64)
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
     return np.asarray(normal / np.linalg.norm(normal))

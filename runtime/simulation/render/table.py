@@ -1,4 +1,4 @@
-"""The table, drawn where a camera sees it."""
+"""Renderer of the table and the room around it."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from runtime.core.types import Float32, Float64, UInt8
 from runtime.simulation.bench.bench import Belt, Bench, PinholeCamera
 from runtime.simulation.render.painter import ahead, fill_ahead
 
-_FLOOR, _CEILING, _WALL = -0.75, 1.9, 2.4  # m from the table's surface; m from its middle
+_FLOOR, _CEILING, _WALL = -0.75, 1.9, 2.4  # [m] heights relative to the table; distance of walls
 
 
 def _room() -> list[tuple[Float32, tuple[int, int, int]]]:
-    """Floor and walls around the table as quads [4, 3] with their colours (blue, green, red)."""
+    """Return floor, ceiling and walls around the table as quads [4, 3] with their colours (blue, green, red)."""
     w, f, c, s = _WALL, _FLOOR, _CEILING, -0.05
     quads: list[tuple[list[tuple[float, float, float]], tuple[int, int, int]]] = [
         ([(-w, -w, f), (w, -w, f), (w, w, f), (-w, w, f)], (92, 88, 84)),
@@ -33,31 +33,31 @@ _ROOM = _room()
 
 
 def draw_room(picture: UInt8, camera: PinholeCamera) -> None:
-    """Fill the picture with what of the room the camera sees."""
+    """Fill the image with the visible part of the room."""
     eye, turn = camera.pose[:3, 3].astype(np.float32), camera.pose[:3, :3].astype(np.float32)
-    picture.fill(118)  # of a seam that no wall covers
+    picture.fill(118)  # colour of gaps between the quads
     for corners, colour in _ROOM:
         inside = np.asarray((corners - eye) @ turn, np.float32)
         fill_ahead(picture, camera, inside, colour, cv2.LINE_8)
 
 
-X, Y = (-0.80, 0.80), (-0.42, 0.86)  # m, the table's edges
-_TEXEL = 0.001  # m
-_BOARD = 0.16  # m, width of a board
-_BEYOND = 0.08  # m of belt at either end that nothing rides on
-_RAIL, _RAIL_COLOUR = 0.008, (150, 154, 160)  # m
+X, Y = (-0.80, 0.80), (-0.42, 0.86)  # [m] edges of the table
+_TEXEL = 0.001  # [m] per point of the texture
+_BOARD = 0.16  # [m] width of a board
+_BEYOND = 0.08  # [m] of belt beyond the range of blocks, at either end
+_RAIL, _RAIL_COLOUR = 0.008, (150, 154, 160)  # width [m], colour
 CORNERS = np.array([[X[0], Y[0], 0.0], [X[1], Y[0], 0.0], [X[1], Y[1], 0.0], [X[0], Y[1], 0.0]])
 
 
 class Table:
-    """Boards of pale wood with the work area marked; `seed` makes their grain."""
+    """Table of pale wooden boards with a marked work area; `seed` decides the grain."""
 
     def __init__(self, bench: Bench, seed: int) -> None:
         self._bench = bench
         self._texture = _boards(bench, seed)
 
     def draw(self, camera: PinholeCamera) -> UInt8:
-        """The bare table in its room, BGR [H, W, 3]."""
+        """Return an image of the empty table in its room, BGR [H, W, 3]."""
         picture = np.empty((camera.height, camera.width, 3), np.uint8)
         outline = outline_of(camera)
         whole = covers(outline, camera)
@@ -91,7 +91,7 @@ class Table:
 
 
 def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
-    """The homography [3, 3] from a map of the table, `texel` m per point, to the camera's picture."""
+    """Return the homography [3, 3] from a map of the table with `texel` [m] per point to the camera's image."""
     to_world = np.array([[texel, 0, X[0]], [0, texel, Y[0]], [0, 0, 0], [0, 0, 1.0]])
     lens = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     turn = camera.pose[:3, :3].T
@@ -99,7 +99,7 @@ def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
 
 
 def outline_of(camera: PinholeCamera) -> Float32:
-    """Pixels [n, 2] around the part of the table that lies before the camera; empty if there is none."""
+    """Return the pixels [n, 2] around the part of the table in front of the camera; empty if there is none."""
     inside = ahead(((CORNERS - camera.pose[:3, 3]) @ camera.pose[:3, :3]).astype(np.float32))
     if len(inside) < 3:
         return np.empty((0, 2), np.float32)
@@ -108,7 +108,7 @@ def outline_of(camera: PinholeCamera) -> Float32:
 
 
 def covers(outline: Float32, camera: PinholeCamera) -> bool:
-    """True if every corner of the picture lies inside the outline."""
+    """Return True if all corners of the image are inside the outline."""
     if len(outline) < 3:
         return False
     right, low = float(camera.width), float(camera.height)
@@ -117,7 +117,7 @@ def covers(outline: Float32, camera: PinholeCamera) -> bool:
 
 
 def _boards(bench: Bench, seed: int) -> UInt8:
-    """Boards along x with grain, joints between them, and the corners of the work area taped."""
+    """Draw boards along x with grain, joints between them, and tape at the corners of the work area."""
     chance = np.random.default_rng(seed)
     height, width = round((Y[1] - Y[0]) / _TEXEL), round((X[1] - X[0]) / _TEXEL)
     grain = _streaks(chance, height, width, 60, 0.0) * 3.5 + _streaks(chance, height, width, 260, 2.0) * 3.0
@@ -139,7 +139,7 @@ def _boards(bench: Bench, seed: int) -> UInt8:
 def _streaks(
     chance: np.random.Generator, height: int, width: int, along: int, across: float
 ) -> NDArray[np.float32]:
-    """Noise of deviation 1, smeared over so many texels along x and, where `across` is not 0, along y."""
+    """Return noise of deviation 1, blurred over `along` texels in x and, unless 0, `across` texels in y."""
     noise = chance.standard_normal((height, width // 4)).astype(np.float32)
     smeared = cv2.GaussianBlur(noise, (0, 0), along / 16, sigmaY=across or 0.3)
     wide = cv2.resize(smeared, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -147,7 +147,7 @@ def _streaks(
 
 
 def _tape(texture: UInt8, bench: Bench) -> None:
-    """White angles at the corners of the work area, a little outside of it."""
+    """Draw white angles slightly outside the corners of the work area."""
     x_from, x_to, y_from, y_to = bench.area
     margin, arm, thick = 0.045, 0.045, 0.005
     for x, inwards_x in ((x_from - margin, 1), (x_to + margin, -1)):
@@ -160,7 +160,7 @@ def _tape(texture: UInt8, bench: Bench) -> None:
 
 
 def _roll_out(texture: UInt8, belt: Belt) -> None:
-    """A belt across the table with a rail on either side, both longer than what rides on it ever goes."""
+    """Draw a belt across the table with a rail on either side, longer than the range in which blocks ride."""
     ends = belt.x[0] - _BEYOND, belt.x[1] + _BEYOND
     for half, colour in ((belt.width / 2 + _RAIL, _RAIL_COLOUR), (belt.width / 2, belt.colour)):
         corners = np.column_stack([ends, (belt.y - half, belt.y + half)]) - (X[0], Y[0])

@@ -1,1 +1,1 @@
-"""What the simulated robot's ROS nodes share: messages, domains, and the robot behind them."""
+"""Common parts of the simulated ROS robots: message types, domains, and the robot itself."""

@@ -1,7 +1,7 @@
-"""Lends this Python the rospy of another one, such as Debian's: it is written in Python alone.
+"""Import of rospy from another Python installation, such as Debian's; rospy is pure Python.
 
-A folder of links to rospy's packages is put behind everything else that is imported, so that nothing of the other
-Python but these comes along.
+A folder of links to rospy's packages is appended to the end of sys.path, so that nothing else of the other installation
+can be imported. Packages that this Python has itself are not linked.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PACKAGES = (
     "rosgraph_msgs", "roslib", "rospkg", "rospy", "sensor_msgs", "std_msgs", "std_srvs", "yaml",
 )  # fmt: skip
 _NEEDED = {"rospy", "sensor_msgs", "geometry_msgs"}
-_FIND = (
+_FIND = (  # program that prints the origins of packages
     "import importlib.util as u, json, sys; "
     "print(json.dumps({n: s.origin for n in sys.argv[1:] for s in [u.find_spec(n)] if s and s.origin}))"
 )
@@ -30,7 +30,11 @@ _FIND = (
 
 @contextmanager
 def lent(python: str) -> Iterator[None]:
-    """rospy can be imported within; SetupError where that Python has none."""
+    """Make rospy of the installation `python` importable within the context.
+
+    Raises:
+        SetupError: If that installation lacks a needed package, or cannot be run.
+    """
     wanted = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
     found = _places(python, wanted)
     missing = _NEEDED & set(wanted) - found.keys()

@@ -1,7 +1,7 @@
-"""The messages of the simulated ROS 2 robot, with a codec of its own: nothing here is shared with the client.
+"""Messages of the simulated ROS 2 robot, with a codec of its own: no code is shared with the transport under test.
 
-Joints and poses go through cyclonedds' own codec. Pictures are packed here, as that one takes 60 ms for each. No
-`from __future__ import annotations`: cyclonedds cannot resolve what it makes of them.
+Joints and poses use cyclonedds' codec. Images are serialised here, because cyclonedds takes 60 ms for each. There is no
+`from __future__ import annotations`: cyclonedds cannot resolve the annotations that it leaves.
 """
 # mypy: disable-error-code="type-arg, misc, call-arg, untyped-decorator"
 
@@ -81,7 +81,7 @@ class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
     data: sequence[uint8]
 
     def serialize(self, *_: Any, **__: Any) -> bytes:
-        """The bytes, `data` being bytes."""
+        """Return the CDR bytes of the message; `data` must be bytes."""
         packed = _text(_fields(_header(self.header), "II", self.height, self.width), self.encoding)
         packed = _fields(packed + bytes([self.is_bigendian]), "II", self.step, len(self.data))
         return packed + bytes(self.data)
@@ -95,13 +95,13 @@ class CompressedImage(IdlStruct, typename="sensor_msgs::msg::dds_::CompressedIma
     data: sequence[uint8]
 
     def serialize(self, *_: Any, **__: Any) -> bytes:
-        """The bytes, `data` being bytes."""
+        """Return the CDR bytes of the message; `data` must be bytes."""
         packed = _fields(_text(_header(self.header), self.format), "I", len(self.data))
         return packed + bytes(self.data)
 
 
 def _fields(packed: bytes, kinds: str, *numbers: int) -> bytes:
-    """Four-byte numbers behind what is packed, aligned; the four bytes of encapsulation change no alignment."""
+    """Append aligned four-byte numbers; the four bytes of encapsulation do not affect alignment."""
     return packed + bytes(-len(packed) % 4) + struct.pack(f"<{kinds}", *numbers)
 
 

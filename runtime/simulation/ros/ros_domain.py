@@ -1,4 +1,4 @@
-"""A ROS domain of one's own for a while: real UDP on loopback, on ports that nobody else uses meanwhile."""
+"""Temporary private ROS domain: real UDP on loopback, on ports that no other process uses meanwhile."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from collections.abc import Iterator
 
 from runtime.core.errors import SetupError
 
-_DOMAINS = range(1, 100)  # beyond, ports reach into those that the system gives to anybody
-_FIRST, _EACH = 7400, 250  # RTPS 2.5, section 9.6.2
+_DOMAINS = range(1, 100)  # higher domains overlap the system's ephemeral ports
+_FIRST, _EACH = 7400, 250  # first port, ports per domain: RTPS 2.5, section 9.6.2
 
 
 @contextlib.contextmanager
 def free_domain() -> Iterator[int]:
-    """A domain id; a TCP port among the domain's is held as a sign that it is taken."""
+    """Yield an unused domain id; a bound TCP port of the domain's range marks it as in use.
+
+    Raises:
+        SetupError: If all domains are in use.
+    """
     start = os.getpid()
     for offset in _DOMAINS:
         domain = _DOMAINS[(start * 7 + offset) % len(_DOMAINS)]

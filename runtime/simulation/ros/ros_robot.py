@@ -1,4 +1,4 @@
-"""A simulated robot behind ROS topics, of either generation: it says where it is and what it sees, and obeys."""
+"""Simulated robot with ROS topics, common to ROS 1 and 2: publishes joints, poses and images, and follows commands."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class JointTopic(NamedTuple):
-    """A topic of joints: its name, the places in the robot's vector, and what the joints are called."""
+    """Topic of joints: its name, the joints' dimensions in the robot's vector, and their names in messages."""
 
     topic: str
     dims: list[int]
@@ -32,7 +32,7 @@ class JointTopic(NamedTuple):
 
 
 class ReceivedCommand(NamedTuple):
-    """A command as it came."""
+    """Received command message: its topic, joint names and positions."""
 
     outlet: JointTopic
     names: tuple[str, ...]
@@ -40,7 +40,10 @@ class ReceivedCommand(NamedTuple):
 
 
 def topics(robot: Robot, version: Literal[1, 2]) -> tuple[dict[str, str], dict[str, RosGroupTable]]:
-    """Camera topics by the camera's key, and the topics of each group."""
+    """Return camera topics by camera key, and the topics of each group.
+
+    They are those of the robot's description if it declares topics for this ROS version, else default names.
+    """
     own = robot.ros if robot.ros is not None and robot.ros.version == version else None
     if own is not None:
         pictures = {camera.key: own.cameras[camera.name] for camera in robot.cameras}
@@ -53,7 +56,11 @@ def topics(robot: Robot, version: Literal[1, 2]) -> tuple[dict[str, str], dict[s
 
 
 class RosRobot(ABC):
-    """One robot; `open`, then `tick` at the rate, then `close`."""
+    """Simulated robot as a ROS node; call `open`, then `tick` at the rate, then `close`.
+
+    Raises:
+        SetupError: If --silence names none of the topics, or the start pose does not exist.
+    """
 
     VERSION: ClassVar[Literal[1, 2]]
 
@@ -68,19 +75,19 @@ class RosRobot(ABC):
         self._heard = -math.inf
         self._holding = True
         self._sequence = 0
-        self.refused = 0  # commands with other names, or numbers that are none
+        self.refused = 0  # commands with other joint names, or with missing or non-finite numbers
 
     @abstractmethod
     def open(self) -> dict[str, object]:
-        """Become a node; returns where, with the topics of the pictures."""
+        """Start the node; return its address in ROS and the image topics."""
 
     @abstractmethod
     def close(self) -> None:
-        """Leave; safe to call twice."""
+        """Stop the node; safe to call twice."""
 
     @abstractmethod
     def _received_commands(self) -> Iterable[ReceivedCommand]:
-        """The commands that have come since the last tick."""
+        """Return the commands received since the last tick."""
 
     @abstractmethod
     def _publish_joints(self, topic: str, stamp: int, names: list[str], position: list[float]) -> None:
@@ -99,7 +106,7 @@ class RosRobot(ABC):
         """Publish a sensor_msgs/CompressedImage of a JPEG."""
 
     def tick(self, seconds: float) -> None:
-        """Obey, move for `seconds`, publish."""
+        """Execute the received commands, move for `seconds`, publish."""
         self._obey()
         silent = self._clock.now() - self._heard > self._options.deadline
         if silent and not self._holding:
@@ -110,11 +117,11 @@ class RosRobot(ABC):
         self._sequence += 1
 
     def truth(self) -> dict[str, object] | None:
-        """Ground truth of its bench."""
+        """Return the ground truth of the bench; None if there is no bench."""
         return self._surroundings.truth()
 
     def outlets(self) -> Iterator[JointTopic]:
-        """Outlets on which it takes commands."""
+        """Yield the topics on which the robot receives commands."""
         for group in self._robot.groups:
             topic = self._groups[group.name]
             if self._options.as_simulation:
@@ -141,7 +148,7 @@ class RosRobot(ABC):
                 if self._silent(name):
                     continue
                 spoken = [f"x_{joint}" if self._options.wrong_names else joint for joint in joints]
-                order = np.random.default_rng(self._sequence).permutation(len(dims))  # as drivers may
+                order = np.random.default_rng(self._sequence).permutation(len(dims))  # as with real drivers
                 position = self._plant.q[np.array(dims)[order]].tolist()
                 self._publish_joints(name, stamp, [spoken[i] for i in order], position)
             if topic.eef and group.chain is not None and not self._options.no_eef:
@@ -166,7 +173,7 @@ class RosRobot(ABC):
 
 
 def _split(group: Group, whole: str | None, hand: str | None) -> Iterator[JointTopic]:
-    """The topics of a group's joints, the gripper's apart where it has one of its own."""
+    """Yield the topics of a group's joints, with the gripper separate if it has a topic of its own."""
     dims, joints = list(range(group.slice.start, group.slice.stop)), group.joints
     if hand and group.gripper is not None:
         place = group.gripper.index
@@ -177,7 +184,7 @@ def _split(group: Group, whole: str | None, hand: str | None) -> Iterator[JointT
 
 
 def add_arguments(line: argparse.ArgumentParser) -> None:
-    """The options that robots of both generations share."""
+    """Add the options that robots of both ROS versions share."""
     line.add_argument("--robot", required=True, help="name of a folder in robots/, or a path")
     line.add_argument("--groups", type=program.names, metavar="NAME,...", help="of the robot")
     line.add_argument("--rate", type=positive, default=30.0, help="of everything, per second")

@@ -1,1 +1,1 @@
-"""Scripted policies of the simulated bench, and what they plan with."""
+"""Scripted policies for the simulated bench, with their detection and motion planning."""

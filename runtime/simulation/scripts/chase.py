@@ -1,9 +1,9 @@
-"""A scripted policy that keeps an arm's fingertips beside the block on the belt, by what it sees and nothing else.
+"""Scripted policy that keeps an arm's fingertips beside the block on the belt, using only its observations.
 
-It does what a policy does that has learnt the task: it takes the block's place from the overhead picture of the
-request, and its velocity from the pictures of the requests before; it takes the block to go on like that as far as
-the chunk reaches, but not beyond the ends of the belt; it leads by what robots lag behind; and it goes there from
-the joints of the request no faster than it is used to. When the belt turns round it cannot know beforehand.
+It acts as a policy that has learnt the task: it detects the block's place in the overhead image of the request and
+estimates its velocity from earlier requests; it extrapolates this motion over the chunk, but not beyond the ends of the
+belt; its rows are ahead of time by the robots' lag; and it approaches from the joints of the request within a speed
+limit. It cannot predict when the belt reverses.
 """
 
 from __future__ import annotations
@@ -26,17 +26,21 @@ from runtime.simulation.scripts.script import Answer, Script
 if TYPE_CHECKING:
     from robots import Group, Robot
 
-LEAD = 0.08  # s by which a row is ahead of its time: what robots lag behind
-SPEED = 1.0  # rad/s of each joint on the way to the block, at most
-_WINDOW = 0.25  # s of sights that velocity is fitted to; the newest two in any case
-_FORGOTTEN = 3.0  # s after which a sight says nothing about velocity any more
-_ACROSS = 0.04  # m to either side of the belt's middle that a block is followed
-_BEYOND = 0.02  # m to either side of where blocks ride
-_NODES = (16, 5)  # of the map from places to joints, along and across the belt
+LEAD = 0.08  # [s] by which rows are ahead of time, to compensate for the robots' lag
+SPEED = 1.0  # [rad/s] highest speed of each joint while approaching the block
+_WINDOW = 0.25  # [s] of detections that velocity is fitted to; at least the newest two
+_FORGOTTEN = 3.0  # [s] after which a detection is discarded
+_ACROSS = 0.04  # [m] range to either side of the belt's middle in which a block is followed
+_BEYOND = 0.02  # [m] beyond the range in which blocks ride, at either end
+_NODES = (16, 5)  # nodes of the map, along and across the belt
 
 
 class ChaseScript(Script):
-    """The policy for every connection; `places` are those of the belt that it has learnt."""
+    """Chase policy for all connections; `places` maps the places of the belt to joints.
+
+    Raises:
+        SetupError: If no arm of the robot reaches all of the belt.
+    """
 
     def __init__(
         self,
@@ -58,19 +62,22 @@ class ChaseScript(Script):
         }
 
     def begin(self) -> Answer:
-        """A connection that has seen nothing."""
+        """Return the answers of a new connection, which has not detected a block yet."""
         return ChaseEpisode(self)
 
 
 class ChaseEpisode:
-    """One connection: where the block was seen, and when."""
+    """State of one connection: the places at which the block was detected, with times."""
 
     def __init__(self, policy: ChaseScript) -> None:
         self._policy = policy
         self._seen: deque[tuple[float, float, float]] = deque(maxlen=64)  # time [s], x, y [m]
 
     def __call__(self, q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
-        """Rows float32 [H, D] beside where the block will be; the joints themselves before it was ever seen."""
+        """Return rows float32 [H, D] beside the block's future places.
+
+        If the block was not detected within the last _FORGOTTEN seconds, all rows are the joints `q`.
+        """
         policy, now = self._policy, self._policy.clock.now()
         self._detect(pictures, now)
         if not self._seen:
@@ -91,7 +98,7 @@ class ChaseEpisode:
             self._seen.append((now, block[0], block[1]))
 
     def _ahead(self, times: Float64) -> tuple[Float64, Float64]:
-        """Positions along the belt at these times [n], extrapolated from its motion, and positions across."""
+        """Return extrapolated positions along the belt at `times` [n], and the newest position across it [n]."""
         seen = np.array(self._seen)
         newest = seen[-1]
         fitted = seen[(newest[0] - seen[:, 0] <= _WINDOW) | (np.arange(len(seen)) >= len(seen) - 2)]
@@ -103,7 +110,11 @@ class ChaseEpisode:
 
 
 class PlaceMap:
-    """From places of the block to joints with fingertips beside it: solved at some, interpolated between."""
+    """Map from places of the block to joints with fingertips beside it: solved on a grid, then interpolated.
+
+    Raises:
+        SetupError: If no arm of the robot reaches all of the belt.
+    """
 
     def __init__(self, robot: Robot, belt: Belt) -> None:
         self.belt = belt
@@ -120,7 +131,7 @@ class PlaceMap:
         )
 
     def joints(self, x: Float64, y: Float64) -> Float64:
-        """Joints [n, D] for a block at x, y [n], or at the nearest place that is mapped."""
+        """Return the joints [n, D] for a block at x, y [n], or at the nearest place within the grid."""
         column, right = _between(self._x, x)
         row, up = _between(self._y, y)
         left, more = (self._joints[column + step] for step in (0, 1))
@@ -130,7 +141,7 @@ class PlaceMap:
         return np.asarray(lower + up * (upper - lower))
 
     def _solved(self, robot: Robot, postures: Postures, arm: Group) -> Float64 | None:
-        """Joints [along, across, D]; None where the arm does not reach one of the places."""
+        """Return joints [along, across, D] of an arm on the grid; None if it does not reach one of the places."""
         rest = robot.poses.get("ready", robot.poses["home"])
         dx, dy, height = self.belt.fingertip_offset
         found = []
@@ -144,7 +155,7 @@ class PlaceMap:
 
 
 def _between(nodes: Float64, values: Float64) -> tuple[np.ndarray, Float64]:
-    """The node at or below each value [n], and how far it is from there to the next one [n, 1], from 0 to 1."""
+    """Return the node at or below each value [n], and the fraction [n, 1] of the interval up to the next node."""
     part = np.clip((values - nodes[0]) / (nodes[1] - nodes[0]), 0.0, len(nodes) - 1.0)
     lower = np.minimum(part.astype(int), len(nodes) - 2)
     return lower, (part - lower)[:, None]

@@ -1,4 +1,4 @@
-"""Room that the arms of a robot leave each other, and its body, on a way."""
+"""Clearance between a robot's arms, and between arms and body, along a path."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from runtime.core.types import Float64
 if TYPE_CHECKING:
     from robots import Robot
 
-_LOOKS = 48  # postures of a way that are looked at
-_BETWEEN = 0.03  # m that arms leave each other
-_OWN = MARGIN + 0.001  # m that an arm leaves between its links, and to the body that it stands on
+_LOOKS = 48  # least number of postures that are checked on a longer path
+_BETWEEN = 0.03  # [m] required between two arms
+_OWN = MARGIN + 0.001  # [m] required between an arm's links, and between arm and body
 
 
 class Clearance:
-    """Clearance that safety would warn of, with some margin; without the table, for hands go down to it."""
+    """Clearance of a robot with a margin to the warnings of safety; without the table, because hands go down to it."""
 
     def __init__(self, robot: Robot) -> None:
         self._clearance = get_clearance(robot)
@@ -34,7 +34,7 @@ class Clearance:
         self._wanted = wanted[self._links]
 
     def margin_along(self, rows: Float64) -> float:
-        """Room on the way float64 [n, D] beyond what there should be, at its narrowest [m]."""
+        """Return the least clearance along a path float64 [n, D], minus the required one [m]; inf without pairs."""
         if not len(self._links):
             return np.inf
         looked_at = rows[:: max(1, len(rows) // _LOOKS)]
@@ -43,5 +43,5 @@ class Clearance:
 
 @lru_cache(maxsize=32)  # cache: reads the meshes of a robot, which do not change
 def clearance_for(robot: Robot) -> Clearance:
-    """That of a robot, made once."""
+    """Return the cached clearance of a robot."""
     return Clearance(robot)

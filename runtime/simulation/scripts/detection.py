@@ -1,7 +1,7 @@
-"""Sight of a scripted policy: the task's block and the plate, found by colour in the overhead picture.
+"""Detection of the task's block and the plate by colour in the overhead image.
 
-Nothing else tells it where things are. What an arm covers in part has neither the size nor the shape that it
-should have at its place, and then counts as not seen.
+A scripted policy has no other knowledge of their places. An object that is partly hidden by an arm does not have the
+size or shape expected at its place, and is reported as not detected.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from runtime.simulation.bench.bench import Bench, BenchError, PinholeCamera
 if TYPE_CHECKING:
     from robots import Robot
 
-_NATIVE_WIDTH, _NATIVE_HEIGHT = 640, 480  # the overhead camera's picture before it was fitted
-_BLACK = 8  # the brightest that a letterbox may be
-_FINER = 4  # times, for the outline of something that is ten pixels wide
-_HUE = 9  # to each side, of 180
-_SATURATION = 0.45  # of the thing's own
-_DARKEST = 40  # of 255; in shadow a colour is still a colour
-_BLOCK_SIZE = (0.7, 1.4)  # area seen over area expected
+_NATIVE_WIDTH, _NATIVE_HEIGHT = 640, 480  # size of the overhead camera's image before resizing
+_BLACK = 8  # highest value of a letterbox
+_FINER = 4  # upsampling for the outline of a block that is ten pixels wide
+_HUE = 9  # tolerance of hue to each side, of 180
+_SATURATION = 0.45  # least share of the colour's own saturation
+_DARKEST = 40  # least value, of 255; low, because colours are also detected in shadow
+_BLOCK_SIZE = (0.7, 1.4)  # range of detected area over expected area
 _PLATE_SIZE = (0.85, 1.2)
-_ROUND = 1.15  # longest over shortest width of a disc
-_RING = 0.6  # of what a ring surrounds, the most that has its colour
+_ROUND = 1.15  # largest ratio of longest to shortest width of a disc
+_RING = 0.6  # largest share of a ring's enclosed area that has its colour
 _CORNERS = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 
-Matrix = NDArray[Any]  # what OpenCV's own annotations call a picture or a mask
+Matrix = NDArray[Any]  # images and masks, as in OpenCV's own annotations
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Block (x, y, yaw) and plate (x, y) in the world [m, rad], each None where it is not seen whole.
+    """Detected block (x, y, yaw) and plate (x, y) in the world [m, rad], each None unless it is fully visible.
 
-    The yaw is that of a square: within 45 degrees of zero. `dark`: there was nothing but black.
+    The yaw is that of a square: within 45 degrees of zero. `dark` is whether the image was black.
     """
 
     block: tuple[float, float, float] | None = None
@@ -49,7 +49,11 @@ class Detection:
 
 
 class OverheadDetector:
-    """The overhead camera of a robot's bench: `key` names its picture among those of a request."""
+    """Detector in the image of a robot's overhead camera; `key` is the image's name in a request.
+
+    Raises:
+        BenchError: If the robot has no overhead camera.
+    """
 
     def __init__(self, robot: Robot, table: Bench | None = None) -> None:
         keys = [camera.key for camera in robot.cameras if bench.camera_arm(robot, camera) is None]
@@ -60,7 +64,11 @@ class OverheadDetector:
         self._camera = bench.overhead_camera(_NATIVE_WIDTH, _NATIVE_HEIGHT)
 
     def detect(self, picture: UInt8) -> Detection:
-        """Block and plate in an RGB picture [H, W, 3] or [3, H, W] of any size, letterboxed or not."""
+        """Detect block and plate in an RGB image [H, W, 3] or [3, H, W] of any size, letterboxed or not.
+
+        Raises:
+            BenchError: If the image has another shape.
+        """
         shown = _without_bars(_channels_last(picture))
         if int(shown.max(initial=0)) < _DARKEST:
             return Detection(dark=True)
@@ -68,7 +76,7 @@ class OverheadDetector:
         return Detection(self._block(shown, hsv), self._plate(hsv))
 
     def _block(self, shown: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
-        """The silhouette's middle lies half-way up the block; its narrowest rectangle gives the yaw."""
+        """Return the block's pose from its silhouette: the middle is half-way up, the smallest box has its yaw."""
         colour = self._bench.block_colours[0]
         found = _largest(_mask(hsv, colour))
         if found is None:
@@ -91,7 +99,7 @@ class OverheadDetector:
         return block if _within(cv2.contourArea(hull), self._block_area(block), _BLOCK_SIZE) else None
 
     def _yaw(self, middle: tuple[float, float], angle: float, length: float) -> float:
-        """The world's direction of a line in the picture, modulo a quarter turn."""
+        """Return the world's direction of a line in the image, modulo a quarter turn [rad]."""
         u, v = middle
         ahead = u + length * math.cos(angle), v + length * math.sin(angle)
         height = self._bench.block_edge / 2
@@ -105,7 +113,7 @@ class OverheadDetector:
         return _area(self._camera, self._bench.block_edge * _CORNERS @ turn + (x, y, 0.0))
 
     def _plate(self, hsv: Matrix) -> tuple[float, float] | None:
-        """The middle of the rim's outer edge; a solid disc of its colour is part of a robot."""
+        """Return the middle of the rim's outer edge; a solid disc of the rim's colour is part of a robot."""
         mask = _mask(hsv, self._bench.plate_rim_colour)
         rim = _largest(mask)
         if rim is None or len(rim) < 5:
@@ -122,7 +130,7 @@ class OverheadDetector:
         return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _PLATE_SIZE) else None
 
     def _native(self, pixels: Float64, shown: Matrix) -> Float64:
-        """Pixels [n, 2] of the picture shown as pixels of the camera."""
+        """Convert pixels [n, 2] of the given image to pixels of the camera."""
         height, width = shown.shape[:2]
         return np.asarray((pixels + 0.5) * (_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height) - 0.5)
 
@@ -134,7 +142,7 @@ def _channels_last(picture: UInt8) -> UInt8:
 
 
 def _without_bars(picture: UInt8) -> UInt8:
-    """The picture without its letterbox; one whose margins are not black was stretched, and is taken whole."""
+    """Return the image without its letterbox; if its margins are not black it was stretched, and is returned whole."""
     height, width = picture.shape[:2]
     ratio = max(_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height)
     inner_width, inner_height = max(1, int(_NATIVE_WIDTH / ratio)), max(1, int(_NATIVE_HEIGHT / ratio))
@@ -146,24 +154,24 @@ def _without_bars(picture: UInt8) -> UInt8:
 
 
 def _mask(hsv: Matrix, colour: bench.Colour) -> Matrix:
-    """Mask of a picture, 255 where it has the colour, in whatever light."""
+    """Return a mask of the image, 255 for pixels of the colour in any light."""
     pixel = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_RGB2HSV)[0, 0]
     hue, saturation, _ = (int(part) for part in pixel)
     lowest = max(0, hue - _HUE), int(_SATURATION * saturation), _DARKEST
     mask: Matrix = cv2.inRange(hsv, lowest, (hue + _HUE, 255, 255))
-    if hue < _HUE:  # red lies at both ends of the circle
+    if hue < _HUE:  # the hue of red is at both ends of the range
         mask |= cv2.inRange(hsv, (180 + hue - _HUE, *lowest[1:]), (179, 255, 255))
     return mask
 
 
 def _largest(mask: Matrix) -> Matrix | None:
-    """The outline [n, 1, 2] of the largest patch."""
+    """Return the outline [n, 1, 2] of the largest region; None if there is none."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return max(outlines, key=cv2.contourArea, default=None)
 
 
 def _is_ring(mask: Matrix, outline: Matrix) -> bool:
-    """True if most of what the outline [n, 1, 2] surrounds, or would if closed, is not in the mask."""
+    """Return True if most of the area within the convex hull of an outline [n, 1, 2] is not in the mask."""
     left, top, width, height = cv2.boundingRect(outline)
     inside = np.zeros((height, width), np.uint8)
     cv2.fillConvexPoly(inside, cv2.convexHull(outline - (left, top)), 1)
@@ -172,7 +180,7 @@ def _is_ring(mask: Matrix, outline: Matrix) -> bool:
 
 
 def _area(camera: PinholeCamera, points: Float64) -> float:
-    """Area of the convex hull of world points [n, 3] in the camera's picture [pixels]."""
+    """Return the area of the convex hull of world points [n, 3] in the camera's image [pixels]."""
     return float(cv2.contourArea(cv2.convexHull(camera.project(points).astype(np.float32))))
 
 

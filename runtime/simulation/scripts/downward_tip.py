@@ -1,4 +1,4 @@
-"""Fingertips that point down over a place, and the way of such fingertips from one place to another."""
+"""Poses of fingertips that point down at a place, and paths between such poses."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 
 from runtime.core.types import Float64
 
-_STRIDE, _SWING = 0.04, 0.25  # m and rad between two points of a way, at most
+_STRIDE, _SWING = 0.04, 0.25  # [m], [rad] largest distance between two poses of a path
 
 Place = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class DownwardTip:
-    """Fingertips over a place at a height [m], pointing down, `tilt` [rad] outwards along `bearing` from the arm.
+    """Fingertips above a place at a height [m] that point down, tilted outwards from the arm.
 
-    The jaws open along `yaw`.
+    The tilt is `tilt` [rad] along `bearing` [rad]; the jaws open along `yaw` [rad].
     """
 
     place: Place
@@ -29,7 +29,7 @@ class DownwardTip:
     tilt: float
 
     def tip(self) -> Float64:
-        """Their frame [4, 4] in the world."""
+        """Return the fingertips' frame [4, 4] in the world."""
         sine, cosine = math.sin(self.tilt), math.cos(self.tilt)
         ahead = np.array([sine * math.cos(self.bearing), sine * math.sin(self.bearing), -cosine])
         across = np.array([math.cos(self.yaw), math.sin(self.yaw), 0.0])
@@ -41,7 +41,7 @@ class DownwardTip:
         return tip
 
     def interpolate(self, other: DownwardTip) -> Iterator[DownwardTip]:
-        """The points on the way to another one, without either end."""
+        """Yield the poses on the path to another one, without either end."""
         numbers = np.array([*self.place, self.height, self.yaw, self.bearing, self.tilt])
         way = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
         way[3:5] = [math.remainder(turn, 2 * math.pi) for turn in way[3:5]]

@@ -1,4 +1,4 @@
-"""Smooth, visible motion of a whole robot: what the stand-in policy answers and the stand-in leader does."""
+"""Smooth, visible motion of a whole robot, for stand-in policies and the simulated node's leader."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from runtime.core.types import Float32, Float64
 if TYPE_CHECKING:
     from robots import Robot
 
-_AMPLITUDE = 0.25  # rad
-_TURN = 1.2  # rad/s of phase: one gesture takes 5.2 s
-_SPEED = 0.8  # rad/s, at most
-_LEAD = 0.13  # s by which targets lead the measured joints, as in teleoperated data
-_GRIPPER_TIME = 2.0  # s for the whole way of a gripper, at least
+_AMPLITUDE = 0.25  # [rad] of each joint
+_TURN = 1.2  # [rad/s] of phase: one gesture takes 5.2 s
+_SPEED = 0.8  # [rad/s] highest speed of a joint
+_LEAD = 0.13  # [s] by which targets are ahead of the measured joints, as in teleoperated data
+_GRIPPER_TIME = 2.0  # [s] least time for the full range of a gripper
 
 
 class Gesture:
-    """A closed path around home, by phase; the phase can be read off the joints, so no memory is needed.
+    """Closed path around home, parametrised by a phase that can be computed from the joints, so no state is needed.
 
-    The first two joints of the first arm go round in a circle, which gives the phase; every other arm joint
-    follows with a lag of its own; grippers open and close once a round; what is no arm stays.
+    The first two joints of the first arm move in a circle, which gives the phase; every other arm joint follows with a
+    lag of its own; grippers open and close once per round; joints outside arms do not move.
     """
 
     def __init__(self, robot: Robot, seed: int = 0) -> None:
@@ -43,7 +43,7 @@ class Gesture:
         self._speed[list(robot.binary_dims)] = np.inf
 
     def joints_at(self, phase: float, q: Float64) -> Float64:
-        """Joints [D] on the path; places that do not take part are those of `q`."""
+        """Return the joints [D] on the path at a phase; joints that do not take part are those of `q`."""
         target = self._centre + self._room * np.sin(phase + self._lags)
         for arm in self._robot.arms:
             if arm.gripper is not None and arm.gripper_dim is not None:
@@ -53,17 +53,17 @@ class Gesture:
         return np.asarray(np.clip(target, self._robot.lower, self._robot.upper))
 
     def phase_of(self, q: Float64) -> float:
-        """Phase of the joints [D] on the path, or of the point that they reach if moved straight onto it."""
+        """Return the phase of joints [D] on the path; beside the path, that of the point straight towards it."""
         sine, minus_cosine = ((q - self._centre) / np.maximum(self._room, 1e-9))[self._clockwork]
         return float(np.arctan2(sine, -minus_cosine))
 
     def towards(self, phase: float, q: Float64, seconds: float) -> Float64:
-        """The joints [D] that are reached from `q` on the way to the path within `seconds`."""
+        """Return the joints [D] reached from `q` within `seconds` on the way to the path's point at `phase`."""
         reach = self._speed * seconds
         return np.asarray(q + np.clip(self.joints_at(phase, q) - q, -reach, reach))
 
     def chunk(self, q: Float64, horizon: int, rate: float) -> Float32:
-        """float32 [horizon, D] from the joints `q` on, at `rate` [Hz]: the same for the same joints."""
+        """Return rows float32 [horizon, D] that continue from joints `q` at `rate` [Hz]; the same for the same `q`."""
         phase = self.phase_of(q) + _TURN * _LEAD
         rows = np.empty((horizon, self._robot.dim))
         now = np.clip(q, self._robot.lower, self._robot.upper)
@@ -73,5 +73,5 @@ class Gesture:
         return rows.astype(np.float32)
 
     def turn(self, seconds: float) -> float:
-        """Advance of the phase in `seconds`."""
+        """Return the advance of the phase in `seconds` [rad]."""
         return _TURN * seconds

@@ -1,9 +1,9 @@
-"""A scripted policy that picks the block up and puts it on the plate, by what it sees and nothing else.
+"""Scripted policy that picks up the block and puts it on the plate, using only its observations.
 
-Where the block and the plate are it takes from the overhead picture of the request; how far it has come, from the
-joints in it. Between the requests of one connection it remembers the route it is on and when it was where: a leg
-ends when the joints are there, a gate when the measured jaws have obeyed, and rows run on with the time between
-requests, so that a chunk continues the one before it whatever the delay.
+It detects block and plate in the overhead image of the request, and its progress from the joints in it. Between the
+requests of one connection it remembers its route, its row in it and the time: a leg ends when the joints have arrived,
+a gate when the measured jaws have moved, and the row advances with the time between requests, so that a chunk continues
+the previous chunk whatever the delay.
 """
 
 from __future__ import annotations
@@ -29,37 +29,38 @@ from runtime.simulation.scripts.script import Answer, Script
 if TYPE_CHECKING:
     from robots import Group, Robot
 
-_LEAD = 0.12  # s by which rows lead the measured joints where time does not tell: what robots lag behind
-_BEHIND, _AHEAD = 0.8, 0.6  # s between the row of the clock and that of the joints, beyond which they win
-_FAR = 0.2  # rad between the row of the clock and the joints, beyond which they win
-_THERE = 0.015  # rad from the end of a leg
-_LOST = 0.35  # rad from a leg: something else has moved the robot
-_MOVED = 0.025  # m; a block that lies elsewhere is another scene
-_MARGIN = 0.01  # m inside the plate's rim that a block's middle has to be
-_GRIPPED = 1.25  # of the block's edge: jaws narrower than that have closed on it, or on nothing
-_EMPTY = 0.75  # of the block's edge: jaws narrower than that hold nothing
-_SHORT = 0.05  # m by which a grasp is short where it slips
+_LEAD = 0.12  # [s] lag of robots: rows are ahead of the joints by it if the clock is not used
+_BEHIND, _AHEAD = 0.8, 0.6  # [s] deviation of the clock's row from the joints' row; beyond it these decide
+_FAR = 0.2  # [rad] distance of the joints from the clock's row; beyond it the joints decide
+_THERE = 0.015  # [rad] distance from the end of a leg at which it is finished
+_LOST = 0.35  # [rad] distance from a leg: something else has moved the robot
+_MOVED = 0.025  # [m] displacement of block or plate that makes it a new scene
+_MARGIN = 0.01  # [m] least distance of the block's middle inside the plate's rim
+_GRIPPED = 1.25  # of the block's edge: narrower jaws have closed, on the block or on nothing
+_EMPTY = 0.75  # of the block's edge: narrower jaws hold nothing
+_SHORT = 0.05  # [m] by which a deliberately failing grasp is short
 _CARRYING = ("lift", "carry", "lower")
 _LEAVING = ("back off", "retreat")
 _COMING = ("make way", "reach")
-_ARM = 0.25  # m
-_PAUSED = 3.0  # s without a request, after which a robot that was leaving begins another episode
+_ARM = 0.25  # [m] lever arm that converts shifts to radians
+_PAUSED = 3.0  # [s] without a request after which a robot that was leaving begins a new episode
 
 
 Apart = Callable[["Group", Float64, Float64], Float64]
-"""From the arm that moves, rows float64 [n, D] and joints [D] to how far apart they are [n], in rad."""
+"""Function of the moving arm, rows float64 [n, D] and joints [D]: distance of the joints from each row [n, rad]."""
 
 
 class ScriptError(RuntimeFault):
-    """A request that a script cannot answer."""
+    """A script cannot answer a request."""
 
 
 @dataclass(frozen=True, slots=True)
 class Skill:
-    """Skill of the policy: `noise` [m] on the block's place in each attempt, one sigma in x and in y.
+    """Skill of the policy: `noise` [m] is one sigma of the error of the block's place in x and in y, per attempt.
 
-    A block's edge of noise is one radian of it on the block's turn. `failure_rate` is the probability that in
-    an episode it lets the block go on the way or always grasps short; `seed` decides both, episode by episode.
+    Noise of one block edge corresponds to one radian of noise on the block's yaw. `failure_rate` is the probability
+    that in an episode the policy drops the block on the way or always grasps short of it; `seed` decides both, episode
+    by episode.
     """
 
     noise: float = 0.0
@@ -68,7 +69,10 @@ class Skill:
 
 
 class PickPlace(Script):
-    """The policy for every connection; episodes are counted over all of them, so that no two are alike."""
+    """Pick-and-place policy for all connections; episodes are counted over all of them, so that each has its own noise.
+
+    `apart` measures how far joints are from rows; by default it compares joints.
+    """
 
     def __init__(
         self,
@@ -97,16 +101,16 @@ class PickPlace(Script):
         }
 
     def begin(self) -> Answer:
-        """A connection that remembers nothing."""
+        """Return the answers of a new connection."""
         return PickPlaceEpisode(self)
 
     def next_episode_noise(self) -> EpisodeNoise:
-        """Luck of the next episode."""
+        """Return the noise of the next episode."""
         return EpisodeNoise(self.skill, next(self._episodes), self.table.block_edge)
 
 
 class EpisodeNoise:
-    """The chances of one episode: the same for the same seed and number."""
+    """Random errors of one episode: the same for the same seed and episode number."""
 
     def __init__(self, skill: Skill, episode: int, edge: float) -> None:
         self._chance = np.random.default_rng([skill.seed, episode])
@@ -116,28 +120,28 @@ class EpisodeNoise:
         self.slip = PlannedFailure(_SHORT * (slips and lets_go >= 0.5), bool(slips and lets_go < 0.5))
 
     def perceive(self, block: tuple[float, float, float]) -> tuple[float, float, float]:
-        """The block's place and turn as one attempt takes them to be."""
+        """Return the block's place and yaw with the error of one attempt."""
         x, y, yaw = np.array(block) + self._chance.normal(0.0, self._noise)
         return float(x), float(y), float(yaw)
 
 
 class PickPlaceEpisode:
-    """One connection's errand: no route, or a route and how far along it the robot is."""
+    """State of one connection: no route, or a route and the robot's progress on it."""
 
     def __init__(self, policy: PickPlace) -> None:
         self._policy = policy
         self._prompt = ""
         self._luck: EpisodeNoise | None = None
-        self._resigned = False  # the episode has failed; it knows, and does nothing more about it
-        self._left: Detection | None = None  # how things lay when it resigned
+        self._resigned = False  # the episode failed deliberately, and is not tried again
+        self._left: Detection | None = None  # detection after it resigned; a change begins a new episode
         self._route: Route | None = None
-        self._seen = Detection()  # where things were when the route was made
+        self._seen = Detection()  # detection with which the route was planned
         self._leg = 0
-        self._row = 0.0  # of the whole route, at the last request
-        self._asked = 0.0  # s, the last request
+        self._row = 0.0  # row in the whole route at the last request
+        self._asked = 0.0  # [s] time of the last request
 
     def __call__(self, q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
-        """Rows float32 [H, D]: the rest of the route, or the joints themselves where there is nothing to do."""
+        """Return rows float32 [H, D]: the next rows of the route, or the joints `q` if there is nothing to do."""
         sight = self._detect(pictures)
         now = self._policy.clock.now()
         elapsed, self._asked = now - self._asked, now
@@ -162,7 +166,7 @@ class PickPlaceEpisode:
     # --- deciding ------------------------------------------------------------------------------------------
 
     def _decide(self, q: Float64, sight: Detection) -> None:
-        """Make a route if there is a block to pick, a plate to put it on, and it is not there already."""
+        """Plan a route if block and plate are detected and the block is not on the plate yet."""
         if sight.block is None or sight.plate is None:
             return
         if math.dist(sight.block[:2], sight.plate) < self._policy.table.plate_radius - _MARGIN:
@@ -190,12 +194,12 @@ class PickPlaceEpisode:
         self._follow_route(None)
 
     def _is_over(self, pause: float) -> bool:
-        """True if another episode follows the pause [s]: nothing was going on any more before it."""
+        """Return True if a new episode begins after the pause [s]: the task was finished, or nearly so, before it."""
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED
 
     def _elsewhere(self, q: Float64, sight: Detection) -> bool:
-        """True if robot or things are not where they should be in the episode so far."""
+        """Return True if the robot is far from its route, or objects were moved before they were grasped."""
         if self._route is None:
             return False
         return self._distances(q).min() > _LOST or (
@@ -209,7 +213,7 @@ class PickPlaceEpisode:
         return self._route
 
     def _distances(self, q: Float64) -> Float64:
-        """Of the joints [D] from each row of the present leg [rad]."""
+        """Return the distance of joints [D] from each row of the present leg [rad]."""
         return self._apart(self._on().legs[self._leg].rows, q)
 
     def _apart(self, rows: Float64, q: Float64) -> Float64:
@@ -218,7 +222,7 @@ class PickPlaceEpisode:
         return np.asarray(np.max([self._policy.apart(arm, rows, q) for arm in movers], axis=0))
 
     def _advance(self, q: Float64, elapsed: float) -> None:
-        """Find the leg and the row that the robot is at; a route that is done is dropped."""
+        """Update leg and row from the time and the joints; a finished route is dropped."""
         row = self._row + elapsed * self._policy.rate
         while self._route is not None and self._passed(q):
             left, self._leg = self._route.legs[self._leg], self._leg + 1
@@ -231,7 +235,7 @@ class PickPlaceEpisode:
             self._row = self._agreed(row, q)
 
     def _agreed(self, row: float, q: Float64) -> float:
-        """The row that time has come to, unless the joints say that the robot was held up or moved on."""
+        """Return the row by the clock, unless the joints show that the robot was delayed or moved."""
         route, rate = self._on(), self._policy.rate
         leg, start = route.legs[self._leg], route.starts[self._leg]
         jaw = gripper_dim(route.arm)
@@ -252,18 +256,18 @@ class PickPlaceEpisode:
         return bool(self._distances(q)[-1] < _THERE)
 
     def _misses(self, q: Float64) -> bool:
-        """True if the jaws are empty on a leg on which they should hold the block."""
+        """Return True if the jaws are empty on a leg on which they should hold the block."""
         if self._route is None or self._route.legs[self._leg].name not in _CARRYING:
             return False
         return self._opening(q) < _EMPTY * self._policy.table.block_edge
 
     def _opening(self, q: Float64) -> float:
-        """Of the jaws at work [m]."""
+        """Return the opening of the active arm's jaws [m]."""
         arm = self._on().arm
         return Opening(jaws(arm)).metres(float(q[gripper_dim(arm)]))
 
     def _ahead(self, route: Route) -> Float32:
-        """The next rows of the route; its last one is repeated."""
+        """Return the next rows of the route; the last one is repeated."""
         wanted = round(self._row) + np.arange(self._policy.horizon)
         return route.rows[np.minimum(wanted, len(route.rows) - 1)].astype(np.float32)
 
@@ -272,7 +276,7 @@ class PickPlaceEpisode:
 
 
 def joints_apart(robot: Robot) -> Apart:
-    """Function for joints' largest distance [rad] to each row; grippers and numbers without a link aside."""
+    """Return a function for the largest distance [rad] to each row over all joints of the URDF but grippers."""
     moving = np.concatenate([group.joint_dims[np.array(group.urdf_joints) != ""] for group in robot.groups])
 
     def apart(arm: Group, rows: Float64, q: Float64) -> Float64:
@@ -282,9 +286,9 @@ def joints_apart(robot: Robot) -> Apart:
 
 
 def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
-    """Distance of the arm's end effector from its pose in each of the rows, whatever its joints are [rad].
+    """Return the distance [n] of the arm's end effector at `q` from its pose in each row [rad].
 
-    A way of _ARM metres counts as one radian.
+    The joints may differ. A shift of _ARM metres counts as one radian.
     """
     wanted, found = arm.pose(rows), arm.pose(q)
     shift = np.linalg.norm(wanted[:, :3] - found[:3], axis=1) / _ARM
@@ -293,6 +297,6 @@ def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
 
 
 def _differs(sight: Detection, before: Detection) -> bool:
-    """True if the block or the plate is seen where it was not."""
+    """Return True if the block or the plate is detected at another place than before."""
     pairs = ((sight.block, before.block), (sight.plate, before.plate))
     return any(now and then and math.dist(now[:2], then[:2]) > _MOVED for now, then in pairs)

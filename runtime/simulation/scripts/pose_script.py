@@ -1,4 +1,4 @@
-"""A scripted policy that answers in poses: the joint rows of another script, as end effectors in a declared format."""
+"""Scripted policy that answers in poses: the joint rows of another script, converted to a declared pose format."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ if TYPE_CHECKING:
 
 
 class PoseScript(Script):
-    """Is asked as the other script is, with joints and pictures; says in its metadata how its rows are written.
+    """Script with the requests of another script, joints and images; its metadata declares the format of its rows.
 
-    `rate` [Hz] is that of its rows. SetupError where the format does not fit the robot.
+    `rate` [Hz] is that of its rows.
+
+    Raises:
+        SetupError: If the format does not fit the robot.
     """
 
     def __init__(self, script: Script, robot: Robot, rate: float, pose: PoseFormat) -> None:
@@ -38,7 +41,7 @@ class PoseScript(Script):
         }
 
     def begin(self) -> Answer:
-        """One connection of the other script, answered in poses."""
+        """Return the answers of a new connection of the other script, converted to poses."""
         answer = self._script.begin()
 
         def posed(q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
@@ -47,9 +50,9 @@ class PoseScript(Script):
         return posed
 
     def to_poses(self, joints: Float64, q: Float64) -> Float32:
-        """Rows float32 [H, width] of joint rows [H, D].
+        """Return pose rows float32 [H, width] of joint rows [H, D].
 
-        What carries a declared frame stands as in q [D], unless its joints follow the poses.
+        Joints that carry a declared frame are taken from `q` [D], unless the rows contain them after the poses.
         """
         vectors = np.stack([_vectors(arm, joints) for arm in self._robot.arms], axis=1)
         at = np.tile(q, (len(joints), 1))
@@ -58,7 +61,11 @@ class PoseScript(Script):
 
 
 def pose_format(assignments: Sequence[str]) -> PoseFormat:
-    """The format that "key=value" assignments describe, values as in a deployment; SetupError names a wrong one."""
+    """Return the pose format that "key=value" assignments describe, with values as in a deployment.
+
+    Raises:
+        SetupError: If an assignment is invalid; the message names it.
+    """
     given = {}
     for text in assignments:
         key, equals, value = text.partition("=")
@@ -72,7 +79,7 @@ def pose_format(assignments: Sequence[str]) -> PoseFormat:
 
 
 def _value(text: str) -> object:
-    """A value of TOML; what is none is the text itself, so that words need no quotes."""
+    """Parse a TOML value; other text is returned as it is, so that names need no quotes."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -87,7 +94,7 @@ def _rows(pose: PoseFormat, robot: Robot) -> PoseRows:
 
 
 def _vectors(arm: Group, joints: Float64) -> Float64:
-    """Of one arm, [H, 8], for joint rows [H, D]; the gripper's number is 0 where there is none."""
+    """Return the end-effector vectors [H, 8] of one arm for joint rows [H, D]; the gripper is 0 if there is none."""
     vectors = np.zeros((len(joints), EEF_WIDTH))
     vectors[:, : EEF_WIDTH - 1] = arm.pose(joints)
     if arm.gripper_dim is not None:

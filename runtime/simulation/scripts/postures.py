@@ -1,7 +1,8 @@
-"""Joints of an arm for its fingertips over a block or a plate, pointing down.
+"""Joints of an arm for fingertips that point down above a block or a plate.
 
-Four points of every vertical way are solved by inverse kinematics, from a posture of the arm with its fingers down
-that is found once: turned about an upright first joint, or led from place to place where there is none.
+Four points of every vertical path are solved by inverse kinematics, starting from a nominal posture of the arm with its
+fingers down that is searched once. It is rotated about the first joint if that is upright, else moved from place to
+place.
 """
 
 from __future__ import annotations
@@ -24,17 +25,15 @@ from runtime.simulation.scripts.downward_tip import DownwardTip, Place
 if TYPE_CHECKING:
     from robots import Gripper, Group, Robot
 
-CLEAR = 0.12  # m: fingertips so high pass over everything, also with a block between them
-TILTS = ((0.0, 0.26), (0.26, 0.26), (0.4, 0.4))  # rad outwards from straight down: below, above
-_GRASP = 0.45  # of the block's edge: the height of the fingertips that grasp it
-_DROP = 0.003  # m between block and plate when the jaws open
-_MARGIN = 0.05  # of the jaws' whole way, at both ends
-_AHEAD = (
-    0.3  # m from an arm's shoulder to the place over which searches begin, away from the table's near side
-)
-_ASIDE = 0.05  # m beyond the area, where they may begin too
-_TRIES = 60  # postures that a search begins from
-_ENOUGH = 0.8  # of the places that an arm is asked for, with which a search is content
+CLEAR = 0.12  # [m] height at which fingertips pass over everything, even with a block
+TILTS = ((0.0, 0.26), (0.26, 0.26), (0.4, 0.4))  # [rad] outwards from straight down: below, above
+_GRASP = 0.45  # of the block's edge: height of the fingertips in a grasp
+_DROP = 0.003  # [m] between block and plate when the jaws open
+_MARGIN = 0.05  # share of the jaws' range that is not used, at both ends
+_AHEAD = 0.3  # [m] from an arm's shoulder to the first place of searches, away from the table's near side
+_ASIDE = 0.05  # [m] beyond the area in which searches may begin
+_TRIES = 60  # seed postures of a search
+_ENOUGH = 0.8  # share of an arm's places that is sufficient
 _STATIONS = 4
 _ACROSS = math.pi / 2
 
@@ -43,7 +42,7 @@ Tilts = tuple[float, float]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nominal:
-    """A posture of an arm's `joints` [n] with its fingertips `down`; the jaws open `across` its bearing there."""
+    """Posture `joints` [n] of an arm with fingertips at `down`; the jaws open at the angle `across` to its bearing."""
 
     joints: Float64
     down: DownwardTip
@@ -51,9 +50,10 @@ class Nominal:
 
 
 class Postures:
-    """Those of one robot at one bench; SetupError where no arm of it can pick things up.
+    """Postures of one robot at one bench; `arms` are those that can pick objects up.
 
-    `arms` are those that can.
+    Raises:
+        SetupError: If no arm can; the message names the reasons.
     """
 
     def __init__(self, robot: Robot, table: Bench) -> None:
@@ -73,11 +73,11 @@ class Postures:
         return tuple(arm for arm in self._robot.arms if arm.name in self._nominal)
 
     def distance(self, arm: Group, place: Sequence[float]) -> float:
-        """From an arm's shoulder to a place, over the table [m]."""
+        """Return the horizontal distance from an arm's shoulder to a place [m]."""
         return math.dist(self._shoulders[arm.name], place[:2])
 
     def hover(self, arm: Group, q: Float64, place: Place, height: float) -> Float64 | None:
-        """Joints [D] with an arm's fingertips over a place at a height, its jaws open; None where it cannot reach."""
+        """Return joints [D] with an arm's fingertips above `place` at `height`, jaws open; None if it cannot reach."""
         tilt = TILTS[0][1]
         way = self._down(arm, q, place, 0.0, (height, CLEAR), (tilt, tilt))
         return None if way is None else np.asarray(way[-1])
@@ -91,9 +91,11 @@ class Postures:
         short: float,
         tilts: Tilts,
     ) -> tuple[Float64 | None, Float64 | None]:
-        """Joints [stations, D] from above to below the block, and the same over the plate.
+        """Return joints [stations, D] from above down to the block, and the same for the plate.
 
-        The jaws take those sides of the block that they are turned to most, else the other two.
+        Each is None if it is not reached. The jaws grasp the pair of sides that needs the smaller rotation, else the
+        other pair. `short` [m] is the deliberate error of the place, towards the arm; `tilts` [rad] are outwards from
+        straight down, below and above.
         """
         base = self._shoulders[arm.name]
         reach = math.dist(base, block[:2])
@@ -112,7 +114,7 @@ class Postures:
         return first
 
     def risen(self, arm: Group, q: Float64) -> Float64:
-        """Joints [D] with the fingertips straight up from where they are; q where they are high or cannot."""
+        """Return joints [D] with the fingertips raised straight up; `q` if they are high or cannot be raised."""
         tip = self.tip(arm, q)
         if tip[2, 3] >= CLEAR:
             return q
@@ -125,23 +127,23 @@ class Postures:
         return q
 
     def stowed(self, arm: Group, q: Float64) -> Float64:
-        """Joints [D] with an arm at rest, its jaws as they are."""
+        """Return joints [D] with an arm in its rest posture, its jaws unchanged."""
         rest = q.copy()
         rest[arm.joint_dims] = self._rest[arm.joint_dims]
         return rest
 
     def rested(self, arm: Group, q: Float64) -> Float64:
-        """Joints [D] with an arm at rest, its jaws open."""
+        """Return joints [D] with an arm in its rest posture, its jaws open."""
         return opened(arm, self.stowed(arm, q))
 
     def tip(self, arm: Group, q: Float64) -> Float64:
-        """An arm's fingertips in the world, [4, 4], at joints q [D]."""
+        """Return an arm's fingertips in the world [4, 4] at joints q [D]."""
         return self._limbs[arm.name].tip(q)
 
     def _down(
         self, arm: Group, q: Float64, place: Place, twist: float, heights: tuple[float, float], tilts: Tilts
     ) -> Float64 | None:
-        """Joints [stations, D] of an arm with open jaws, the others as in q [D]; None where it cannot reach."""
+        """Return joints [stations, D] of an arm with open jaws, other joints as in q [D]; None if it cannot reach."""
         bearing = self._bearing(arm, place)
         yaw = bearing + self._nominal[arm.name].across + twist
         way = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
@@ -151,7 +153,11 @@ class Postures:
     def _descent(
         self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[DownwardTip]
     ) -> Float64 | None:
-        """Joints [stations, D]: from the nominal posture turned about an upright shoulder, else led there."""
+        """Return joints [stations, D]; None if one is not reached.
+
+        The search begins at the nominal posture rotated about an upright shoulder; if this fails, or the shoulder is
+        not upright, it follows a path from the nominal posture.
+        """
         start = opened(arm, q)
         start[arm.joint_dims] = nominal.joints
         if upright := self._limbs[arm.name].upright:
@@ -165,7 +171,7 @@ class Postures:
     def _solved(
         self, arm: Group, stations: Sequence[DownwardTip], seed: Float64, before: Sequence[DownwardTip] = ()
     ) -> Float64 | None:
-        """Joints [T, D] for the stations, by way of what comes `before`; None where one of them is not reached."""
+        """Return joints [T, D] for the stations, solved via the poses `before`; None if a station is not reached."""
         index = self._robot.arms.index(arm)
         frame = self._limbs[arm.name].frame(seed)
         tip = np.eye(4) if arm.tip is None else arm.tip
@@ -181,7 +187,7 @@ class Postures:
         return result.q[len(before) :] if result.reached[len(before) :, index].all() else None
 
     def _learn(self, arm: Group) -> str:
-        """Find an arm's nominal posture; returns why it has none, "" where it has."""
+        """Find an arm's nominal posture; return the reason if there is none, else ""."""
         if arm.tip is None or arm.gripper is None or arm.gripper.apart is None:
             return f"{arm.name} needs fingertips and a gripper that says how far it opens (apart)"
         wanted = self._arm_places(arm)
@@ -198,7 +204,7 @@ class Postures:
         return ""
 
     def _search_postures(self, arm: Group) -> Iterator[Nominal]:
-        """Postures with the fingertips down: from the rest posture, then from more and more random ones."""
+        """Yield postures with the fingertips down, found from the rest posture, then from increasingly random seeds."""
         chance = np.random.default_rng(0)
         seed = self._rest
         low, high = np.maximum(self._robot.lower, -math.pi), np.minimum(self._robot.upper, math.pi)
@@ -218,7 +224,7 @@ class Postures:
             )
 
     def _reaches(self, arm: Group, nominal: Nominal, place: Place) -> bool:
-        """True if the fingertips go straight down on a place of the table."""
+        """Return True if the fingertips can go straight down at a place of the table."""
         bearing = self._bearing(arm, place)
         low = _GRASP * self._table.block_edge
         above = DownwardTip(place, CLEAR, bearing + nominal.across, bearing, TILTS[0][1])
@@ -226,7 +232,7 @@ class Postures:
         return self._descent(arm, self._rest, nominal, [above, below]) is not None
 
     def _arm_places(self, arm: Group) -> list[Place]:
-        """Places of the area that are this arm's: nearer to it than to any other."""
+        """Return the places of the area that are nearer to this arm than to any other."""
         x_from, x_to, y_from, y_to = self._table.area
         places = [
             (float(x), float(y)) for x in np.linspace(x_from, x_to, 5) for y in np.linspace(y_from, y_to, 3)
@@ -239,7 +245,7 @@ class Postures:
         ]
 
     def _ahead(self, arm: Group) -> list[Place]:
-        """First places of searches: straight ahead of the shoulder, and in the middle of the area."""
+        """Return the first places of searches: straight ahead of the shoulder, and the middle of the area."""
         x_from, x_to, y_from, y_to = self._table.area
         x, y = self._shoulders[arm.name]
         ahead = (
@@ -254,23 +260,23 @@ class Postures:
 
 
 def jaws(arm: Group) -> Gripper:
-    """The gripper of an arm."""
-    assert arm.gripper is not None  # an arm without one picks nothing up
+    """Return the gripper of an arm."""
+    assert arm.gripper is not None  # arms without a gripper are excluded in _learn
     return arm.gripper
 
 
 def opened(arm: Group, q: Float64) -> Float64:
-    """Joints [..., D] with an arm's jaws open: nearly as far as they go, because safety slows them at their limits."""
+    """Return joints [..., D] with an arm's jaws open, but short of their limit, near which safety slows them."""
     return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).open, jaws(arm).close)
 
 
 def closed(arm: Group, q: Float64) -> Float64:
-    """Joints [..., D] with an arm's jaws closed, likewise."""
+    """Return joints [..., D] with an arm's jaws closed, but short of their limit."""
     return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).close, jaws(arm).open)
 
 
 def gripper_dim(arm: Group) -> int:
-    """The place of an arm's gripper in the robot's vector."""
+    """Return the dimension of an arm's gripper in the robot's vector."""
     assert arm.gripper_dim is not None
     return arm.gripper_dim
 

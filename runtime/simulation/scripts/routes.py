@@ -1,7 +1,7 @@
-"""Pick and place of a block by an arm: legs of joint targets, timed, with gates for the jaws between.
+"""Routes that pick and place a block with one arm: timed legs of joint targets, with gates for the jaws between them.
 
-Between few postures the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so
-that an attempt is planned once and cheaply.
+Between a few postures the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so that
+planning is cheap and done once per attempt.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from runtime.simulation.scripts.postures import (
 if TYPE_CHECKING:
     from robots import Group, Robot
 
-_SPEED = 0.75  # rad/s of the fastest joint, at its fastest
-_TIP_SPEED = 0.11  # m/s on vertical ways, at its fastest
-_SHORTEST = 0.5  # s
-_JAW_SPEED = 0.16  # m/s
-_PAUSE = 0.3  # s that a route stands still at first: its rows arrive late
-_DWELL = 0.2  # s by which a gate outlasts the way of its jaws
-_PEAK = 1.875  # highest over mean speed of a minimum-jerk motion
-_AT_REST = 0.02  # rad
+_SPEED = 0.75  # [rad/s] peak speed of the fastest joint
+_TIP_SPEED = 0.11  # [m/s] peak speed on vertical paths
+_SHORTEST = 0.5  # [s] duration of a leg
+_JAW_SPEED = 0.16  # [m/s] of the jaws' opening
+_PAUSE = 0.3  # [s] at rest at the start of a route, because its first rows arrive late
+_DWELL = 0.2  # [s] by which a gate's rows continue after the jaws' motion
+_PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
+_AT_REST = 0.02  # [rad] from the rest posture
 
 Gate = Literal["", "close", "open"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leg:
-    """Rows float64 [n, D], one per control period; a gate's leg ends when the jaws are seen to have obeyed.
+    """Part of a route: rows float64 [n, D], one per control period; a leg with a gate ends when the jaws have moved.
 
-    `others` are the arms that move instead of the route's own: those that make way.
+    `others` are the arms that move instead of the route's own, to make room for it.
     """
 
     name: str
@@ -59,13 +59,13 @@ class Leg:
 
     @property
     def end(self) -> Float64:
-        """Its last row [D]."""
+        """Last row of the leg [D]."""
         return np.asarray(self.rows[-1])
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedFailure:
-    """Deliberate failure: the jaws close `short` of the block [m], or let it go on the way."""
+    """Deliberate failure: the jaws close `short` of the block [m], or release it on the way."""
 
     short: float = 0.0
     lets_go: bool = False
@@ -73,9 +73,9 @@ class PlannedFailure:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Motion of one arm, leg after leg; the rest of the robot stays, or makes way first.
+    """Motion of one arm, leg after leg; the other joints do not move, or move out of the way first.
 
-    `rows` [N, D] are those of all legs, `starts` the places of each leg's first one among them.
+    `rows` [N, D] are the rows of all legs, `starts` the index of each leg's first row among them.
     """
 
     arm: Group
@@ -91,7 +91,7 @@ class Route:
 
 
 class RoutePlanner:
-    """Plans for one robot at one bench, `rate` rows per second."""
+    """Planner of routes for one robot at one bench, with `rate` rows per second."""
 
     def __init__(self, robot: Robot, rate: float, table: Bench) -> None:
         self._robot = robot
@@ -105,10 +105,10 @@ class RoutePlanner:
     def pick_and_place(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
     ) -> Route | None:
-        """The route from joints q [D], by the arm nearest the block that reaches all of it; None if none does.
+        """Return the route from joints q [D] with the nearest arm that reaches all of it; None if no arm does.
 
-        Where that would come too near to another arm or the body, it is another arm's, or others make way; where
-        nothing helps, the one with most room.
+        If it comes too near to another arm or the body, another arm is tried, then routes for which other arms make
+        room; if none is clear, the route with the most clearance is returned.
         """
         found, most = None, -math.inf
         for route in self._routes(q, block, plate, slip):
@@ -122,7 +122,7 @@ class RoutePlanner:
     def _routes(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
     ) -> Iterator[Route]:
-        """By each arm that can, the nearest first: while the others stay, then with those at rest that are not."""
+        """Yield routes of all arms, the nearest first: with the others as they are, then with the others at rest."""
         nearest = sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block))
         for makes_way in (False, True):
             for arm in nearest:
@@ -136,7 +136,7 @@ class RoutePlanner:
                         yield self._begun(arm, [*before, *self._legs(arm, start, down, over, slip)])
 
     def _clear_other_arms(self, arm: Group, q: Float64) -> list[Leg]:
-        """The legs by which all other arms that are not at rest go there, up from the table first; [] where none is."""
+        """Return the legs that move all other arms to rest, up from the table first; [] if they are at rest already."""
         others = tuple(
             other
             for other in self._robot.arms
@@ -154,18 +154,21 @@ class RoutePlanner:
         return [replace(self._leg(*way), others=others) for way in ways]
 
     def _low(self, arm: Group, q: Float64) -> bool:
-        """True if the fingertips are so near to the table that they have to rise before they go elsewhere."""
+        """Return True if the fingertips are so near to the table that they have to rise before other motion."""
         return bool(self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR)
 
     def retreat(self, q: Float64, arm: Group) -> Route:
-        """Open the jaws, rise, and go where the arm is out of the camera's way."""
+        """Return the route that opens the jaws, rises, and moves the arm to rest, out of the camera's view."""
         high = opened(arm, self._postures.risen(arm, q))
         return self._begun(
             arm, [self._leg("back off", q, high), self._leg("retreat", high, self._postures.rested(arm, q))]
         )
 
     def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: PlannedFailure) -> list[Leg]:
-        """From the stations above to below the block, `down`, and the plate, `over`, [stations, D], jaws open."""
+        """Return the legs of a route, given the stations [stations, D] above the block, `down`, and the plate, `over`.
+
+        Both begin at the top and have open jaws.
+        """
         held, lowered = (closed(arm, way) for way in (down, over))
         legs = []
         if self._low(arm, q):
@@ -203,7 +206,7 @@ class RoutePlanner:
         )
 
     def _timed(self, stations: Float64, shortest: float) -> Float64:
-        """Rows [n, D] through stations [k, D], at rest at both ends: a polynomial, run with minimum jerk."""
+        """Return rows [n, D] through stations [k, D], at rest at both ends: a polynomial with minimum-jerk timing."""
         marks = np.linspace(0.0, 1.0, len(stations))
         powers = np.linalg.solve(np.vander(marks, increasing=True), stations)
         way = np.abs(np.diff(stations, axis=0)).sum(axis=0)
@@ -213,12 +216,12 @@ class RoutePlanner:
         rows = np.vander(s, len(stations), increasing=True) @ powers
         switched = list(
             self._robot.binary_dims
-        )  # on a way through numbers between they would begin anew at each look
+        )  # binary grippers have no values in between: a gradual motion would restart at each request
         rows[:, switched] = stations[-1, switched]
         return np.asarray(np.clip(rows, self._robot.lower, self._robot.upper))
 
 
 def _jaw_speed(arm: Group) -> float:
-    """In the gripper's own unit per second."""
+    """Return the jaws' speed in the gripper's joint unit per second."""
     opening = Opening(jaws(arm))
     return abs(opening.number(_JAW_SPEED) - opening.number(0.0))

@@ -1,4 +1,4 @@
-"""Script of a stand-in policy server; it begins anew with every connection."""
+"""Scripts of stand-in policy servers; a script restarts with every connection."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ if TYPE_CHECKING:
     from robots import Robot
 
 Answer = Callable[[Float64, Mapping[str, UInt8], str], Float32]
-"""From joints float64 [D], pictures by request key and instruction to rows float32 [H, D]."""
+"""Function of joints float64 [D], images by request key and instruction: rows float32 [H, D]."""
 
 
 class Script(ABC):
-    """One behaviour; `metadata` is what the server says of it on connect."""
+    """Policy without a model; `metadata` is what the server sends about it on connection."""
 
     metadata: Mapping[str, object]
 
     @abstractmethod
     def begin(self) -> Answer:
-        """Answers to the requests of one connection, in their order."""
+        """Return a function that answers the requests of one connection, called in their order."""
 
 
 class WavingScript(Script):
-    """A gesture around home: depends on nothing but the joints."""
+    """Script of a gesture around home, which depends only on the joints."""
 
     def __init__(
         self, robot: Robot, horizon: int, rate: float, seed: int = 0, name: str | None = None
