@@ -217,7 +217,7 @@ def episodes(text: str, most: int = MOST) -> list[int]:
             raise RecordingError(f"{text!r:.80} names no episodes: expected 3, or 0:4 (without 4), or 0:4,7")
         some = range(int(first), int(end)) if colon else [int(first)]
         if len(found) + len(some) > most:  # probably a typing error, which would exhaust the memory
-            raise RecordingError(f"{text!r:.80} names too many episodes: at most {MOST:,} in one order")
+            raise RecordingError(f"{text!r:.80} names too many episodes: at most {most:,} in one order")
         found += some
     return found
 

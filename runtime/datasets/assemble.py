@@ -471,20 +471,24 @@ class _Assembly:
     def _copy_other_files(self) -> None:
         """Copy files beyond the format and the episodes if there is a single source; report them otherwise.
 
-        Lists of subtasks are always copied, modality.json from the first source unless features are renamed.
+        The list of subtasks is copied from the first source, and modality.json unless features are renamed.
         """
+        first = self._sources[0]
         for source in self._sources:
             root = source.dataset.root
             for path in sorted([*root.glob("*"), *(root / "meta").glob("*")]):
                 name = str(path.relative_to(root))
                 if path.name.startswith(".") or name in _OURS or name in _folders(source):
                     continue
-                if name == layout.MODALITY:
-                    if source is self._sources[0] and source.names.empty:
-                        shutil.copyfile(path, self._root / name)
-                elif path.is_symlink() and not _is_its_own(path, root):
+                if path.is_symlink() and not _is_its_own(path, root):
                     self._left_out[f"{path}: a link to {path.resolve()}, which is not of the dataset"] = None
-                elif path.is_file() and (len(self._sources) == 1 or name == SUBTASKS):
+                elif name in (layout.MODALITY, SUBTASKS):
+                    if source is not first:
+                        if _bytes(source.dataset, name) != _bytes(first.dataset, name):
+                            self._left_out[str(path)] = None
+                    elif name == SUBTASKS or source.names.empty:
+                        shutil.copyfile(path, self._root / name)
+                elif path.is_file() and len(self._sources) == 1:
                     shutil.copyfile(path, self._root / name)
                 else:
                     self._left_out[str(path)] = None

@@ -289,7 +289,7 @@ def positive(text: str) -> float:
     """Return a number of the command line that is above zero and below 1e6."""
     number = float(text)
     if not 0 < number < 1e6:
-        raise argparse.ArgumentTypeError(f"{text} is not above zero")
+        raise argparse.ArgumentTypeError(f"{text} is not above zero and below 1,000,000")
     return number
 
 

@@ -18,7 +18,6 @@ from runtime.config import loader as deployment
 from runtime.core.errors import RuntimeFault, SetupError
 
 _DEPLOYMENT = Path(__file__).parents[2] / "deployments" / "demo.toml"
-_READY_S = 30.0
 
 
 class StandIns:

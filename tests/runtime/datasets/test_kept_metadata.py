@@ -217,6 +217,21 @@ def test_subtasks_that_are_numbered_otherwise_are_not_merged(tmp_path: Path) -> 
         merge(roots, tmp_path / "never")
 
 
+@pytest.mark.parametrize("name", ["meta/modality.json", "meta/subtasks.parquet"])
+def test_a_file_of_the_first_source_is_kept_and_another_one_of_the_second_is_named(
+    tmp_path: Path, name: str
+) -> None:
+    roots = [tmp_path / "one", tmp_path / "other"]
+    for root in roots:
+        write(root, Plan("v2.1", lengths=(3,), videos=()))
+        (root / name).write_bytes(b"the same")
+    assert merge(roots, tmp_path / "both").left_out == ()
+    (roots[1] / name).write_bytes(b"another")
+
+    assert merge(roots, tmp_path / "again").left_out == (str(roots[1] / name),)
+    assert (tmp_path / "again" / name).read_bytes() == b"the same"
+
+
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_own_keys_are_kept_whatever_they_begin_with(tmp_path: Path, version: str) -> None:
     write(tmp_path / "set", Plan("v2.1", lengths=(3, 4), videos=()))
