@@ -1,7 +1,8 @@
 """Loops that only sleep, for comparison: `python -m benchmarks.sleeper HOW HZ SECONDS [PRIORITY]`.
 
-"rest" is the common method: work, then sleep for the remaining period. "deadlines" sleeps to absolute deadlines like
-our control, in its scheduling class if PRIORITY is given: its lateness is the machine's.
+"rest" is the common method: sleep for what is left of the period since the last wake-up. "deadlines" sleeps until
+absolute deadlines, as the control process does, and with PRIORITY in the real-time scheduling class of that process.
+The loops do no work, so that their lateness is caused by the machine alone.
 """
 
 from __future__ import annotations

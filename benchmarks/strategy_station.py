@@ -103,7 +103,10 @@ def station_of(
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Task for both station and step loop; `inference_hz` None is back to back."""
+    """Parameters with which both the station and the step loop run.
+
+    If `inference_hz` is None, each inference starts as soon as the previous one has ended.
+    """
 
     strategy: str
     control_hz: float

@@ -74,7 +74,7 @@ def debug(request: HttpRequest, name: str) -> HttpResponse:
     """Render the page for operating a station manually: every command, every value."""
     found, seen = _station(name), visibility_for_request(request)
     if name in seen.busy_stations:
-        return _page(request, found, "veiled", {"why": seen.plans})
+        return _page(request, found, "redacted", {"why": seen.plans})
     shown = {"checkpoints": checkpoint_list(sight=seen), **_replayed(request, found)}
     return _page(request, found, "debug", shown)
 

@@ -30,10 +30,11 @@ def success_of(path: Path) -> bool | None:
 
 
 def dataset_name(recorded: RecordedEpisode, *, scored: bool, simulated: bool) -> str:
-    """Return the dataset's name, which separates robots, rollouts, demonstrations, simulated and unscored ones.
+    """Return the name of the dataset that an episode goes to.
 
-    An episode of a collection session goes to the session's dataset.
-    Raises: RecordingError if a name cannot be that of a folder.
+    There is one per robot and kind (rollouts or demonstrations), with simulated episodes and unscored rollouts apart.
+    An episode of a collection session goes to the session's dataset instead.
+    Raises: RecordingError if the name of the robot or of the session's dataset cannot be a folder's.
     """
     if recorded.session.get("dataset"):
         return session_dataset(str(recorded.session["dataset"]), simulated=simulated)

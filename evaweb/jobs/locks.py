@@ -72,9 +72,9 @@ def _mark(owner: UUID | None) -> bytes:
 
 
 def _locked(path: Path) -> int | None:
-    """Lock the file at `path` and return its descriptor; None if it stays locked.
+    """Lock the file at `path` and return its descriptor; None if another process holds the lock at every attempt.
 
-    The file is compared after locking, because it may have been removed and created anew in between.
+    After locking, `path` must still name the opened file: it may have been removed and created anew in between.
     """
     for attempt in range(_TRIES):
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

@@ -43,10 +43,11 @@ def design_power(
     margin: float | None = None,
     looks: tuple[int, ...] = (),
 ) -> DesignPower:
-    """Return the power of a design of at most `pairs` pairs; exact, except for "evidence" (4,000 simulations).
+    """Return power and number of pairs of a design of at most `pairs` pairs.
 
-    With a `margin` the power is the probability of finding that the first arm's rate is not lower than the second's by
-    that much or more. `looks` are numbers of pairs; if empty, there is a look after every pair.
+    They are exact, except for "evidence" (4,000 simulations). With a `margin` the power is that of a non-inferiority
+    test: the probability of finding that the first arm's rate is above the second's minus the margin. `looks` are the
+    numbers of pairs after which there is a look; if empty, there is one after every pair.
     """
     _check(rule, alpha, p_first, p_second)
     if not 1 <= pairs <= MOST:

@@ -140,7 +140,7 @@ class Want:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Bytes that were requested, in the part that follows; empty if the station cannot read them any more."""
+    """Answer to a `Want`: the next part of the message has the bytes; it is empty if the station cannot read them."""
 
     episode: str
     file: str

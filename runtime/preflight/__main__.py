@@ -99,10 +99,11 @@ def _seconds(text: str) -> float:
 
 
 def _for_a_parent() -> int:
-    """Answer one line of JSON on standard input with one on standard output; end when the input closes.
+    """Run one preflight for a parent process: the request is a line of JSON on standard input, so is the report on
+    standard output. Return early if standard input closes.
 
-    The line has "tree" (a resolved deployment) or "deployment" (a file), "changes" (tables merged on top, as by a
-    set-up), and "deadline_s" or null.
+    The request has "tree" (a resolved deployment) or "deployment" (path of a file), "changes" (tables merged over the
+    deployment, such as a checkpoint's), and "deadline_s" [s] (null: the default).
     """
     os.nice(_BACKGROUND_NICE)
     log.configure_logging("preflight")

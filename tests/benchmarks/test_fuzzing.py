@@ -34,7 +34,7 @@ def test_nothing_that_is_done_to_an_arm_that_stands_below_its_command_moves_it(s
 def test_an_arm_that_sinks_is_noticed(monkeypatch):
     """As before: an e-stop leads the command to the reading."""
     monkeypatch.setattr(
-        "runtime.processes.control.steady_error.SteadyError.keeps",
+        "runtime.processes.control.steady_error.SteadyError.unchanged_joints",
         lambda self, actuator, measured, now: np.zeros(len(measured), bool),
     )
     found = [text for seed in range(3) for text in compliant.once(seed)]

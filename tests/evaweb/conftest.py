@@ -147,7 +147,7 @@ def nobody_computes(monkeypatch: pytest.MonkeyPatch) -> None:
     def busy(*asked: object, soon: bool = False) -> None:
         raise Busy("it computes for others")
 
-    monkeypatch.setattr("evaweb.serving.computations.questions.ask", busy)
+    monkeypatch.setattr("evaweb.serving.computations.questions.result", busy)
 
 
 @pytest.fixture

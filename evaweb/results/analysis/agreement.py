@@ -105,8 +105,9 @@ def _defined(statistic: Callable[..., float], *given: Any) -> float | None:
 
 
 def judge_agreement(plan: Plan) -> list[dict[str, Any]] | None:
-    """Return the agreement of each version of each automatic judge with the scores of that time; None without
-    judgements.
+    """Return for each version of each automatic judge its agreement with the scores that were current when it judged.
+
+    None without judgements.
 
     Second raters and judges are kept strictly apart: neither counts in the other's agreement.
     """

@@ -20,12 +20,13 @@ class _Tried(NamedTuple):
 
 
 def anchors_of(plan: Plan) -> list[dict[str, Any]]:
-    """Return for each anchor of a frozen plan its successes by plan, and two tests for drift.
+    """Return for each anchor of a frozen plan its successes by plan, and two p-values of tests for drift.
 
-    `against_earlier` is the probability of a difference from the earlier plans as large as observed by chance,
-    `within` that of a difference between the first and the second half of this plan. Both are stratified by station,
-    scene and position; None if nothing can be compared. Earlier plans were frozen before this one, are revealed or
-    were never blind, and have the anchor and identical scenes.
+    `against_earlier` compares this plan with earlier ones, `within` its first half with its second half. Each is the
+    probability that chance alone makes a difference at least as improbable as the observed one, stratified by
+    station, scene and position; it is None if nothing can be compared. An earlier plan counts if it was frozen before
+    this one, served the anchor in the same way, and is revealed or was never blind; of its trials those in scenes that
+    are identical in this plan.
     """
     found = []
     for row in (plan.document or {}).get("checkpoints", ()):

@@ -28,12 +28,12 @@ def update_jacobian(chain: Record, costs: Costs, frame: Record) -> None:
 
 @device_function
 def add_nullspace_bias(arm: Record, costs: Costs, dt: float, going: bool, frame: Record) -> None:
-    """Add to a frame's start and rest position a step in the null space of frame.jacobian.
+    """Shift the solver's first guess and rest position for one row by a step in the null space of frame.jacobian.
 
-    The step descends a potential of the distance from home and the nearness to limits (gradient projection, Liegeois
-    1977), and replaces the null-space part of the continued motion: it depends on the posture only, so that a closed
-    path is closed in joint space too. It does not move the tip, and fades out at singularities, where the freedom is
-    a choice of branches and not of postures.
+    The step descends a potential that grows with the distance from home and near joint limits (gradient projection,
+    Liegeois 1977). It replaces the null-space part of the motion that is extrapolated from the previous row: it depends
+    on the posture only, so that a closed path of the tip is closed in joint space too. It does not move the tip, and
+    fades out at singularities, where the extra freedom chooses between solution branches.
     """
     free = frame.free
     for i in range(len(frame.q)):

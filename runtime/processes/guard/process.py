@@ -131,7 +131,11 @@ class Guard:
         return status.version > version and bool(status.read()["estop_obeyed"])
 
     def answer(self, command: Command) -> Ack:
-        """Answer a command. Every user may press; "failed" means no confirmation by control: use the hardware stop."""
+        """Carry out an "estop" or "status" command and return its acknowledgement; others are refused.
+
+        Every user may press the e-stop. The status "failed" means that control did not confirm the press in time: use
+        the hardware stop.
+        """
         if command.kind == "estop":
             version = self._shared_state.control.version  # before the press: only a newer status confirms it
             doubt = self.press(display_name(command), reason_of(command))

@@ -75,7 +75,10 @@ class DropoutLog:
         self._cameras = {name: _Camera() for name in sorted(cameras)}
 
     def update(self, now: float, row: int, silent: Mapping[str, float]) -> list[Event]:
-        """Return the events at row `row` and time `now` [s]; `silent` maps cameras to the age of an old picture [s]."""
+        """Return the events of lost and returned cameras that are due at row `row` and time `now` [s].
+
+        `silent` maps each camera whose newest picture is too old to the age of that picture [s].
+        """
         events = []
         for name, camera in self._cameras.items():
             if (name in silent) != camera.silent:

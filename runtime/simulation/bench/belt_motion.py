@@ -73,7 +73,10 @@ def draw_belt_motion(seed: int, belt: Belt, seconds: float) -> BeltMotion:
 
 @dataclass(slots=True)
 class _BeltMotionBuilder:
-    """Motion that is being drawn, up to `time` [s], at which the block is at `x` [m] and has `speed` [m/s]."""
+    """Belt motion under construction: `knots` describe it up to `time` [s].
+
+    At that time a block on the belt is at `x` [m] and moves at `speed` [m/s].
+    """
 
     knots: list[tuple[float, float, float, float]]
     time: float

@@ -491,7 +491,7 @@ def test_that_something_has_to_be_compiled_is_said_before(
 def test_what_is_kept_on_disk_and_broken_is_compiled_again(tmp_path: Path) -> None:
     code = (
         "import logging, robots; logging.basicConfig(level='INFO'); from runtime.kinematics import compiled; "
-        "compiled.build(compiled.Config(), robots.load('ur5e'))"
+        "compiled.build(compiled.Config(), robots.load_robot('ur5e'))"
     )
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     build(Config(), load_robot("ur5e"))  # so that it is kept

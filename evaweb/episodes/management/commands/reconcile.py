@@ -10,7 +10,7 @@ from evaweb.episodes.reconcile import reconcile
 
 
 class Command(BaseCommand):
-    """Can be run at any time, also while everything is running; idempotent."""
+    """Command that updates the database from the data folder; idempotent, and allowed while the lab runs."""
 
     help = "Makes the database say what the data folder holds: episodes, datasets, scores."
 

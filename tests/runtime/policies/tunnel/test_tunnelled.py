@@ -440,7 +440,7 @@ def test_a_run_holds_naming_the_tunnel_that_broke_and_goes_on_when_it_is_up_agai
         policy = station.coordinator.inference.policy
         assert isinstance(policy, TunnelledPolicy)
         assert policy._keeper is not None
-        assert policy._keeper.wait(lambda now: now.up, PATIENCE_S).up
+        assert policy._keeper.wait_for(lambda now: now.up, PATIENCE_S).up
         answers = station.coordinator.inference.metrics.answers
         station.command("resume")
         station.until(lambda: station.coordinator.inference.metrics.answers > answers + 2, 20.0, "answers")
