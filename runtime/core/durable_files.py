@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -24,7 +25,7 @@ def write_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
 
     Any number of processes may do so at once; the last one wins. Raises: OSError.
     """
-    draft = _draft_path(path)
+    draft = path.with_name(f".{path.name}.draft")
     with _open_draft(draft, mode) as file:
         try:
             # Content, then name, then folder entry: in this order a power cut leaves the old or the whole new file.
@@ -41,14 +42,15 @@ def create_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
 
     Raises: OSError.
     """
-    draft = _draft_path(path)
-    with _open_draft(draft, mode) as file:
-        try:
+    # A draft of its own, and no lock: nobody waits for a process that stands still.
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        with open(draft, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             _fill(file, content)
-            with suppress(FileExistsError):
-                os.link(draft, path)
-        finally:
-            draft.unlink(missing_ok=True)
+        with suppress(FileExistsError):
+            os.link(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
     sync_folder(path.parent)
 
 
@@ -82,10 +84,6 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _draft_path(path: Path) -> Path:
-    return path.with_name(f".{path.name}.draft")
 
 
 @contextmanager

@@ -464,14 +464,14 @@ def test_a_station_that_dies_and_comes_back_is_said(live, ann, runtime):
 
 def test_what_changes_in_the_database_is_said(live, ann, bob, runtime, monkeypatch):
     lease = leases.claim(user=ann, station=live, page="p1")
-    looked, look = asyncio.Event(), hubs.changes.read_marks
+    looked, look = asyncio.Event(), hubs.change_marks.read_marks
 
     async def watched(station):
         found = await look(station)
         looked.set()
         return found
 
-    monkeypatch.setattr(hubs.changes, "read_marks", watched)
+    monkeypatch.setattr(hubs.change_marks, "read_marks", watched)
     monkeypatch.setattr(hubs, "_CHANGES_S", 0.05)
 
     async def scenario():

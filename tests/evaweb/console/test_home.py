@@ -170,7 +170,7 @@ def test_a_still_is_asked_for_once_for_all_viewers(bench, monkeypatch):
             raise Conflict("no picture from cam_high")
         return {cameras[0]: b"jpeg"}
 
-    monkeypatch.setattr(stills.pictures, "current_images", now)
+    monkeypatch.setattr(stills.image_store, "current_images", now)
     monkeypatch.setattr(stills, "_stills", {})
     browser = Client()
     browser.force_login(bench.operator)

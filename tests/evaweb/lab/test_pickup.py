@@ -55,7 +55,7 @@ def lab(settings, tmp_path, monkeypatch):
 
 def looks(found, most=50):
     for _ in range(most):
-        found.look()
+        found.poll()
 
 
 def test_a_simulated_station_comes_with_its_bench_and_policies_and_is_known_to_the_database(lab):
@@ -63,7 +63,7 @@ def test_a_simulated_station_comes_with_its_bench_and_policies_and_is_known_to_t
     looks(found)
     assert started.programs == []
     deployments.write_simulated(name="bench-2", robot="ur5e")
-    found.look()
+    found.poll()
     assert deployments.standing_of("bench-2") == Standing(doing="the simulated bench")
     looks(found)
     names = [program.name for program in started.programs]
@@ -118,7 +118,7 @@ def test_what_is_removed_is_ended_and_its_name_can_be_used_again(lab):
 def test_what_is_removed_while_it_is_started_does_not_stay_behind(lab):
     started, found = lab
     deployments.write_simulated(name="bench-2", robot="ur5e")
-    found.look()
+    found.poll()
     deployments.remove(name="bench-2")
     looks(found)
     assert not any("bench-2" in program.name for program in started.programs)

@@ -27,7 +27,7 @@ def shown(monkeypatch):
     """What the cameras show, by their names."""
     found = {camera: jpeg(seed) for seed, camera in enumerate(CAMERAS)}
     monkeypatch.setattr(
-        looking.pictures,
+        looking.image_store,
         "current_images",
         lambda station, cameras, patience_s=3.0: {c: found[c] for c in cameras},
     )

@@ -70,7 +70,7 @@ def test_where_the_disk_does_not_take_it_nothing_is_changed(closed, ann, monkeyp
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(disk.os, "fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(disk.NotWritten, match="No space left"):
         services.add_review(user=ann, episode=episode, verdict="pass")
     with pytest.raises(disk.NotWritten, match="No space left"):

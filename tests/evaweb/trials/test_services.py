@@ -480,7 +480,7 @@ def test_what_cannot_be_written_to_the_disk_is_no_score(bench, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(disk, "_written", full)
+    monkeypatch.setattr(disk, "append_durably", full)
     with pytest.raises(EvaError, match="not kept: No space left on device"):
         score(bench, trial)
     trial.refresh_from_db()

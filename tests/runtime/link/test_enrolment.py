@@ -25,7 +25,7 @@ def address(lab):
 
 def test_a_computer_is_enrolled_and_knows_its_lab(lab, tmp_path, key, capsys):
     lab.allowed.now = allowed(enrolling=True)
-    words = ["--data-dir", str(tmp_path / "robot"), "enrol", address(lab), lab.code(STATION).shown()]
+    words = ["--data-dir", str(tmp_path / "robot"), "enrol", address(lab), lab.code(STATION).text()]
     assert keys.main(words) == 0
     assert f"{STATION} is a station of the test's lab now" in capsys.readouterr().out
     known = key_files.known_lab(tmp_path / "robot" / "stations" / STATION)

@@ -33,7 +33,7 @@ def shelf(data):
 
 
 def offered(shelf, folder, episode=UUID):
-    return list(shelf.take(Offer(episode), contents_of(folder).packed()))
+    return list(shelf.handle(Offer(episode), contents_of(folder).packed()))
 
 
 def sent(shelf, folder, said, pieces=10**6):
@@ -43,7 +43,7 @@ def sent(shelf, folder, said, pieces=10**6):
         want, pieces = wanted.pop(0), pieces - 1
         with (folder / want.file).open("rb") as file:
             file.seek(want.offset)
-            wanted += shelf.take(Piece(want.episode, want.file, want.offset), file.read(want.count))
+            wanted += shelf.handle(Piece(want.episode, want.file, want.offset), file.read(want.count))
     return wanted
 
 
@@ -162,7 +162,7 @@ BAD = ["../a", "a/b", ".hidden", "", "/etc/passwd", "a\0b", "\ud800", "x" * 256,
 @pytest.mark.parametrize("name", BAD)
 def test_a_file_that_is_named_like_a_path_is_refused(data, shelf, home, name):
     rows = [*json.loads(contents_of(home).packed()), [name, 1, "00" * 32]]
-    assert "cannot name a file" in why(list(shelf.take(Offer(UUID), json.dumps(rows).encode())))
+    assert "cannot name a file" in why(list(shelf.handle(Offer(UUID), json.dumps(rows).encode())))
     assert not (data / "episodes" / ".arriving" / STATION / UUID).exists()
 
 
@@ -185,7 +185,7 @@ def test_a_file_that_is_named_like_a_path_is_refused(data, shelf, home, name):
     ],
 )
 def test_a_list_that_is_none_is_refused_with_a_sentence(shelf, rows, said):
-    assert said in why(list(shelf.take(Offer(UUID), rows)))
+    assert said in why(list(shelf.handle(Offer(UUID), rows)))
 
 
 def test_bytes_that_are_not_what_the_list_says_are_sent_three_times_and_no_more(data, shelf, home):
@@ -193,7 +193,7 @@ def test_bytes_that_are_not_what_the_list_says_are_sent_three_times_and_no_more(
     for _ in range(3):
         want = said[0]
         assert (want.file, want.offset) == ("events.jsonl", 0)
-        said = list(shelf.take(Piece(UUID, want.file, 0), bytes(want.count)))
+        said = list(shelf.handle(Piece(UUID, want.file, 0), bytes(want.count)))
     assert "was sent 3 times, and is not what its SHA-256 says" in why(said)
     assert not (data / "episodes" / UUID).exists()
 
@@ -210,9 +210,9 @@ def test_bytes_that_are_not_what_the_list_says_are_sent_three_times_and_no_more(
 )
 def test_a_piece_that_was_not_asked_for_ends_the_try_and_writes_nothing(data, shelf, home, lie, said):
     want, piece = lie(offered(shelf, home)[0], (home / "events.jsonl").read_bytes())
-    assert said in why(list(shelf.take(Piece(want.episode, want.file, want.offset), piece)))
+    assert said in why(list(shelf.handle(Piece(want.episode, want.file, want.offset), piece)))
     assert (data / "episodes" / ".arriving" / STATION / UUID / "events.jsonl").read_bytes() == b""
-    assert list(shelf.take(Piece(UUID, "events.jsonl", 0), b"more")) == []  # of a try that has ended
+    assert list(shelf.handle(Piece(UUID, "events.jsonl", 0), b"more")) == []  # of a try that has ended
 
 
 def test_an_episode_for_which_there_is_no_room_is_declined_before_a_byte_of_it_comes(data, home):
@@ -226,7 +226,7 @@ def test_an_episode_for_which_there_is_no_room_is_declined_before_a_byte_of_it_c
 
 def test_a_size_that_no_disk_has_is_declined(shelf, home):
     files = (*contents_of(home).files, File("huge.mp4", 1 << 39, "00" * 32))
-    assert "too little room" in why(list(shelf.take(Offer(UUID), Contents(files).packed())))
+    assert "too little room" in why(list(shelf.handle(Offer(UUID), Contents(files).packed())))
 
 
 def test_a_disk_that_fills_up_ends_the_try_with_a_sentence_and_keeps_what_is_here(
@@ -265,16 +265,16 @@ def test_a_link_in_place_of_a_file_is_not_followed(tmp_path, data, shelf, home):
 
 def test_labels_grow_and_are_never_replaced(data, shelf, home):
     sent(shelf, home, offered(shelf, home))
-    (arrived,) = shelf.take(Labels(UUID), b"one\n")
+    (arrived,) = shelf.handle(Labels(UUID), b"one\n")
     assert isinstance(arrived, Arrived)
-    assert isinstance(next(shelf.take(Labels(UUID), b"one\ntwo\n")), Arrived)
-    assert "nothing is overwritten" in why(list(shelf.take(Labels(UUID), b"two\n")))
+    assert isinstance(next(shelf.handle(Labels(UUID), b"one\ntwo\n")), Arrived)
+    assert "nothing is overwritten" in why(list(shelf.handle(Labels(UUID), b"two\n")))
     assert (data / "labels" / f"{UUID}.jsonl").read_bytes() == b"one\ntwo\n"
 
 
 def test_labels_of_another_stations_episode_are_refused(data, shelf):
     recorded(data, "bench-1")
-    assert "of another station" in why(list(shelf.take(Labels(UUID), b"one\n")))
+    assert "of another station" in why(list(shelf.handle(Labels(UUID), b"one\n")))
     assert not (data / "labels").exists()
 
 

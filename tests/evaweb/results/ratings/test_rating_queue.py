@@ -284,7 +284,7 @@ def test_nothing_is_kept_that_the_disk_does_not_take(plan, carry_out, rater, ben
     def full(file, payload):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(lines, "_written", full)
+    monkeypatch.setattr(lines, "append_durably", full)
     with pytest.raises(lines.NotWritten):
         rating_queue.save_rating(
             user=rater, plan=plan, code=handout.code, milestones=bench.ticks(True, True, True)

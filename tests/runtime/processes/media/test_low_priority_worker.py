@@ -36,7 +36,7 @@ class Wanted:
         self.socket.bind("inproc://news")
         self._tells.connect("inproc://news")
 
-    def wanted(self) -> bool:
+    def is_requested(self) -> bool:
         while self.socket.get(zmq.EVENTS) & zmq.POLLIN:
             self._wants = self.socket.recv() == b"yes"
         return self._wants

@@ -26,12 +26,12 @@ class Looking:
         self.topics = {"camera/"}
         self.begun: list[str] = []
 
-    def hear(self) -> list[str]:
+    def poll_subscriptions(self) -> list[str]:
         begun, self.begun = self.begun, []
         self.topics.update(begun)
         return begun
 
-    def wanted(self, stream: str) -> bool:
+    def has_subscriber(self, stream: str) -> bool:
         return stream.startswith(tuple(self.topics))
 
     def publish(self, stream: str, jpeg: bytes) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 _ROUNDS = """
 import resource, sys
-from runtime.core import malloc as heap
+from runtime.core import process_limits as heap
 if sys.argv[1] == "keep":
     assert heap.keep_freed_memory()
 pieces = lambda: [bytearray(b"x") * 900_000 for _ in range(6)]
