@@ -13,7 +13,7 @@ from pathlib import Path
 HERE = Path(__file__)
 TYPES = ("feat", "fix", "refactor", "perf", "docs", "test", "build", "ci", "chore", "style")
 LONGEST = 72
-_FORM = re.compile(rf"({'|'.join(TYPES)})(\([a-z0-9_-]+\))?!?: [^\sA-Z].*[^.]")
+_FORM = re.compile(rf"({'|'.join(TYPES)})(\([a-z0-9_/,-]+\))?!?: [^\sA-Z].*[^.]")
 
 
 def subject_problem(subject: str) -> str:
