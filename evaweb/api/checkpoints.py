@@ -46,9 +46,10 @@ class CheckpointOut(Schema):
     "", response={200: Page[CheckpointOut], **FAILURES}, summary="Checkpoints", url_name="checkpoints"
 )
 def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = False, tag: str = "") -> Any:
-    """Those offered to operators; with `inactive` also the ones that are switched off, with `tag` those that have it.
+    """Return the checkpoints that operators may choose.
 
-    None of a blind plan behind which the caller has not looked.
+    With `inactive` also those that are switched off, with `tag` only those with this tag. Checkpoints of a blind plan
+    are left out unless the caller has looked behind the blind.
     """
     rows = selectors.checkpoint_list(all_of_them=inactive, tag=tag, sight=visibility_for_request(request))
     return paging.page(rows, CheckpointOut)
@@ -58,5 +59,5 @@ def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = Fa
     "/{path:name}", response={200: CheckpointOut, **FAILURES}, summary="One checkpoint", url_name="checkpoint"
 )
 def checkpoint(request: HttpRequest, name: str) -> Any:
-    """By its name, which may contain slashes, or by its id."""
+    """Return a checkpoint by its name, which may contain slashes, or by its id."""
     return selectors.checkpoint_get(name=name, sight=visibility_for_request(request))

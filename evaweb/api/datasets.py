@@ -73,13 +73,13 @@ class DatasetEpisodeOut(Schema):
 
 @router.get("", response={200: list[DatasetOut], **FAILURES}, summary="Datasets", url_name="datasets")
 def datasets(request: HttpRequest) -> Any:
-    """All below the data folder, in the order of their names."""
+    """Return all datasets below the data folder, sorted by name."""
     return [DatasetOut.of(found) for found in overviews()]
 
 
 @router.get("/one", response={200: DatasetOut, **FAILURES}, summary="One dataset", url_name="dataset")
 def dataset(request: HttpRequest, name: str) -> Any:
-    """By its name; `cups` is datasets/cups."""
+    """Return a dataset by its name; `cups` is datasets/cups."""
     return DatasetOut.of(overview(dataset_orders.full_name(name)))
 
 
@@ -92,8 +92,10 @@ def dataset(request: HttpRequest, name: str) -> Any:
 def episodes(
     request: HttpRequest, name: str, words: str = "", success: str = "", result: str = "", verdict: str = ""
 ) -> Any:
-    """In the order of their indices; `success` is yes, no or unknown, `result` success, partial, fail or unknown,
-    `verdict` pass, fail or unreviewed."""
+    """Return the episodes of a dataset, sorted by index.
+
+    `success` is yes, no or unknown, `result` success, partial, fail or unknown, `verdict` pass, fail or unreviewed.
+    """
     only = {"words": words, "success": success, "result": result, "verdict": verdict}
     try:
         found = episode_list.list_rows(dataset_orders.full_name(name), **only)
@@ -109,5 +111,8 @@ def episodes(
     url_name="dataset-jobs",
 )
 def ask(request: HttpRequest, given: dataset_orders.Order) -> Any:
-    """Check, repair, convert, merge, split; delete and push are for administrators. The job says how far it is."""
+    """Queue a check, repair, conversion, merge or split; only administrators may delete and push.
+
+    The job reports the progress.
+    """
     return Status(202, dataset_orders.submit_order(user=request.auth, given=given.model_dump()))

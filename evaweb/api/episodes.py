@@ -153,7 +153,7 @@ class Filters(Schema):
 
 @router.get("", response={200: Page[EpisodeOut], **FAILURES}, summary="Episodes", url_name="episodes")
 def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging]) -> Any:
-    """The newest first."""
+    """Return the episodes, newest first."""
     sight = visibility_for_request(request)
     rows = Episode.objects.select_related(*_WITH).prefetch_related("tags")
     rows = rows.order_by("-started_at", "-created_at", "pk")
@@ -179,7 +179,7 @@ def episodes(request: HttpRequest, filters: Query[Filters], paging: Query[Paging
     "/{uuid:uuid}", response={200: EpisodeDetail, **FAILURES}, summary="One episode", url_name="episode"
 )
 def episode(request: HttpRequest, uuid: UUID) -> Any:
-    """By its uuid."""
+    """Return an episode by its uuid."""
     return EpisodeDetail.of(_found(uuid), visibility_for_request(request))
 
 
@@ -194,7 +194,7 @@ _TABLE = {"schema": {"type": "string", "format": "binary"}}
     openapi_extra={"responses": {200: {"description": "A parquet file", "content": {CONTENT_TYPE: _TABLE}}}},
 )
 def episode_export(request: HttpRequest, uuid: UUID) -> Any:
-    """Raw, smoothed and executed, step by step, with manifest and outcome in its metadata."""
+    """Return raw, smoothed and executed actions step by step; the file's metadata hold manifest and outcome."""
     found = _found(uuid)
     visibility_for_request(request).require_episode(found)
     path = table_file(found.uuid)
@@ -208,7 +208,7 @@ def episode_export(request: HttpRequest, uuid: UUID) -> Any:
     url_name="episode-export-asked",
 )
 def request_export(request: HttpRequest, uuid: UUID) -> Any:
-    """For an episode that its station has not exported; the job says how far it is."""
+    """Queue the export of an episode that its station has not exported. The job reports the progress."""
     require_role(request.auth, Role.OPERATOR)
     return Status(
         202, JobOut.of(services.request_export(episode=_found(uuid)), visibility_for_request(request))
@@ -222,9 +222,10 @@ def request_export(request: HttpRequest, uuid: UUID) -> Any:
     url_name="episode-publish-asked",
 )
 def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
-    """Write it into its dataset, or anew with the score that counts now; operators.
+    """Write the episode into its dataset, or again with the score that counts now. Requires an operator.
 
-    A demonstration as its session would: labelled a success or partial, neither discarded nor failed by a review.
+    A demonstration is published as by its session: it must be labelled success or partial, and be neither discarded nor
+    failed by a review.
     """
     require_role(request.auth, Role.OPERATOR)
     found = _found(uuid)

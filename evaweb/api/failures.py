@@ -25,6 +25,6 @@ class TermOut(Schema):
 
 @router.get("", response={200: list[TermOut], **FAILURES}, summary="Why trials fail", url_name="failures")
 def failures(request: HttpRequest, inactive: bool = False) -> Any:
-    """Phases, then causes, in the lab's order; with `inactive` also those that are retired."""
+    """Return the failure phases, then the causes, in the lab's order; with `inactive` also those that are retired."""
     terms = FailureTerm.objects.all()
     return terms if inactive else terms.filter(active=True)

@@ -38,9 +38,9 @@ class AllFoundOut(Schema):
 
 @router.get("", response={200: AllFoundOut, **FAILURES}, summary="Find anything", url_name="find")
 def find(request: HttpRequest, q: str) -> Any:
-    """Stations, trials by number and code, episodes by uuid, plans, checkpoints, scenes, datasets and pages.
+    """Find stations, trials by number and code, episodes by uuid, plans, checkpoints, scenes, datasets and pages.
 
-    All words of `q`, 1 to 200 characters, have to fit. What is hidden from the caller is not found.
+    All words of `q` (1 to 200 characters) must match. What is hidden from the caller is not found.
     """
     user: Any = request.auth  # type: ignore[attr-defined]
     return {"groups": selectors.find(query=q, user=user, sight=visibility_for_request(request))}

@@ -61,7 +61,7 @@ def jobs(
     kind: str = "",
     key: str = "",
 ) -> Any:
-    """The newest first."""
+    """Return the jobs, newest first."""
     rows = Job.objects.order_by("-created_at", "-pk")
     wanted = {"status": status and status.value, "kind": kind, "key": key}
     return paging.page(
@@ -73,12 +73,12 @@ def jobs(
 
 @router.post("/{id}/retry", response={202: JobOut, **FAILURES}, summary="Try again", url_name="job-retry")
 def retry(request: HttpRequest, id: int) -> Any:
-    """Ask anew for what a failed job was about; whoever may ask for that."""
+    """Queue a failed job again. Requires the role that may request such a job."""
     job = services.retry_job(user=request.auth, job=job_get(id=id))
     return Status(202, JobOut.of(job, visibility_for_request(request)))
 
 
 @router.post("/{id}/cancel", response={200: JobOut, **FAILURES}, summary="Cancel", url_name="job-cancel")
 def cancel(request: HttpRequest, id: int) -> Any:
-    """End a job for good: at once where it waits, else at its next step; operators."""
+    """Cancel a job: immediately if it is waiting, otherwise at its next step. Requires an operator."""
     return JobOut.of(services.cancel(user=request.auth, job=job_get(id=id)), visibility_for_request(request))

@@ -229,14 +229,14 @@ class LayoutIn(Body):
 
 @router.get("/plans", response={200: Page[PlanOut], **FAILURES}, summary="Plans", url_name="plans")
 def plans(request: HttpRequest, paging: Query[Paging], state: PlanState | None = None) -> Any:
-    """All versions by name, the newest first; drafts are for their owners and administrators."""
+    """Return all versions of the plans by name, newest first; drafts are shown to their owners and administrators."""
     rows = plan_list(user=request.auth)
     return paging.page(rows.filter(state=state.value) if state else rows, PlanOut, request.auth)
 
 
 @router.get("/plans/{name}", response={200: PlanOut, **FAILURES}, summary="One plan", url_name="plan")
 def plan(request: HttpRequest, name: str, version: int | None = None) -> Any:
-    """By its name; without a version the newest that is no draft."""
+    """Return a plan by its name; without a version the newest that is not a draft."""
     return PlanOut.of(plan_get(name=name, version=version, user=request.auth), request.auth)
 
 
@@ -244,7 +244,10 @@ def plan(request: HttpRequest, name: str, version: int | None = None) -> Any:
     "/plans/{name}/next", response={201: HandoutOut, **FAILURES}, summary="Next trial", url_name="plan-next"
 )
 def next_trial(request: HttpRequest, name: str, given: StationIn) -> Any:
-    """Prepare the next trial of the plan's schedule on a station; operators who have confirmed its cameras."""
+    """Prepare the next trial of the plan's schedule on a station.
+
+    Requires an operator who has confirmed the station's cameras.
+    """
     station = station_get(name=given.station)
     found = plan_get(name=name, user=request.auth)
     handout = bench.allocate_checked_trial(user=request.auth, station=station, plan=found)
@@ -268,7 +271,10 @@ def next_trial(request: HttpRequest, name: str, given: StationIn) -> Any:
     url_name="plan-give-back",
 )
 def release_slots(request: HttpRequest, name: str, given: ReleaseSlotsIn) -> Any:
-    """Let other stations have the trials that this one has begun a block of and not made; operators."""
+    """Release the trials of a station's open blocks that have not run, so that other stations can get them.
+
+    Requires an operator.
+    """
     found, station = plan_get(name=name, user=request.auth), station_get(name=given.station)
     return {
         "freed": allocation.release_slots(user=request.auth, plan=found, station=station, reason=given.reason)
@@ -279,14 +285,16 @@ def release_slots(request: HttpRequest, name: str, given: ReleaseSlotsIn) -> Any
     "/plans/{name}/close", response={200: PlanOut, **FAILURES}, summary="Close it", url_name="plan-close"
 )
 def close(request: HttpRequest, name: str, given: Reason) -> Any:
-    """Hand out no more trials of it; its owner, or an administrator."""
+    """Stop handing out trials of the plan. Requires its owner or an administrator."""
     found = plan_get(name=name, user=request.auth)
     return PlanOut.of(services.close_plan(user=request.auth, plan=found, reason=given.reason), request.auth)
 
 
 @router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
 def unblind(request: HttpRequest, name: str) -> Any:
-    """Look behind the blind before the reveal: recorded, and the user runs none of its trials."""
+    """Show the caller what is behind the blind before the reveal: it is recorded, and the caller can run none of the
+    plan's trials from then on.
+    """
     found = plan_get(name=name, user=request.auth)
     record_unblinding(found, request.auth)
     return PlanOut.of(found, request.auth)
@@ -296,7 +304,7 @@ def unblind(request: HttpRequest, name: str) -> Any:
     "/plans/{name}/reveal", response={200: PlanOut, **FAILURES}, summary="Reveal it", url_name="plan-reveal"
 )
 def reveal(request: HttpRequest, name: str) -> Any:
-    """Say which checkpoint was which, once and for all; its owner, or an administrator."""
+    """Publish which checkpoint was which; it cannot be undone. Requires the plan's owner or an administrator."""
     found = plan_get(name=name, user=request.auth)
     return PlanOut.of(services.reveal_plan(user=request.auth, plan=found), request.auth)
 
@@ -308,7 +316,7 @@ def reveal(request: HttpRequest, name: str) -> Any:
     url_name="cameras",
 )
 def cameras(request: HttpRequest, name: str) -> Any:
-    """The caller's confirmation of the cameras; valid until the station starts anew, half a day at most."""
+    """Return the caller's confirmation of the cameras, which is valid until the station restarts, at most half a day."""
     return CamerasOut.of(bench.current_camera_check(user=request.auth, station=station_get(name=name)))
 
 
@@ -319,7 +327,10 @@ def cameras(request: HttpRequest, name: str) -> Any:
     url_name="cameras-confirm",
 )
 def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
-    """Each camera shows what its reference shows; kept with what it shows now. Operators."""
+    """Confirm that each camera shows what its reference shows; the current images are stored with it.
+
+    Requires an operator.
+    """
     check = bench.confirm_cameras(user=request.auth, station=station_get(name=name), first=given.first)
     return Status(201, CamerasOut.of(check))
 
@@ -331,7 +342,7 @@ def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
     url_name="references",
 )
 def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
-    """Take the cameras' current pictures as reference of how the position should lie; operators."""
+    """Store the cameras' current images as the reference of how the position is laid out. Requires an operator."""
     position = None
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)
@@ -347,7 +358,10 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
     url_name="reference-regions",
 )
 def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
-    """Another reference with the same picture and these regions, in which the bench is compared; operators."""
+    """Create another reference with the same image and these regions, in which the bench is compared.
+
+    Requires an operator.
+    """
     drawn = [region.dict() for region in given.regions]
     row = bench.save_regions(user=request.auth, reference=reference_get(id=id), drawn=drawn)
     return Status(201, ReferenceOut.of(row))
@@ -360,7 +374,7 @@ def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
     url_name="bench",
 )
 def bench_match(request: HttpRequest, id: int) -> Any:
-    """Of each camera that has a reference of the trial's position, how well it matches now; nothing is kept."""
+    """Return how well each camera with a reference of the trial's position matches it now; nothing is stored."""
     seen = bench.current_matches(trial=trials.trial_get(id=id))
     return [
         {
@@ -381,7 +395,10 @@ def bench_match(request: HttpRequest, id: int) -> Any:
     url_name="achieved",
 )
 def record_layout(request: HttpRequest, id: int, given: LayoutIn) -> Any:
-    """Before the run: what the cameras show, and how well it matches the position's references; operators."""
+    """Record before the run what the cameras show and how well it matches the position's references.
+
+    Requires an operator.
+    """
     taken = bench.record_layout(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
     return Status(201, [_seen(row) for row in taken])
 

@@ -76,7 +76,7 @@ class PreflightFilters(Schema):
 
 @router.get("", response={200: Page[PreflightOut], **FAILURES}, summary="Preflights", url_name="preflights")
 def preflights(request: HttpRequest, filters: Query[PreflightFilters], paging: Query[Paging]) -> Any:
-    """The newest first."""
+    """Return the preflights, newest first."""
     seen = visibility_for_request(request)
     checkpoint = checkpoint_get(name=filters.checkpoint, sight=seen) if filters.checkpoint else None
     return paging.page(
@@ -88,7 +88,7 @@ def preflights(request: HttpRequest, filters: Query[PreflightFilters], paging: Q
     "", response={202: PreflightOut, **FAILURES}, summary="Ask for a preflight", url_name="preflight-ask"
 )
 def start_preflight(request: HttpRequest, given: PreflightIn) -> Any:
-    """Begin one; it is under way then, and read at its id."""
+    """Start a preflight; read its progress and result at its id."""
     row = services.start_preflight(
         user=request.auth,
         checkpoint=checkpoint_get(name=given.checkpoint, sight=visibility_for_request(request)),
@@ -101,7 +101,7 @@ def start_preflight(request: HttpRequest, given: PreflightIn) -> Any:
     "/{uuid:id}", response={200: PreflightOut, **FAILURES}, summary="One preflight", url_name="preflight"
 )
 def preflight(request: HttpRequest, id: UUID) -> Any:
-    """A preflight: its progress, or its result."""
+    """Return a preflight: its progress, or its result."""
     row = services.refresh_preflight(
         row=selectors.preflight_get(id=id, sight=visibility_for_request(request))
     )

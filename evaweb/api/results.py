@@ -233,7 +233,9 @@ def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilt
     url_name="plan-integrity",
 )
 def integrity(request: HttpRequest, name: str, version: int) -> Any:
-    """Looks, voids, corrections, amendments, deviations, delays, and what the headline would be under each doubt."""
+    """Return looks, voids, corrections, amendments, deviations and delays, and the headline with the doubtful trials
+    left out.
+    """
     plan, _ = _seen(request, name, version, TrialFilters())
     return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **integrity_document(plan)}
 
@@ -245,8 +247,9 @@ def integrity(request: HttpRequest, name: str, version: int) -> Any:
     url_name="plan-simulated",
 )
 def simulated(request: HttpRequest, name: str, version: int) -> Any:
-    """Of each plan of the same checkpoints on simulated benches: rates, rank correlation, mean maximum rank violation,
-    and differences with what simulation adds (null of fewer than eight matched trials)."""
+    """Return the comparison with each plan of the same checkpoints on simulated benches: rates, rank correlation, mean
+    maximum rank violation, and prediction-powered differences (null with fewer than eight matched trials).
+    """
     plan, _ = _seen(request, name, version, TrialFilters())
     user: Any = request.auth  # type: ignore[attr-defined]
     found = (compare_with_real(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
@@ -281,7 +284,9 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
     url_name="result-frozen",
 )
 def frozen(request: HttpRequest, digest: str) -> Any:
-    """One sentence, one table and one figure with the design; no later correction changes them."""
+    """Return one sentence, one table and one figure with the design, as stored at the reveal; later corrections do not
+    change them.
+    """
     plan = plan_at_reveal(digest)
     require_visible_results(plan, request.auth)
     later = reverse("api:plan-integrity", args=[plan.name, plan.version])
@@ -297,7 +302,7 @@ def frozen(request: HttpRequest, digest: str) -> Any:
 def checkpoint(
     request: HttpRequest, name: str, version: int, checkpoint: str, only: Query[TrialFilters]
 ) -> Any:
-    """Its rates, scores, milestones and times."""
+    """Return the rates, scores, milestones and times of a checkpoint."""
     plan, which = _seen(request, name, version, only)
     analysis = caching.cached_analysis(plan, which)
     found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
@@ -315,7 +320,9 @@ def checkpoint(
 def comparison(
     request: HttpRequest, name: str, version: int, first: str, second: str, only: Query[TrialFilters]
 ) -> Any:
-    """Difference, tests and evidence; the first minus the second, whichever way round the page has them."""
+    """Return difference, tests and evidence of the first checkpoint minus the second, in whichever order the page has
+    them.
+    """
     plan, which = _seen(request, name, version, only)
     analysis = caching.cached_analysis(plan, which)
     found = analysis.comparison_of(first, second)
@@ -338,7 +345,9 @@ def outcomes(
     paging: Query[Paging],
     format: Format = "json",
 ) -> Any:
-    """In the order in which they were handed out, those that do not count included; CSV and Parquet have all."""
+    """Return the trials in the order in which they were handed out, also those that do not count; CSV and Parquet have
+    all.
+    """
     plan, which = _seen(request, name, version, only)
     if format != "json":
         name = f"{plan.name}-v{plan.version}-trials"
@@ -355,7 +364,7 @@ def outcomes(
 def scores(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Those that were corrected included."""
+    """Return the scores, also those that were corrected."""
     plan, _ = _seen(request, name, version, TrialFilters())
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "scores", rows, ScoreRow, paging, format)
@@ -370,7 +379,7 @@ def scores(
 def ratings(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Given by users other than the trial's operator; they never change its score."""
+    """Return the ratings of users other than the trial's operator; they never change its score."""
     plan, _ = _seen(request, name, version, TrialFilters())
     rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "ratings", rows, RatingOut, paging, format)
@@ -385,7 +394,10 @@ def ratings(
 def judgements(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Each trial once by each version of a judge; they never change its score and are no ratings."""
+    """Return the judgements of automatic judges: each trial once by each version of a judge.
+
+    They never change its score and are not ratings.
+    """
     plan, _ = _seen(request, name, version, TrialFilters())
     rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
     return _rows(request, plan, "judgements", rows, JudgementOut, paging, format)
@@ -400,7 +412,7 @@ def judgements(
 def preferences(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Raters' preferences between two trials at the same initial condition."""
+    """Return the raters' preferences between two trials at the same initial condition."""
     plan, _ = _seen(request, name, version, TrialFilters())
     rows = plan.preferences.select_related("rater", "first__checkpoint", "second__checkpoint").order_by("pk")
     return _rows(request, plan, "preferences", rows, PreferenceOut, paging, format)
@@ -410,7 +422,7 @@ def preferences(
     "/planner", response={200: dict[str, Any], **FAILURES}, summary="How many trials", url_name="planner"
 )
 def planner(request: HttpRequest, asked: Query[PlannerIn]) -> Any:
-    """Trials and robot hours for a wanted difference, and what the trials there is time for would miss."""
+    """Return the trials and robot hours for a wanted difference, and the power of the trials that there is time for."""
     question = question_of({name: str(value) for name, value in asked.model_dump().items()})
     user: Any = request.auth  # type: ignore[attr-defined]
     return {"question": asked.model_dump(), **table_of(question, user.pk)}

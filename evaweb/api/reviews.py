@@ -167,7 +167,9 @@ class NextOut(Schema):
     "/reviews/next", response={200: NextOut, **FAILURES}, summary="Next unreviewed", url_name="review-next"
 )
 def next_unreviewed(request: HttpRequest, after: UUID | None = None) -> Any:
-    """The one after the episode `after` in the list, newest first; from the top where there is none below."""
+    """Return the next unreviewed episode after the episode `after` in the list, newest first; from the top if none
+    follows.
+    """
     found, waiting = selectors.unreviewed_next(after=after)
     return {"episode": found.uuid if found else None, "waiting": waiting}
 
@@ -179,7 +181,7 @@ def next_unreviewed(request: HttpRequest, after: UUID | None = None) -> Any:
     url_name="segment-labels",
 )
 def labels(request: HttpRequest) -> Any:
-    """In the lab's order, without what is retired; segments may have other labels."""
+    """Return the labels in the lab's order without retired ones; segments may have other labels."""
     return selectors.labels_offered()
 
 
@@ -190,7 +192,7 @@ def labels(request: HttpRequest) -> Any:
     url_name="episode-reviews",
 )
 def get_reviews(request: HttpRequest, uuid: UUID) -> Any:
-    """Verdicts, annotations, and what the checks found."""
+    """Return verdicts, annotations, and the results of the checks."""
     return _said(request, uuid)
 
 
@@ -201,7 +203,7 @@ def get_reviews(request: HttpRequest, uuid: UUID) -> Any:
     url_name="episode-review",
 )
 def review(request: HttpRequest, uuid: UUID, given: ReviewIn) -> Any:
-    """Add to what is said; operators. Nothing that was said is changed."""
+    """Add a verdict or note; earlier ones are never changed. Requires an operator."""
     services.add_review(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
     return _said(request, uuid)
 
@@ -213,7 +215,7 @@ def review(request: HttpRequest, uuid: UUID, given: ReviewIn) -> Any:
     url_name="episode-segment",
 )
 def segment(request: HttpRequest, uuid: UUID, given: SegmentIn) -> Any:
-    """Mark a part, or change one of one's own; operators."""
+    """Mark a segment, or change one of the caller's own. Requires an operator."""
     services.save_segment(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
     return _said(request, uuid)
 
@@ -225,14 +227,14 @@ def segment(request: HttpRequest, uuid: UUID, given: SegmentIn) -> Any:
     url_name="episode-segment-remove",
 )
 def remove_segment(request: HttpRequest, uuid: UUID, segment: UUID) -> Any:
-    """One of one's own; administrators any."""
+    """Remove a segment of the caller's own; administrators may remove any."""
     services.remove_segment(user=request.auth, episode=episode_get(uuid=uuid), segment=segment)
     return _said(request, uuid)
 
 
 @router.get("/reviews/tags", response={200: list[TagOut], **FAILURES}, summary="Tags", url_name="tags")
 def tags(request: HttpRequest) -> Any:
-    """All that episodes have, in the order of the alphabet."""
+    """Return all tags of episodes in alphabetical order."""
     found = tag_counts(sight=visibility_for_request(request))
     return [{"words": words, "episodes": episodes} for words, episodes in found.items()]
 
@@ -244,7 +246,7 @@ def tags(request: HttpRequest) -> Any:
     url_name="episode-tags",
 )
 def tags_changed(request: HttpRequest, uuid: UUID, given: TagsIn) -> Any:
-    """Put tags on it and take others off; operators. Once it is closed."""
+    """Add tags to a closed episode and remove others. Requires an operator."""
     changed = services.tags_change(user=request.auth, episode=episode_get(uuid=uuid), **given.model_dump())
     left = visibility_for_request(request).tags_of(episode_get(uuid=uuid))
     return {"tags": left, "added": changed.added, "removed": changed.removed}
@@ -257,7 +259,7 @@ def tags_changed(request: HttpRequest, uuid: UUID, given: TagsIn) -> Any:
     url_name="episode-quality",
 )
 def quality(request: HttpRequest, uuid: UUID) -> Any:
-    """Flag by flag, with frames, values and bounds."""
+    """Return the quality report flag by flag, with frames, values and bounds."""
     return selectors.report_get(uuid=episode_get(uuid=uuid).uuid)
 
 
@@ -268,7 +270,10 @@ def quality(request: HttpRequest, uuid: UUID) -> Any:
     url_name="episode-quality-asked",
 )
 def request_quality(request: HttpRequest, uuid: UUID) -> Any:
-    """Again where it was; operators. The job says how far it is."""
+    """Queue the quality checks of an episode, again if there were any.
+
+    Requires an operator. The job reports the progress.
+    """
     require_role(request.auth, Role.OPERATOR)
     asked = services.request_quality_check(episode=episode_get(uuid=uuid))
     return Status(202, JobOut.of(asked, visibility_for_request(request)))

@@ -60,11 +60,11 @@ class SceneOut(Schema):
 
 @router.get("", response={200: Page[SceneOut], **FAILURES}, summary="Scenes", url_name="scenes")
 def scenes(request: HttpRequest, paging: Query[Paging], inactive: bool = False) -> Any:
-    """Those offered to operators; with `inactive` also the ones that are switched off."""
+    """Return the scenes that operators may choose; with `inactive` also those that are switched off."""
     return paging.page(selectors.scene_list(all_of_them=inactive), SceneOut)
 
 
 @router.get("/{name}", response={200: SceneOut, **FAILURES}, summary="One scene", url_name="scene")
 def scene(request: HttpRequest, name: str) -> Any:
-    """By its name, or by its id."""
+    """Return a scene by its name or its id."""
     return selectors.scene_get(name=name)

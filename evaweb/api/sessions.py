@@ -185,7 +185,7 @@ def sessions(
     dataset: str = "",
     open: bool | None = None,
 ) -> Any:
-    """The newest first."""
+    """Return the sessions, newest first."""
     return paging.page(selectors.session_list(station=station, dataset=dataset, is_open=open), SessionOut)
 
 
@@ -196,7 +196,7 @@ def sessions(
     url_name="session",
 )
 def session(request: HttpRequest, uuid: UUID) -> Any:
-    """With its episodes and history."""
+    """Return a session with its episodes and history."""
     return SessionDetail.of(selectors.session_get(uuid=uuid))
 
 
@@ -207,7 +207,7 @@ def session(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-queue",
 )
 def queue(request: HttpRequest, uuid: UUID) -> Any:
-    """Quality, previews, tables, publication; `POST /jobs/ID/retry` tries one again that has failed."""
+    """Return the jobs of a session: quality, previews, tables, publication. `POST /jobs/ID/retry` retries a failed one."""
     found = session_queue(session=selectors.session_get(uuid=uuid))
     return {
         "done": found.done,
@@ -224,7 +224,7 @@ def queue(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-open",
 )
 def open_session(request: HttpRequest, name: str, given: SessionIn) -> Any:
-    """With the station's present set-up; operators, while no other user commands it."""
+    """Open a session with the station's present set-up. Requires an operator, while no other user commands the station."""
     made = services.open_session(user=request.auth, station=station_get(name=name), **given.model_dump())
     return Status(201, SessionOut.of(made))
 
@@ -236,7 +236,7 @@ def open_session(request: HttpRequest, name: str, given: SessionIn) -> Any:
     url_name="session-close",
 )
 def close_session(request: HttpRequest, uuid: UUID) -> Any:
-    """For now: it can be resumed."""
+    """Close a session; it can be resumed."""
     return SessionOut.of(services.close_session(user=request.auth, session=selectors.session_get(uuid=uuid)))
 
 
@@ -247,7 +247,7 @@ def close_session(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-resume",
 )
 def resume_session(request: HttpRequest, uuid: UUID) -> Any:
-    """Refused with every difference where the station's set-up is not as it was."""
+    """Resume a session; refused with every difference if the station's set-up has changed."""
     return SessionOut.of(services.resume_session(user=request.auth, session=selectors.session_get(uuid=uuid)))
 
 
@@ -270,7 +270,7 @@ def set_target(request: HttpRequest, uuid: UUID, given: TargetIn) -> Any:
     url_name="session-publish",
 )
 def publish(request: HttpRequest, uuid: UUID, given: PublishIn) -> Any:
-    """Those that are accepted and in no dataset yet; the jobs that do it."""
+    """Publish the accepted episodes that are in no dataset yet; returns the jobs."""
     found = selectors.session_get(uuid=uuid)
     asked = services.publish_session(user=request.auth, session=found, **given.model_dump())
     return Status(202, [JobOut.of(job, visibility_for_request(request)) for job in asked])

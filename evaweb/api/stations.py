@@ -218,13 +218,13 @@ ANSWERS = {200: CommandOut, 504: CommandOut, frozenset({400, 401, 403, 404, 422,
 
 @router.get("", response={200: list[StationOut], **FAILURES}, summary="Stations", url_name="stations")
 def stations(request: HttpRequest, inactive: bool = False) -> Any:
-    """Those offered to operators; with `inactive` also the ones that are switched off."""
+    """Return the stations that operators may choose; with `inactive` also those that are switched off."""
     return [StationOut.of(row) for row in selectors.station_list(all_of_them=inactive)]
 
 
 @router.get("/{name}", response={200: StationDetail, **FAILURES}, summary="One station", url_name="station")
 def station(request: HttpRequest, name: str) -> Any:
-    """With its newest snapshot; `gone` says why there is none."""
+    """Return a station with its newest snapshot; `gone` says why there is none."""
     found = selectors.station_get(name=name)
     snapshot, gone = None, ""
     try:
@@ -242,7 +242,7 @@ def station(request: HttpRequest, name: str) -> Any:
     "/{name}/lease", response={200: LeaseOut, **FAILURES}, summary="Take, give, ask", url_name="lease"
 )
 def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
-    """Act on the station's lease; answers with its state afterwards."""
+    """Claim, request, hand over, move or give up the station's lease; returns its state afterwards."""
     found, user, page = selectors.station_get(name=name), request.auth, given.page
     if given.action == "claim":
         leases.claim(user=user, station=found, page=page)
@@ -269,7 +269,7 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
     url_name="commands",
 )
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
-    """Set-up, run, stop, modes, strategy, motions, grippers; the same uuid again gets the first answer."""
+    """Send a command: set-up, run, stop, modes, strategy, motions, grippers. The same uuid again gets the first answer."""
     found, seen = selectors.station_get(name=name), visibility_for_request(request)
     order = given.model_dump(exclude=set(_NAMED))
     named = [name for name in _NAMED if getattr(given, name) is not None]
@@ -301,7 +301,7 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     "/{name}/estop", response={**ANSWERS, 409: CommandOut | ErrorOut}, summary="E-stop", url_name="estop"
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
-    """Stop the robot now; any logged-in user. To the wire first, without a wait for the row."""
+    """Stop the robot now; any logged-in user may. The press goes to the station before it is written to the database."""
     # In a served lab evaweb.api.stop_gateway answers first, even if the database cannot verify the login.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth
@@ -318,7 +318,7 @@ def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
     "/{name}/trials", response={201: TrialDetail, **FAILURES}, summary="Prepare a trial", url_name="prepare"
 )
 def prepare(request: HttpRequest, name: str, given: TrialIn) -> Any:
-    """The next trial of this checkpoint at this position, or the repetition of one that does not count."""
+    """Prepare the next trial of a checkpoint at a position, or the repetition of one that does not count."""
     scene = trial_selectors.scene_get(name=given.scene)
     made = services.prepare_trial(
         user=request.auth,

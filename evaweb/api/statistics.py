@@ -87,7 +87,9 @@ METHOD = (
     url_name="statistics",
 )
 def statistics(request: HttpRequest, filters: Query[Filters], format: Format = "json") -> Any:
-    """Counts, success rate with its Wilson 95 % interval, mean score, median duration, smoothness; CSV, Parquet."""
+    """Return counts, success rates with Wilson 95 % intervals, mean scores, median durations and smoothness, also as
+    CSV and Parquet.
+    """
     rows = [
         StatisticsOut.of(row)
         for row in selectors.statistics(filters.chosen(), visibility_for_request(request))

@@ -200,7 +200,7 @@ COLUMNS: dict[str, Any] = {**_LIST, "milestones_reached": str, "milestones_misse
 def trials(
     request: HttpRequest, filters: Query[Filters], paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """The newest first, in pages; with `format=csv` or `parquet` all that fit, the oldest first."""
+    """Return the trials, newest first, in pages; with `format=csv` or `parquet` all that match, oldest first."""
     seen = visibility_for_request(request)
     if format != "json":
         pages = selectors.trials_in_pages(filters.chosen(), sight=seen)
@@ -210,13 +210,13 @@ def trials(
 
 @router.get("/{int:id}", response={200: TrialDetail, **FAILURES}, summary="One trial", url_name="trial")
 def trial(request: HttpRequest, id: int) -> Any:
-    """With every score it was ever given."""
+    """Return a trial with all its scores."""
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
 
 @router.post("/{int:id}/score", response={200: TrialDetail, **FAILURES}, summary="Score it", url_name="score")
 def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
-    """Add a score, or a correction; operators."""
+    """Add a score, or a correction. Requires an operator."""
     found = selectors.trial_get(id=id)
     services.score_trial(user=request.auth, trial=found, **given.model_dump())
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
@@ -229,7 +229,10 @@ def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
     url_name="failure",
 )
 def failure(request: HttpRequest, id: int, given: FailureIn) -> Any:
-    """Correct phase and cause and nothing else of its score, which stays in the record; operators."""
+    """Correct the failure's phase and cause and nothing else; the score before stays in the record.
+
+    Requires an operator.
+    """
     found = selectors.trial_get(id=id)
     corrections.trial_failure(user=request.auth, trial=found, **given.model_dump())
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
@@ -253,7 +256,7 @@ def void(request: HttpRequest, id: int, given: Reason) -> Any:
     url_name="void_answer",
 )
 def void_answer(request: HttpRequest, id: int, given: VoidAnswer) -> Any:
-    """Agree to a void that another operator asked for, or refuse it with a reason; blind operators."""
+    """Agree to a void that another operator requested, or decline it with a reason. Requires a blind operator."""
     trial = selectors.trial_get(id=id)
     voids.answer_void(user=request.auth, trial=trial, agree=given.agree, reason=given.reason)
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
@@ -263,7 +266,7 @@ def void_answer(request: HttpRequest, id: int, given: VoidAnswer) -> Any:
     "/{int:id}/abandon", response={200: TrialDetail, **FAILURES}, summary="Give it up", url_name="abandon"
 )
 def abandon(request: HttpRequest, id: int, given: Reason) -> Any:
-    """Give up a trial that never ran; operators."""
+    """Give up a trial that never ran. Requires an operator."""
     services.abandon_trial(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
 
