@@ -1,8 +1,24 @@
 """A person at the bench: what they press and what they see."""
 
+import os
+
 from tests.e2e.lab import STATION
 from tests.e2e.pixels import pixels
 from tests.processes import PATIENCE_MS, PATIENCE_S, eventually
+
+LATE_MS = int(os.environ.get("EVA_TESTS_LATE_MS", "0"))
+# What the live socket brings reaches the page so much later: a slow connection, or a machine that draws too much.
+_LATE = f"""
+const Own = window.WebSocket;
+const given = (told, message) => (told.handleEvent ? told.handleEvent(message) : told(message));
+const late = (told) => (message) => setTimeout(() => given(told, message), {LATE_MS});
+window.WebSocket = class extends Own {{
+  set onmessage(told) {{ super.onmessage = late(told); }}
+  addEventListener(kind, told, ...more) {{
+    super.addEventListener(kind, kind === "message" ? late(told) : told, ...more);
+  }}
+}};
+"""
 
 
 class BenchPage:
@@ -16,6 +32,8 @@ class BenchPage:
         self.page = self.context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)  # of a busy machine, as in tests.processes
         self.errors: list[str] = []
+        if LATE_MS:
+            self.page.add_init_script(_LATE)
         self._listen()
         self.log_in(username)
 
