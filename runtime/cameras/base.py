@@ -26,22 +26,23 @@ class CameraError(TransportError):
 
 
 class CameraSettings(Settings):
-    """Processing of the pictures of any camera, in this order: colours, crop, rotate, flip, size."""
+    """Image processing and deadlines common to all cameras; the order is colours, crop, rotate, flip, size."""
 
     colours: Literal["rgb", "bgr"] = "rgb"
-    """"bgr" for a camera that has red and blue in each other's place."""
+    """Order of the colour channels; "bgr" for a camera that swaps red and blue."""
     crop: Annotated[list[Offset], Field(min_length=4, max_length=4)] | None = None
-    """The part that is used: left, top, width, height in the camera's own pixels; all of it where not given."""
+    """Region that is used: left, top, width, height in the camera's own pixels; width and height at least 8. Absent:
+    the whole image."""
     rotate: Literal[0, 90, 180, 270] = 0
-    """By how much the picture is turned clockwise [degrees]."""
+    """Clockwise rotation of the image [degrees]."""
     flip: Literal["none", "horizontal", "vertical"] = "none"
-    """"horizontal" exchanges left and right, "vertical" top and bottom, as it stands after turning."""
+    """Mirroring after the rotation: "horizontal" swaps left and right, "vertical" swaps top and bottom."""
     size: Annotated[list[Pixels], Field(min_length=2, max_length=2)] | None = None
-    """Width and height that it is scaled to; its own where not given."""
+    """Width and height to which the image is scaled [pixels]; absent: it is not scaled."""
     open_s: float = Field(default=5.0, gt=0, le=60)
-    """How long opening it may take until it has failed and is tried again [s]."""
+    """Longest time for opening the camera [s]; beyond it the attempt has failed and is repeated."""
     read_s: float = Field(default=2.0, gt=0, le=60)
-    """How long it may send no picture until it is lost and opened anew [s]."""
+    """Longest time without an image [s]; beyond it the camera counts as lost and is opened again."""
 
     @model_validator(mode="after")
     def _crop_something(self) -> CameraSettings:

@@ -9,13 +9,14 @@ from runtime.cameras.base import Address, CameraSettings
 
 
 class Config(CameraSettings):
-    """A video that every run plays from its first picture, at its own pace; between runs that picture stands."""
+    """A video file that every run plays from its first image at its own rate; that image is shown between runs."""
 
     kind: Literal["file"] = "file"
     path: str
-    """The file: whatever FFmpeg reads."""
+    """Path of the file, in any format that FFmpeg reads."""
     at_end: Literal["loop", "stop"] = "loop"
-    """"loop" goes on with its first picture; "stop" gives no more until the run is over."""
+    """At the end of the video, "loop" continues with its first image; "stop" delivers no more images until the run
+    ends."""
 
 
 def address(config: Config) -> Address:

@@ -11,15 +11,15 @@ from runtime.cameras.camera_urls import check_url, with_password
 
 
 class Config(CameraSettings):
-    """A network camera over HTTP, multipart/x-mixed-replace ("MJPEG"); a picture counts as taken when it arrives."""
+    """A network camera over HTTP, multipart/x-mixed-replace ("MJPEG"); images are stamped on arrival."""
 
     kind: Literal["mjpeg"] = "mjpeg"
     url: str
-    """Where it is: http://host[:PORT]/PATH, without a password."""
+    """Address of the camera without a password: http://host[:PORT]/PATH or https://host[:PORT]/PATH."""
     user: str | None = None
-    """Name to log in with."""
+    """User name for the login."""
     password_env: str | None = None
-    """Environment variable that holds the password."""
+    """Name of the environment variable that contains the password."""
 
     @field_validator("url")
     @classmethod

@@ -15,13 +15,14 @@ class Config(CameraSettings):
 
     kind: Literal["rtsp"] = "rtsp"
     url: str
-    """Where it is: rtsp://host[:PORT]/PATH, without a password."""
+    """Address of the camera without a password: rtsp://host[:PORT]/PATH or rtsps://host[:PORT]/PATH."""
     user: str | None = None
-    """Name to log in with."""
+    """User name for the login."""
     password_env: str | None = None
-    """Environment variable that holds the password."""
+    """Name of the environment variable that contains the password."""
     stamps: Literal["stream", "arrival"] = "stream"
-    """When a picture was taken: as the stream says, mapped to our clock, or when it arrived."""
+    """Capture time of an image: "stream" uses the time stamps of the stream, mapped to this machine's clock; "arrival"
+    uses the time of arrival."""
 
     @field_validator("url")
     @classmethod

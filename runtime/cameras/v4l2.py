@@ -14,15 +14,16 @@ class Config(CameraSettings):
 
     kind: Literal["v4l2"] = "v4l2"
     device: str = Field(pattern=r"^/dev/.+")
-    """The device; /dev/v4l/by-id/NAME stays the same when cameras are plugged in another order."""
+    """Device file; /dev/v4l/by-id/NAME does not change if cameras are plugged in in another order."""
     frame_size: Annotated[list[Pixels], Field(min_length=2, max_length=2)] | None = None
-    """Width and height that it is asked for; what it has where not given."""
+    """Width and height requested from the camera [pixels]; absent: its present setting."""
     frame_rate: float | None = Field(default=None, gt=0, le=240)
-    """Pictures per second that it is asked for [Hz]."""
+    """Image rate requested from the camera [Hz]."""
     pixel_format: str | None = Field(default=None, pattern=r"^[a-z0-9_]+$")
-    """What it is asked for, as FFmpeg names it: "mjpeg", "yuyv422"."""
+    """Pixel format requested from the camera, by its FFmpeg name, such as "mjpeg" or "yuyv422"."""
     stamps: Literal["stream", "arrival"] = "stream"
-    """When a picture was taken: as the driver says, mapped to our clock, or when it arrived."""
+    """Capture time of an image: "stream" uses the time stamps of the driver, mapped to this machine's clock; "arrival"
+    uses the time of arrival."""
 
 
 def address(config: Config) -> Address:

@@ -24,31 +24,32 @@ Column = Literal["qvel", "effort", "eef", "eef_action"]
 
 
 class CollectionSettings(Settings):
-    """Collecting demonstrations: a person drives the robot, and what must be recorded of it."""
+    """Collection of demonstrations: how a person drives the robot, and which data must be recorded."""
 
     source: Literal["relay", "node"]
-    """"relay": the leader's joints become commands through our own safety; "node": the robot's node reads a leader of
-    its own and drives, and the action that it reports is recorded."""
+    """"relay": the station turns the leader's joints into commands and applies its own safety checks; "node": the
+    robot's node reads its own leader and drives the robot, and the action that it reports is recorded."""
     leader: LeaderConfig | None = None
-    """Where the leader of "relay" is."""
+    """Connection to the leader; required with source = "relay", an error with source = "node"."""
     mode: Literal["absolute", "relative"] = "absolute"
-    """"absolute": the robot goes where the leader is; "relative": by as much as it moved since the start."""
+    """"absolute": the robot moves to the leader's joints; "relative": it moves by as much as the leader has moved since
+    the start. Only "absolute" with source = "node"."""
     max_age_s: float = Field(default=0.3, gt=0, le=2)
-    """Silence of the leader of "relay" after which the robot holds [s]."""
+    """Silence of the leader after which the robot holds, with source = "relay" [s]."""
     dataset: str = Field(default="demonstrations", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")
-    """Name of the dataset that the episodes are meant for."""
+    """Name of the dataset for which the episodes are recorded."""
     streams: list[Measured] = Field(default_factory=list)
-    """What the robot must measure beside its joints; an episode does not begin without."""
+    """Measurements besides joints that the robot must provide; an episode does not begin without them."""
     columns: list[Column] | None = None
-    """Which of these are recorded beside joints and actions; all that there are where it is not given."""
+    """Data recorded besides joints and actions, at least those of `streams`; absent: all that are available."""
     cameras: list[str] | None = Field(default=None, min_length=1)
-    """Observation keys of the cameras that are recorded; all of the station where it is not given."""
+    """Observation keys of the cameras that are recorded; absent: all cameras of the station."""
     primary_camera: str | None = None
-    """The camera that stands for the episode where one picture must; the first one where it is not given."""
+    """Camera that represents the episode if only one image is shown; absent: the first recorded camera."""
     max_skew_s: Annotated[float, Field(gt=0, le=5)] = 0.1
-    """How far apart in time the streams of one row may be before the row is flagged [s]."""
+    """Largest difference between the times of the streams of one row [s]; beyond it the row is flagged."""
     min_length_s: float = Field(default=1.0, ge=0)
-    """An episode that is shorter is said to be too short [s]."""
+    """Duration below which an episode is reported as too short [s]."""
 
     @model_validator(mode="after")
     def _fit_the_source(self) -> CollectionSettings:

@@ -72,126 +72,127 @@ class ControlSettings(Settings):
     """The control loop."""
 
     rate: float | None = Field(default=None, gt=0, le=1000)
-    """Ticks per second [Hz]; the robot's own rate where it is not given."""
+    """Control rate: ticks per second [Hz]; absent: the robot's own rate."""
     realtime: Literal["auto", "off"] = "auto"
-    """"auto" asks for SCHED_FIFO and locked memory and says what it got; "off" does not ask. Reception and guard
-    likewise, one priority below."""
+    """"auto" requests SCHED_FIFO and locked memory, and reports what was granted; "off" requests neither. Reception and
+    guard do the same, one priority below."""
     realtime_priority: int = Field(default=20, ge=1, le=99)
-    """Priority within SCHED_FIFO."""
+    """SCHED_FIFO priority of control, with realtime = "auto"."""
     heartbeat_timeout_s: float = Field(default=1.0, gt=0)
     """Silence of control, guard or reception after which the robot is held [s]."""
     coordinator_timeout_s: float = Field(default=3.0, gt=0)
-    """Silence of the coordinator after which control holds, and the recorder ends its episode [s]: it decides what
-    comes next and stops nothing, so that a busy machine may keep it longer."""
+    """Silence of the coordinator after which control holds and the recorder ends its episode [s]. The coordinator
+    decides what comes next and stops nothing, so that a busy machine may delay it for longer."""
     orphan_hold_s: float = Field(default=5.0, ge=0, le=8)
-    """How long control goes on holding after its supervisor has died [s]."""
+    """Time for which control continues to hold the robot after its supervisor has died [s]."""
     starvation_hold_s: float = Field(default=1.0, gt=0)
-    """Time without any planned action after which `running` becomes `holding` [s]."""
+    """Time without any planned action after which the state changes from `running` to `holding` [s]."""
 
 
 class SetupSettings(Settings):
-    """A set-up: homing, the first observation, warming up the policy."""
+    """Set-up: homing, first observation, and warm-up of the policy."""
 
     home: bool = True
-    """Drive to the pose before the policy is warmed up; skipped where the transport moves no robot."""
+    """Whether the robot is driven to `pose` before the policy is warmed up; skipped if the transport moves no robot."""
     pose: str = "home"
-    """Named pose of the robot to home to."""
+    """Named pose of the robot for homing."""
     warmup_chunks: int = Field(default=2, ge=1)
-    """Inferences before the first run; the first compiles the model on many servers."""
+    """Number of inferences before the first run; on many servers the first one compiles the model."""
     observation_timeout_s: float = Field(default=10.0, gt=0)
-    """How long to wait for a complete first observation [s]."""
+    """Longest wait for a complete first observation [s]."""
 
 
 class RunSettings(Settings):
-    """A run."""
+    """Duration and mode of a run, unless the command that starts it names others."""
 
     duration_s: float | None = Field(default=None, gt=0)
-    """Time after which a run ends by itself [s]; until it is stopped where it is not given."""
+    """Time after which a run ends by itself [s]; absent: it continues until it is stopped."""
     mode: PolicyMode = "continuous"
-    """"continuous": the policy drives the robot until the run ends; "step": one chunk per command; "preview":
-    each chunk is shown, then committed or cancelled; "sim": actions go to the 3D scene alone; "manual": a person
-    moves it."""
+    """"continuous": the policy drives the robot until the run ends; "step": one chunk per command; "preview": each
+    chunk is shown, then committed or cancelled; "sim": actions go only to the 3D scene; "manual": a person moves the
+    robot."""
     sim_state: Literal["live", "simulated"] = "simulated"
-    """What the policy is shown as the robot's state in "sim": the robot's own, or that of the simulated one."""
+    """State that the policy receives in mode "sim": "live": the real robot's; "simulated": the simulated robot's."""
 
 
 FaultResponse = Literal["hold", "slow", "stop"]
 
 
 class FaultSettings(Settings):
-    """Answers to a failing policy: "hold" at once; "slow": hold after what is planned; "stop": end the run.
+    """Responses to a failing policy: "hold": at once; "slow": hold after the planned actions; "stop": end the run.
 
-    "slow" goes on with what is planned, then decelerates, holds, and goes on by itself if the policy is
-    back in time.
+    "slow" executes the planned actions, then decelerates and holds, and resumes by itself if the policy is back in
+    time.
     """
 
     starvation: FaultResponse = "slow"
-    """Nothing is planned for a step; after control.starvation_hold_s "slow" holds."""
+    """Response if nothing is planned for a step; "slow" holds after control.starvation_hold_s."""
     policy_error: FaultResponse = "hold"
-    """The policy answered with an error, or with something unusable."""
+    """Response if the policy returns an error or unusable data."""
     policy_lost: FaultResponse = "slow"
-    """The policy did not answer in time, or its connection was lost; it is tried again with back-off."""
+    """Response if the policy does not answer in time or its connection is lost; connecting is retried with back-off."""
     patience_s: float = Field(default=3.0, gt=0)
-    """Longest time without an answer before "slow" holds, also for a strategy that waits [s]."""
+    """Longest time without a response of the policy before "slow" holds [s], also for a strategy that waits."""
 
 
 class RecordingChoice(RecordingSettings):
     """Recording of every run."""
 
     enabled: bool = True
-    """Whether runs are recorded; one that is not leaves nothing behind, and a trial is refused."""
+    """Whether runs are recorded; a run without recording leaves no data, and trials are refused."""
     fps: float | None = Field(default=None, gt=0)
-    """Rows per second of the dataset grid; the control rate where it is not given."""
+    """Rows per second of the dataset grid [Hz]; absent: the control rate."""
     kind: Literal["rollout", "demonstration"] = "rollout"
-    """What the episodes are, for the manifest and the dataset."""
+    """Kind of the episodes, stored in the manifest and the dataset."""
     export: bool = True
-    """Whether the streams of every run are exported as one table when it is closed."""
+    """Whether the streams of every run are exported as one table when its recording is closed."""
     on_failure: Literal["hold", "continue"] = "hold"
-    """What a run does when its recording fails: an unrecorded run is no evidence. Trials and demonstrations never begin
-    without."""
+    """Response of a run to a failure of its recording; "hold" because an unrecorded run is no evidence. Trials and
+    demonstrations never begin without recording."""
 
 
 class PublishSettings(Settings):
-    """The LeRobot dataset that finished episodes go to."""
+    """LeRobot dataset to which finished episodes are published."""
 
     dataset: str | None = None
-    """Folder of the dataset, relative to the data folder; nothing is published where it is not given."""
+    """Folder of the dataset, relative to the data folder; absent: nothing is published."""
     version: Literal["v2.1", "v3.0"] | None = None
-    """Version of the format of a new dataset, v2.1 where it is not given; one that is there keeps its own."""
+    """Format version of a new dataset; absent: v2.1. An existing dataset keeps its version."""
 
 
 class PublicationSettings(Settings):
-    """Commands to the robot: joints, or poses beside them where the transport takes such a command."""
+    """Commands to the robot: joints, and also end-effector poses if the transport accepts them."""
 
     space: Space = "joint"
-    """"eef" publishes the poses that the safe joint command amounts to along with the joints."""
+    """"eef" publishes the poses that result from the safe joint command, in addition to the joints."""
     pose: PoseFormat = PoseFormat()
-    """How these poses are written."""
+    """Format of these poses."""
 
 
 class LeaseSettings(Settings):
-    """The right to command, and how long it lasts."""
+    """The right to command: its duration, and the response to its loss."""
 
     ttl_s: float = Field(default=5.0, gt=0)
     """Time after which a lease that is not renewed ends and the robot holds [s]."""
     lost: Literal["hold", "finish"] = "hold"
-    """What a run does whose lease ends because nothing is heard of its holder: "hold"; or "finish": a scored run with a
-    time limit goes on to its end, other runs hold. "finish" needs a [panel], and holds where that is not served."""
+    """Response of a run if the lease ends because its holder is silent. "hold": the run holds; "finish": a scored run
+    with a time limit continues to its end, other runs hold. "finish" needs a [panel], and holds if the panel is not
+    served."""
 
 
 class PanelSettings(Settings):
-    """The station's own panel, a page on its own machine for whoever stands beside the robot."""
+    """The station's own panel: a web page on its own machine for the person next to the robot."""
 
     host: str = "127.0.0.1"
-    """Address at which it listens; beyond this machine only with a certificate."""
+    """IP address at which the panel listens; an address beyond this machine needs a certificate."""
     port: int = Field(default=8480, ge=0, le=65535)
-    """Port at which it listens; 0 for a free one, which is left in the station's folder."""
+    """TCP port at which the panel listens; 0: a free port, which is recorded in the station's folder."""
     names: list[Annotated[str, Field(pattern=r"^[A-Za-z0-9.-]{1,253}$")]] = Field(default_factory=list)
-    """Names by which browsers reach it, beside localhost and addresses in numbers; others are refused."""
+    """Host names by which browsers reach the panel, besides localhost and numeric addresses; others are refused."""
     certificate: str | None = None
-    """File of its certificate, with the chain, as PEM."""
+    """Path of the panel's certificate with its chain, as PEM; needs `key`."""
     key: str | None = None
-    """File of the certificate's key, as PEM."""
+    """Path of the certificate's private key, as PEM; needs `certificate`."""
 
     @model_validator(mode="after")
     def _is_encrypted_beyond_this_machine(self) -> PanelSettings:
@@ -212,45 +213,45 @@ class PanelSettings(Settings):
 
 
 class BusSettings(Settings):
-    """Camera previews that the station publishes for clients that watch."""
+    """Camera previews that the station publishes for its clients."""
 
     preview_rate: float = Field(default=15.0, ge=0, le=60)
-    """JPEG previews per second and camera [Hz]; 0 for none."""
+    """JPEG previews per second and camera [Hz]; 0: no previews."""
     preview_height: int = Field(default=240, ge=60, le=1080)
     """Height of a preview [pixels]."""
 
 
 class ControlChannelSettings(Settings):
-    """JSON commands over ZMQ for existing scripts, on this machine alone: docs/control-channel.md."""
+    """JSON commands over ZMQ for existing scripts, only from this machine: docs/control-channel.md."""
 
     enabled: bool = False
-    """Whether the station listens for scripts."""
+    """Whether the station accepts connections from scripts."""
     port: int = Field(default=5757, ge=0, le=65535)
-    """Where, on 127.0.0.1; 0 for a free port, which is left in the station's folder."""
+    """TCP port on 127.0.0.1; 0: a free port, which is recorded in the station's folder."""
     operator: str = Field(default="", max_length=100)
-    """Who the scripts command for, in lease and events; user and machine where it is not given."""
+    """Name of the scripts' operator in the lease and in events; empty: user and machine."""
     silence_s: float = Field(default=10.0, gt=0, le=3600)
     """Silence of a script after which its lease ends and the robot holds [s]."""
     scripts: Literal["apart", "together"] = "together"
-    """"together": all scripts that give themselves no name are one holder, also with a connection for every message;
-    "apart": each connection is one."""
+    """"together": all scripts that give no name are one lease holder, even with a connection for every message;
+    "apart": each connection is a holder of its own."""
 
 
 class SecuritySettings(Settings):
-    """Variables and files of the station that a table from the web, as a checkpoint's, may name."""
+    """Environment variables and files of the station that a table from the web, such as a checkpoint's, may name."""
 
     variables: list[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*\*?$")]] = Field(
         default=["EVA_POLICY_*"]
     )
-    """Environment variables with keys of policy servers; * at the end stands for anything. Those that [policy] itself
-    names are allowed in any case."""
+    """Environment variables with keys of policy servers; a trailing * matches any suffix. Variables named in the
+    deployment's own [policy] are always allowed."""
     files: list[Annotated[str, Field(pattern=r"^(/|~/)")]] = Field(default_factory=list)
-    """Keys and configurations of ssh, and recordings, or folders of them, outside of ssh/ in the station's folder and
-    of the data folder. Those that [policy] itself names are allowed in any case."""
+    """Paths of ssh keys, ssh configurations and recordings, or of folders of them, besides the ssh/ folder in the
+    station's folder and the data folder. Files named in the deployment's own [policy] are always allowed."""
 
 
 class LockstepSettings(Settings):
-    """One process on a virtual clock."""
+    """Operation of the station as one process on a virtual clock."""
 
     delay_ticks: int = Field(default=0, ge=0)
     """Ticks between an observation and the arrival of its chunk."""
@@ -260,46 +261,46 @@ class GripperSettings(Settings):
     """Settings of a deployment for one gripper that differ from the robot's description."""
 
     binary: bool | None = None
-    """Whether it knows only open and close."""
+    """Whether the gripper can only open and close."""
     threshold: float | None = None
-    """Where a binary gripper switches, in its own unit."""
+    """Value at which a binary gripper switches, in the gripper's unit."""
     hysteresis: float | None = Field(default=None, ge=0, lt=1)
-    """Around the threshold, the part of its travel within which a binary gripper stays as it was."""
+    """Share of the travel, around the threshold, within which a binary gripper keeps its state."""
     open: float | None = None
-    """Its number when open."""
+    """Value when open, in the gripper's unit."""
     close: float | None = None
-    """Its number when closed."""
+    """Value when closed, in the gripper's unit."""
 
 
 class Deployment(Settings):
-    """One station: a robot, a way to it, a policy, and how they are brought together."""
+    """One station: its robot, transport and policy, and how they work together."""
 
     GONE: ClassVar[Mapping[str, str]] = {f"bus.{key}": _NO_PORTS for key in REMOVED_BUS_KEYS}
-    """Keys that there were, and what is in their place."""
+    """Removed keys, each with a message about its replacement."""
 
     station: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,62}$")
-    """Name of the station, and of its folder in the data folder."""
+    """Name of the station and of its folder in the data folder."""
     robot: str
-    """Name of a robot that comes with the program or lies in a folder of $EVA_ROBOTS, or a path to a robot's folder."""
+    """Name of a robot shipped with the program or found in a folder of $EVA_ROBOTS, or path of a robot's folder."""
     groups: list[str] | None = None
-    """Groups of its joints that are part of this station; all that are not optional where they are not given."""
+    """Joint groups of the robot that are part of this station; absent: all that are not optional."""
     grippers: dict[str, GripperSettings] = Field(default_factory=dict)
-    """By the name of the group, what this station's grippers have otherwise."""
+    """Settings of this station's grippers that differ from the robot's description, by group name."""
     task: str = ""
-    """The instruction given to the policy."""
+    """Instruction for the policy."""
     tasks: list[str] = Field(default_factory=list)
-    """Further instructions, offered to choose from."""
+    """Further instructions from which an operator can choose."""
     operator: str = ""
-    """Who runs it, for the manifests."""
+    """Name of the operator, for the manifests."""
     data_dir: str | None = None
-    """Where episodes and datasets lie; $EVA_DATA_DIR or ./data where it is not given."""
+    """Folder of episodes and datasets; absent: $EVA_DATA_DIR, else ./data."""
     transport: TransportConfig
     cameras: dict[str, CameraConfig] = Field(default_factory=dict)
-    """By the camera's key in the robot's description, those that do not come from the transport."""
+    """Cameras whose images do not come from the transport, by their key in the robot's description."""
     policy: PolicyConfig = Field(default_factory=lambda: variants("runtime.policies")["none"].Config())
-    """Who is asked for actions; may be left out where there is a [collection]."""
+    """Source of the actions; optional with a [collection]."""
     collection: CollectionSettings | None = None
-    """Collecting demonstrations; a station without it collects none."""
+    """Collection of demonstrations; absent: the station collects none."""
     kinematics: KinematicsConfig = Field(
         default_factory=lambda: variants("runtime.kinematics")["compiled"].Config()
     )
@@ -314,7 +315,7 @@ class Deployment(Settings):
     publication: PublicationSettings = PublicationSettings()
     lease: LeaseSettings = LeaseSettings()
     panel: PanelSettings | None = None
-    """The station's own panel; a station without it has none."""
+    """The station's own panel; absent: the station has none."""
     bus: BusSettings = BusSettings()
     control_channel: ControlChannelSettings = ControlChannelSettings()
     security: SecuritySettings = SecuritySettings()

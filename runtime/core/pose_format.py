@@ -16,23 +16,26 @@ OrientationName = Literal["wxyz", "xyzw", "euler", "rotation_vector", "6d"]
 
 
 class PoseFormat(Settings):
-    """Format of the pose of an end effector: per arm x, y, z [m], an orientation, and its gripper."""
+    """Format of an end effector's pose: per arm x, y, z [m], an orientation, and the gripper's value."""
 
     orientation: OrientationName = "wxyz"
-    """Quaternion with the scalar first or last, Euler angles, axis times angle, or six numbers of the matrix."""
+    """"wxyz", "xyzw": quaternion with the scalar first or last; "euler": Euler angles; "rotation_vector": axis times
+    angle; "6d": six numbers of the rotation matrix."""
     euler_order: Annotated[str, Field(pattern=_ORDERS)] = "xyz"
-    """Axes of Euler angles: "xyz" turns about fixed axes one after the other (extrinsic), "XYZ" about axes that
-    turn along (intrinsic)."""
+    """Axes of Euler angles; lower case, as in "xyz", for successive rotations about fixed axes (extrinsic), upper case,
+    as in "XYZ", for rotations about moving axes (intrinsic)."""
     degrees: bool = False
-    """Angles of Euler angles and rotation vectors in degrees; else radians."""
+    """Whether Euler angles and rotation vectors are in degrees instead of radians."""
     sixd: Literal["columns", "rows"] = "columns"
-    """Of the rotation matrix, the first two columns one after the other, or the first two rows."""
+    """Numbers of "6d": the first two columns of the rotation matrix, one after the other, or its first two rows."""
     gripper: bool = True
-    """Whether the gripper's number follows each pose (0 for an arm without one); else grippers stay as commanded."""
+    """Whether the gripper's value follows each pose (0 for an arm without gripper); if not, grippers stay as
+    commanded."""
     frame: str = ""
-    """What poses are expressed in: "" for each arm's own frame, the robot's mount frame, or a link of its URDF."""
+    """Frame in which poses are expressed: "" for each arm's own frame, the robot's mount frame, or a link of its
+    URDF."""
     groups: list[str] = Field(default_factory=list)
-    """Groups without end effector (a head, a torso) whose joints follow the poses; all others are held."""
+    """Groups without end effector (a head, a torso) whose joints are appended to the poses; all others are held."""
 
     @model_validator(mode="after")
     def _mean_something(self) -> PoseFormat:

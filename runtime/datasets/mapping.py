@@ -10,12 +10,12 @@ from runtime.core.settings import Settings
 
 
 class ColumnMapping(Settings):
-    """Column names of one dataset. An empty string says that the dataset has no such column."""
+    """Column names of one dataset; an empty string means that the dataset does not have the column."""
 
     state: str = "observation.state"
     """Measured joint positions, [D] in group order."""
     eef: str | None = None
-    """Measured end-effector poses, 8 per arm."""
+    """Measured end-effector poses, 8 numbers per arm."""
     velocity: str | None = None
     """Measured joint velocities, [D]."""
     effort: str | None = None
@@ -23,7 +23,7 @@ class ColumnMapping(Settings):
     action: str | None = "action"
     """Commanded joint positions, [D]."""
     action_eef: str | None = None
-    """Commanded end-effector poses, 8 per arm."""
+    """Commanded end-effector poses, 8 numbers per arm."""
     videos: dict[str, str] | None = None
     """Video key by camera key; absent: `observation.images.<camera key>` for every camera."""
     capture_time: dict[str, str] = Field(default_factory=dict)

@@ -32,25 +32,25 @@ Label = Annotated[str, Field(max_length=200)]
 
 
 class Nothing(Settings):
-    """For commands that are one word."""
+    """Empty arguments, for commands without parameters."""
 
 
 class Checkpoint(Settings):
-    """Which checkpoint is behind the policy, as the one who asks knows it."""
+    """Identity of the policy's checkpoint, as known to the requester."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | int
     name: Label = ""
 
 
 class Positions(Settings):
-    """Positions wanted on the bench, in the world: x, y [m], yaw [degrees]; what is absent lies anywhere."""
+    """Requested positions on the bench in the world frame: x, y [m], yaw [degrees]; absent: anywhere."""
 
     block: list[float] | None = Field(default=None, min_length=3, max_length=3)
     plate: list[float] | None = Field(default=None, min_length=2, max_length=2)
 
 
 class BenchRequest(Settings):
-    """Layout wanted of a simulated bench; `id` names this reset, one is made up where none is given."""
+    """Requested layout of a simulated bench; `id` names this reset, and is generated if absent."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     seed: int = Field(ge=0, le=_HIGHEST_SEED)
@@ -58,19 +58,19 @@ class BenchRequest(Settings):
 
 
 class LeastTimes(Settings):
-    """Least durations of the stages of a set-up that wait for the policy [s], whichever it is."""
+    """Minimum durations of the set-up stages that wait for the policy [s], whichever policy it is."""
 
     connect_s: float = Field(default=0.0, ge=0, le=3600)
     warm_up_s: float = Field(default=0.0, ge=0, le=3600)
 
 
 class SetUpRequest(Settings):
-    """`setup`: what differs from the deployment this time; what is absent is the deployment's own.
+    """`setup`: differences from the deployment for this set-up; absent keys use the deployment's.
 
-    `policy` is merged into the deployment's own [policy] as a file over what it extends: a table of another
-    `kind` replaces it whole. `checkpoint` is only written down. `collect`: a person is to drive the robot, as the
-    deployment's [collection] says; absent: where the deployment has no policy. `least`: so that nobody can tell two
-    policies by how long they take.
+    `policy` is merged into the deployment's [policy] as a file is into the file that it extends: a table of another
+    `kind` replaces it completely. `checkpoint` is only recorded. `collect`: a person drives the robot, according to the
+    deployment's [collection]; absent: only if the deployment has no policy. `least` prevents that two policies can be
+    told apart by their durations.
     """
 
     policy: Map | None = None
@@ -89,10 +89,10 @@ class SetUpRequest(Settings):
 
 
 class PreflightRequest(Settings):
-    """`preflight`: which policy is asked without the robot; what is absent is the deployment's own.
+    """`preflight`: policy to query without the robot; absent keys use the deployment's.
 
-    `policy` and `strategy` as in a set-up; `id` names the report; it ends after `deadline_s` [s] at the latest, without
-    it after what the policy's own deadlines come to.
+    `policy` and `strategy` are as in a set-up; `id` names the report. The preflight ends after `deadline_s` [s] at the
+    latest; absent: after the time that the policy's own deadlines amount to.
     """
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
@@ -116,29 +116,29 @@ class PreflightRequest(Settings):
 
 
 class PreflightReportRequest(Settings):
-    """`preflight_report`: how the preflight of that `id` went."""
+    """`preflight_report`: the report of the preflight with that `id`."""
 
     id: Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class PolicyServerRequest(Settings):
-    """`policy_server`: which server the policy in force has, or the deployment's with this `policy` on top."""
+    """`policy_server`: server of the policy in force, or of the deployment's merged with `policy`."""
 
     policy: Map | None = None
 
 
 class CollectSession(Settings):
-    """The session that a collected episode is one of, and the dataset that it is meant for."""
+    """Session of a collected episode, and the dataset for which it is recorded."""
 
     uuid: Annotated[str, Field(pattern=r"^[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}$")]
     dataset: Annotated[str, Field(max_length=200)] = ""
 
 
 class RunRequest(Settings):
-    """`run`: `trial` is the asker's own and goes into the manifest as it is; `duration_s` ends this run [s].
+    """`run`: `trial` is the requester's and is copied to the manifest unchanged; `duration_s` ends this run [s].
 
-    Where operator, duration, mode or sim_state are absent, the deployment's own hold. `task` and `session` are for the
-    mode collect, which is that of a station set up to collect.
+    If operator, duration_s, mode or sim_state are absent, the deployment's apply. `task` and `session` are for the mode
+    "collect", which is that of a station set up to collect.
     """
 
     trial: Map | None = None
@@ -151,13 +151,13 @@ class RunRequest(Settings):
 
 
 class DiscardRequest(Settings):
-    """`discard`: mark an episode as one that is never published; absent: the open one, which ends, or the newest."""
+    """`discard`: mark an episode as never to be published; absent: the open one, which ends, or the newest."""
 
     episode: Annotated[str, Field(max_length=100)] | None = None
 
 
 class LabelRequest(Settings):
-    """`label`: how an episode went; absent: the open one, or the newest."""
+    """`label`: outcome of an episode; without `episode`: of the open one, or the newest."""
 
     episode: Annotated[str, Field(max_length=100)] | None = None
     result: Result
@@ -165,9 +165,9 @@ class LabelRequest(Settings):
 
 
 class TuneRequest(Settings):
-    """`tune`: another strategy or other parameters of it, another instruction; what is absent stays as it is.
+    """`tune`: another strategy, other parameters, or another instruction; absent keys do not change.
 
-    `strategy` is merged into the one in force, whose parameters another `kind` keeps.
+    `strategy` is merged into the one in force; its parameters are kept if the `kind` changes.
     """
 
     strategy: Map | None = None
@@ -178,9 +178,9 @@ Triple = Annotated[list[Annotated[float, Field(ge=-10, le=10)]], Field(min_lengt
 
 
 class Jog(Settings):
-    """A step of one arm's end effector: `translation` [m], `rotation` roll, pitch, yaw [rad] about fixed axes.
+    """Step of one arm's end effector: `translation` [m], `rotation` as roll, pitch, yaw [rad] about fixed axes.
 
-    Both along the axes of the arm's "base" frame, or of the end effector itself ("tool").
+    Both are along the axes of the arm's frame ("base"), or of the end effector itself ("tool").
     """
 
     arm: str
@@ -190,9 +190,9 @@ class Jog(Settings):
 
 
 class AimRequest(Settings):
-    """`aim`: where the robot would go, moving nothing.
+    """`aim`: preview of a motion; nothing moves.
 
-    `joints` [D] are a target, or what a jog starts from (the commanded ones where absent, or null within); `pose` is a
+    `joints` [D] are the target, or the start of a jog (the commanded joints if absent, or for null values); `pose` is a
     named pose.
     """
 
@@ -202,9 +202,9 @@ class AimRequest(Settings):
 
 
 class MoveRequest(Settings):
-    """`move`: go to `joints` [D] or to a named `pose` on a limited path; a joint that is null stays where it is.
+    """`move`: move to `joints` [D] or to a named `pose` on a limited path; null joints do not move.
 
-    `speed` is the part of the speed of motions of ours that may be used.
+    `speed` is the share of the speed of the station's own motions that may be used.
     """
 
     joints: list[float | None] | None = None
@@ -213,7 +213,7 @@ class MoveRequest(Settings):
 
 
 class GripperRequest(Settings):
-    """`gripper`: open or close one; lock one where it is, or give it back. `arm` absent: all of them."""
+    """`gripper`: open, close, lock or unlock a gripper; without `arm`: all grippers."""
 
     arm: str | None = None
     action: Literal["open", "close", "lock", "unlock"]

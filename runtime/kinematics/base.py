@@ -34,25 +34,25 @@ class IkFlag(IntFlag):
 
 
 class KinematicsSettings(Settings):
-    """Settings that every backend has."""
+    """Settings common to all backends."""
 
     position_weight: Positive = 50.0
-    """Cost of a metre beside the pose."""
+    """Cost per metre of position error."""
     rotation_weight: Positive = 10.0
-    """Cost of a radian beside it."""
+    """Cost per radian of orientation error."""
     rest_weight: Annotated[float, Field(ge=0)] = 0.01
-    """Cost of a radian away from where the frame before leads: holds what the pose leaves open. At 1, reachable
-    poses are missed by millimetres."""
+    """Cost per radian of deviation from the joints that the previous frame leads to; it determines the joints that the
+    pose leaves undetermined. At 1, reachable poses are missed by millimetres."""
     position_tolerance: Positive = 1e-3
-    """Metres within which a target counts as reached."""
+    """Position error up to which a target counts as reached [m]."""
     rotation_tolerance: Positive = math.radians(0.5)
-    """Radians within which a target counts as reached."""
+    """Orientation error up to which a target counts as reached [rad]."""
     max_iterations: Annotated[int, Field(ge=1)] = 60
-    """Per frame and arm."""
+    """Largest number of solver iterations per frame and arm."""
     velocity_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Part of the joint velocities that solved frames may use."""
+    """Share of the joint velocity limits that solved frames may use."""
     singular_below: Annotated[float, Field(ge=0)] = 0.02
-    """Smallest singular value of the Jacobian (m and rad alike) under which a frame counts as near singular."""
+    """Smallest singular value of the Jacobian (m and rad alike) below which a frame counts as near singular."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,12 +40,12 @@ _log = logging.getLogger(__name__)
 
 
 class Config(KinematicsSettings):
-    """Damped least squares in loops that numba compiles: microseconds per frame and arm."""
+    """Damped least squares in loops compiled by numba: microseconds per frame and arm."""
 
     kind: Literal["compiled"] = "compiled"
     home_rate: Annotated[float, Field(ge=0)] = 4.0
-    """Of the way home that what a pose leaves open (arms with more than six joints) goes per second, no joint faster
-    than at a fifth of its velocity; limits push at the same rate. 0: it stays as it is."""
+    """Share of the way home per second by which redundant degrees of freedom (arms with more than six joints) move, no
+    joint faster than a fifth of its velocity limit; joint limits repel at the same rate. 0: they stay as they are."""
 
 
 def build(config: Config, robot: Robot) -> CompiledKinematics:

@@ -27,9 +27,10 @@ _BOX_WEIGHT = 100.0  # per rad beyond the box; the remaining excess is clipped
 
 
 class Config(KinematicsSettings):
-    """PyRoki's least squares in JAX: for those who have it, and to compare with.
+    """PyRoki's least squares in JAX, for users who have it installed and for comparison.
 
-    What poses leave open stays as it is: nothing leads home, and no missed chunk is planned again.
+    Redundant degrees of freedom stay as they are: nothing moves them towards home, and a missed chunk is not planned
+    again.
     """
 
     kind: Literal["pyroki"] = "pyroki"

@@ -33,33 +33,34 @@ class ActionFormatSettings(Settings):
     """Space, format, mode and rate of the rows of an answer."""
 
     action_space: Space = "joint"
-    """What the rows of the answer are: joint targets, or poses."""
+    """Content of the rows of a response: joint targets, or end-effector poses ("eef")."""
     action_pose: PoseFormat = PoseFormat()
-    """How poses are written in the answer, where action_space is "eef"."""
+    """Format of the poses in a response, with action_space = "eef"."""
     action_mode: ActionMode = "absolute"
-    """What their numbers are: targets; "relative" to the observation; or "delta", each to the row before.
+    """Meaning of the values of a row: "absolute" targets, "relative" to the observation, or a "delta" to the previous
+    row.
 
-    Grippers are absolute in every mode. A server's own metadata key action_mode names the space, not this."""
+    Grippers are absolute in every mode. A server's own metadata key action_mode names the space, not this mode."""
     relative_frame: RelativeFrame = "base"
-    """Axes of relative poses: those of the frame that poses are declared in, or the tool as observed."""
+    """Axes of relative poses: "base": the frame in which poses are declared; "tool": the end effector as observed."""
     action_rate: Rate | None = None
-    """Rows per second of the answer [Hz]; the control rate where it is not given."""
+    """Rows per second of a response [Hz]; absent: the control rate."""
 
 
 class ActionLayoutSettings(ActionFormatSettings):
-    """Meaning of the numbers of state and rows, and form of pictures."""
+    """Meaning of the values of the state and of the rows, and format of the images."""
 
     observation_space: Space = "joint"
-    """What the state is: joints, or poses."""
+    """Content of the state: joints, or end-effector poses ("eef")."""
     observation_pose: PoseFormat = PoseFormat()
-    """How poses are written in the state, where observation_space is "eef"."""
+    """Format of the poses in the state, with observation_space = "eef"."""
     observation_eef: Literal["measured", "fk"] = "measured"
-    """Poses that the policy is shown and that its relative poses are relative to: as the robot measures them, where
-    it does; or as its joints have them in any case."""
+    """Source of the poses in the state and of the reference of relative poses: "measured" by the robot if it measures
+    them, else computed from the joints; "fk": always computed from the joints."""
     image_size: Size | None = None
-    """Height and width that pictures are made to; as they are where it is not given."""
+    """Height and width to which images are resized [pixels]; absent: they are not resized."""
     resize: Resize = "pad"
-    """With image_size: "pad" keeps the aspect on black, "stretch" does not."""
+    """With image_size: "pad" preserves the aspect ratio and fills with black, "stretch" does not preserve it."""
 
     @property
     def uses_poses(self) -> bool:

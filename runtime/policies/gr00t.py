@@ -60,17 +60,17 @@ class Config(RequestSettings):
     url: Annotated[str, Field(pattern=r"^tcp://[^/:]+:\d{1,5}$|^tcp://\[[0-9a-fA-F:]+\]:\d{1,5}$")] = (
         "tcp://127.0.0.1:5555"
     )
-    """Where the server listens."""
+    """Address of the server: tcp://HOST:PORT."""
     tunnel: TunnelSettings | None = None
-    """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
+    """SSH tunnel to the server; `url` is then resolved at the tunnel's far end."""
     api_token_env: Variable | None = None
-    """Environment variable with the server's API token; the token itself would end up in every manifest."""
+    """Environment variable with the server's API token; the token itself would be copied to every manifest."""
     connect_deadline: Positive = 5.0
-    """For the connection and the server's modality configuration [s]; for a reset too."""
+    """Longest time for connecting and for the server's modality configuration, and for a reset [s]."""
     first_inference_deadline: Positive = 120.0
-    """For the first answer after set-up [s]: the server may have to compile its model."""
+    """Longest time for the first response after set-up [s]; the server may have to compile its model."""
     inference_deadline: Positive = 2.0
-    """For every later answer [s], also of a server that came back; after it the connection is dropped."""
+    """Longest time for every later response, also after a reconnection [s]; beyond it the connection is dropped."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Gr00tPolicy:

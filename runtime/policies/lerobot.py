@@ -45,28 +45,30 @@ _PAUSES = (0.05, 0.5)  # shortest and longest pause after an empty response [s]
 
 
 class Config(RequestSettings):
-    """LeRobot's policy server, which loads the checkpoint that it is told to."""
+    """LeRobot's policy server, which loads the checkpoint that the station names."""
 
     kind: Literal["lerobot"] = "lerobot"
     url: Annotated[str, Field(pattern=r"^grpc://[^/:]+:\d{1,5}$|^grpc://\[[0-9a-fA-F:]+\]:\d{1,5}$")] = (
         "grpc://127.0.0.1:8080"
     )
-    """Where the server listens; beyond this machine, or the tunnel's far end, only with insecure_link."""
+    """Address of the server: grpc://HOST:PORT; beyond this machine, or the tunnel's far end, only with
+    insecure_link."""
     tunnel: TunnelSettings | None = None
-    """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
+    """SSH tunnel to the server; `url` is then resolved at the tunnel's far end."""
     accept_pickle: bool = False
-    """Has to be true: a server of this kind runs whatever reaches its port. Ours runs nothing of what it answers."""
+    """Must be true: a server of this kind executes any code that reaches its port. The station executes nothing from
+    its responses."""
     insecure_link: bool = False
-    """Allow a server beyond this machine although anybody on the way can run code on it and move the robot; an SSH
-    tunnel needs no such thing."""
+    """Allow a server beyond this machine, although anyone on the network path can run code on it and move the robot;
+    not needed with an SSH tunnel."""
     connect_deadline: Positive = 5.0
-    """For the connection [s]; for a reset too."""
+    """Longest time for connecting, and for a reset [s]."""
     load_deadline: Positive = 300.0
-    """For the server to load the checkpoint [s], also when it came back without it."""
+    """Longest time for the server to load the checkpoint [s], also after a restart without it."""
     first_inference_deadline: Positive = 120.0
-    """For the first answer after set-up [s]."""
+    """Longest time for the first response after set-up [s]."""
     inference_deadline: Positive = 5.0
-    """For every later answer [s]. The server waits two for an observation that it has missed."""
+    """Longest time for every later response [s]. The server waits two seconds for an observation that it has missed."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> LerobotPolicy:

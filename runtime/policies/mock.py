@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 
 class Config(Settings):
-    """Motion made up on this machine, to try everything but a policy."""
+    """Synthetic motion generated on this machine, for testing everything except a policy."""
 
     kind: Literal["mock"] = "mock"
     amplitude: float = Field(default=0.2, gt=0, le=1.0)
-    """How far a joint goes from where it was first seen [rad]; less where its limit is nearer."""
+    """Distance that each joint moves from its first observed position [rad]; less if its limit is closer."""
     period_s: float = Field(default=6.0, ge=0.5, allow_inf_nan=False)
-    """Time of one way out and back [s]."""
+    """Duration of one motion out and back [s]."""
     horizon: int = Field(default=50, ge=1, le=10_000)
     """Rows per chunk, at the control rate."""
     latency_s: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    """How long an answer takes [s]: a real wait on the clock."""
+    """Duration of each response [s], as a real wait on the clock."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> MockPolicy:

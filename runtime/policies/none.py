@@ -17,7 +17,7 @@ _NONE = "this deployment has no [policy]: it is set up to collect (setup with co
 
 
 class Config(Settings):
-    """No policy; what a deployment with a [collection] has where it names none."""
+    """No policy: the default for a deployment with a [collection]."""
 
     kind: Literal["none"] = "none"
 

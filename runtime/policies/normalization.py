@@ -15,14 +15,14 @@ Numbers = Annotated[list[float], Field(min_length=1)]
 
 
 class Statistics(Settings):
-    """Meaning of -1 and 1, per number of a row: minimum and maximum, or quantiles, of the training data."""
+    """Values that -1 and 1 represent, per number of a row: minimum and maximum, or quantiles, of the training data."""
 
     low: Numbers
-    """What -1 stands for."""
+    """Values that -1 represents."""
     high: Numbers
-    """What 1 stands for."""
+    """Values that 1 represents; above `low` wherever `mask` is true."""
     mask: list[bool] | None = None
-    """Which numbers were normalised at all; those that were not (grippers, mostly) stay as they are."""
+    """Which numbers were normalised; the others (mostly grippers) are left unchanged. Absent: all were."""
 
     @model_validator(mode="after")
     def _fit(self) -> Statistics:

@@ -50,27 +50,29 @@ class Config(ServerSettings, RequestSettings, ActionFormatSettings):
 
     kind: Literal["openpi"] = "openpi"
     gripper: Convention = "robot"
-    """How state and answers count grippers: the robot's own numbers, or "droid": 0 is open and 1 closed."""
+    """Gripper convention in state and responses: "robot": the robot's own values; "droid": 0 is open and 1 is
+    closed."""
     action_scale: Annotated[list[float], Field(min_length=1)] | None = None
-    """What each number of a row is multiplied with, in the order of the row: DROID's joint velocities are shares of
-    0.2 rad per row, so 0.2 for every joint and 1 for the gripper, with action_mode "delta"."""
+    """Factor of each number of a row, in the order of the row. DROID's joint velocities are shares of 0.2 rad per row:
+    0.2 for every joint and 1 for the gripper, with action_mode "delta"."""
     rtc: Literal["none", "prev_action", "openpi_rtc", "kai0", "async_rtc"] = "none"
-    """How the server is told what the robot is committed to: flat keys, the envelope of openpi-rtc and its forks,
-    kai0's flat keys, or the openpi-async-rtc envelope."""
+    """Protocol that sends the committed actions to the server: flat keys ("prev_action"), the envelope of openpi-rtc
+    and its forks, kai0's flat keys, or the openpi-async-rtc envelope ("async_rtc"); "none" sends none."""
     rtc_envelope: EnvelopeKeys = EnvelopeKeys()
-    """With openpi_rtc: what its parts are called, and how many rows the server takes off the chunk before."""
+    """With openpi_rtc: keys of the envelope, and number of rows that the server removes from the previous chunk."""
     rtc_rows: Rows = "aligned"
-    """With openpi_rtc and kai0: "aligned" sends the chunk before so that the server continues from the first row that
-    the robot has not consumed; "whole" from its first row on, as these dialects' own clients do, which is right only
-    where the robot has consumed what the server assumes."""
+    """With openpi_rtc and kai0: "aligned" sends the previous chunk so that the server continues from the first row that
+    the robot has not consumed; "whole" sends it from its first row on, as these dialects' own clients do, which is
+    correct only if the robot has consumed as many rows as the server assumes."""
     rtc_model_rows: Literal["absolute", "relative"] | None = None
-    """What the model's own rows are that an RTC server returns beside its actions: "relative" to the state that it is
-    shown (openpi's delta joint actions) they mean something else at the next observation, and are not continued. Not
-    given, they are taken for absolute, and a preflight says that nobody knows."""
+    """Reference of the model's own rows that an RTC server returns besides its actions. Rows "relative" to the state in
+    the request (openpi's delta joint actions) mean something else at the next observation and are not continued.
+    Absent: they are treated as absolute, and a preflight reports that this is unknown."""
     prefix_attention_schedule: Schedule = "exp"
-    """With async_rtc: how the weight of the rows before falls after the predicted delay."""
+    """With async_rtc: decay of the previous rows' weight after the predicted delay."""
     max_guidance_weight: Positive | None = None
-    """Most that those rows may bend an inference: 10 with async_rtc, 0.5 with kai0 (whose server ignores it)."""
+    """Largest influence of the previous rows on an inference; absent: 10 with async_rtc, 0.5 with kai0 (whose server
+    ignores it)."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> OpenpiPolicy:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Config(Settings):
-    """Replays the actions of one episode: of a LeRobot dataset, v2.0, v2.1 or v3.0, or of a recording of ours."""
+    """Replay of the actions of one episode: of a LeRobot dataset (v2.0, v2.1, v3.0) or of an EVA Web recording."""
 
     kind: Literal["replay"] = "replay"
     path: Recording
@@ -35,15 +35,15 @@ class Config(Settings):
     episode: int = Field(default=0, ge=0)
     """Index of the episode in the dataset."""
     mapping: ColumnMapping = ColumnMapping()
-    """Names of the dataset's columns; a recorded episode has its own."""
+    """Names of the dataset's columns; a recorded episode defines its own."""
     space: Space = "joint"
-    """Which recorded actions: "joint" takes the action column, "eef" the action_eef column."""
+    """Recorded actions that are replayed: "joint" uses the action column, "eef" the action_eef column."""
     action_pose: PoseFormat = PoseFormat()
-    """How poses are written in the action_eef column, where space is "eef"."""
+    """Format of the poses in the action_eef column, with space = "eef"."""
     horizon: int = Field(default=50, ge=1)
     """Rows per chunk, at the recording's rate."""
     latency_s: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    """How long an answer takes [s]: a real wait on the clock."""
+    """Duration of each response [s], as a real wait on the clock."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,26 +27,28 @@ class RequestSettings(Settings):
     """A policy server's format of observations: the keys of its request, and their contents."""
 
     observation_space: Space = "joint"
-    """What is sent as state: joints, or poses."""
+    """Content of the state: joints, or end-effector poses ("eef")."""
     observation_pose: PoseFormat = PoseFormat()
-    """How poses are written in the state, where observation_space is "eef"."""
+    """Format of the poses in the state, with observation_space = "eef"."""
     observation_eef: Literal["measured", "fk"] = "measured"
-    """Poses that the policy is shown and that its relative poses are relative to: as the robot measures them, where
-    it does; or as its joints have them in any case."""
+    """Source of the poses in the state and of the reference of relative poses: "measured" by the robot if it measures
+    them, else computed from the joints; "fk": always computed from the joints."""
     cameras: dict[str, str] | None = None
-    """Observation key = request key; without it all pictures that there are, under their own keys."""
+    """Observation key = request key; absent: all available images, under their own keys."""
     images_key: str = "images"
-    """The map that holds the pictures; "" puts them into the request itself (DROID, LIBERO)."""
+    """Request key of the map of images; "" places the images in the request itself (DROID, LIBERO)."""
     image_size: Size | None = Field(default_factory=lambda: [224, 224])
-    """Height and width the policy was trained with."""
+    """Height and width of the images with which the policy was trained [pixels]."""
     resize: Resize | Literal["none"] = "pad"
-    """"pad" keeps the aspect on black, "stretch" does not, "none" sends pictures as they are."""
+    """"pad" preserves the aspect ratio and fills with black, "stretch" does not preserve it, "none" sends images
+    unchanged."""
     image_layout: Layout = "chw"
-    """Axes of a picture: channels first or last."""
+    """Order of an image's axes: channels first or last."""
     state_key: str = "state"
-    """Request key of the state; "" sends no whole state."""
+    """Request key of the state; "" does not send the state as a whole."""
     state_parts: dict[str, Dims] = Field(default_factory=dict)
-    """Further request keys and the places of the state vector they take (DROID: joints and gripper apart)."""
+    """Further request keys and the indices of the state vector that they contain (DROID: joints and gripper
+    separately)."""
     prompt_key: str = "prompt"
     """Request key of the instruction."""
 

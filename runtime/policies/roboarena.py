@@ -28,15 +28,16 @@ ACKNOWLEDGED = "reset successful"
 
 
 class Config(ServerSettings, ArenaRequestSettings, ArenaActionSettings):
-    """A policy server of the RoboArena family: RoboArena, DreamZero, or vLLM-Omni with its path in the url."""
+    """A policy server of the RoboArena family: RoboArena, DreamZero, or vLLM-Omni with its path in `url`."""
 
     kind: Literal["roboarena"] = "roboarena"
     first_inference_deadline: Positive = 600.0
-    """For the first answer after set-up [s]: DreamZero's first inferences take minutes."""
+    """Longest time for the first response after set-up [s]; DreamZero's first inferences take minutes."""
     inference_deadline: Positive = 10.0
-    """For every later answer [s]; after it the connection is dropped. DreamZero takes up to three."""
+    """Longest time for every later response [s]; beyond it the connection is dropped. DreamZero takes up to three
+    seconds."""
     reset_deadline: Positive = 10.0
-    """For the acknowledgement of a reset [s]; after it the connection is dropped."""
+    """Longest time for the acknowledgement of a reset [s]; beyond it the connection is dropped."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> RoboarenaPolicy:

@@ -49,19 +49,21 @@ class Config(ServerSettings, ActionLayoutSettings):
 
     kind: Literal["starvla"] = "starvla"
     url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:10093"
-    """Where the server listens: ws or wss, with a path where it has one."""
+    """Address of the server: ws:// or wss://, with a path if it has one."""
     cameras: list[str] = Field(default_factory=list)
     """Observation keys of the views, in the order in which the policy was trained with them."""
     image_size: Size | None = None
-    """Height and width of the views; without it what the server says it was trained with, else as they are."""
+    """Height and width of the views [pixels]; absent: the training size in the server's metadata, else unchanged. If
+    both are given, they must agree."""
     state: bool = True
-    """Whether the state is sent, [1, D]; false for checkpoints that were trained without."""
+    """Whether the state is sent, [1, D]; false for checkpoints that were trained without it."""
     unnorm_key: str | None = None
-    """Whose statistics the server brings actions back to the robot's numbers with; its own default without it."""
+    """Key of the statistics with which the server converts actions to the robot's values; absent: the server's
+    default."""
     statistics: Statistics | None = None
-    """The same statistics, for servers that answer with `normalized_actions` alone; without it they are refused."""
+    """The same statistics, for servers that return only `normalized_actions`, whose responses are otherwise refused."""
     ping_every: Positive | None = 60.0
-    """Longest silence [s], after which a ping goes out: a server ends by itself when nobody asks. None: no ping."""
+    """Longest silence before a ping is sent [s], because a server without requests ends by itself. None: no pings."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> StarvlaPolicy:

@@ -38,20 +38,20 @@ class ServerSettings(Settings):
     """Address and deadlines of a policy server on a websocket."""
 
     url: Annotated[str, Field(pattern=r"^wss?://.+")] = "ws://127.0.0.1:8000"
-    """Where the server listens: ws or wss, with a path where it has one."""
+    """Address of the server: ws:// or wss://, with a path if it has one."""
     api_key_env: Variable | None = None
-    """Environment variable with the API key; the key itself would end up in every recording's manifest."""
+    """Environment variable with the API key; the key itself would be copied to every recording's manifest."""
     health_path: Annotated[str, Field(pattern=r"^/")] | None = None
-    """Where the same port answers an HTTP GET with 200 while the server is well (openpi: "/healthz"); it is asked
-    before each connection. Without it nothing is asked."""
+    """Path at which the same port answers an HTTP GET with status 200 while the server is healthy (openpi: "/healthz");
+    requested before each connection. Absent: no health check."""
     tunnel: TunnelSettings | None = None
-    """The SSH tunnel through which the server is reached; url is then as seen from the tunnel's far end."""
+    """SSH tunnel to the server; `url` is then resolved at the tunnel's far end."""
     connect_deadline: Positive = 5.0
-    """For the connection and the server's metadata [s]."""
+    """Longest time for connecting and for the server's metadata [s]."""
     first_inference_deadline: Positive = 120.0
-    """For the first answer after set-up [s]: the server may have to compile its model."""
+    """Longest time for the first response after set-up [s]; the server may have to compile its model."""
     inference_deadline: Positive = 2.0
-    """For every later answer [s], also of a server that came back; after it the connection is dropped."""
+    """Longest time for every later response, also after a reconnection [s]; beyond it the connection is dropped."""
 
 
 class WebsocketPolicy(Policy):

@@ -21,36 +21,38 @@ class RecordingSettings(Settings):
     codec: CodecName = "libx264"
     """Video encoder. H.264 (libx264, h264_nvenc) plays in every browser and in every reader of datasets."""
     preset: str | None = None
-    """The encoder's trade of processor time against size: libx264 and libx265 `ultrafast` to `veryslow`,
-    h264_nvenc `p1` to `p7`; where it is not given `veryfast`, `ultrafast`, `p4`."""
+    """Encoder preset, which trades processor time against size: `ultrafast` to `veryslow` for libx264 and libx265, `p1`
+    to `p7` for h264_nvenc; absent: `veryfast` for libx264, `ultrafast` for libx265, `p4` for h264_nvenc."""
     crf: int | None = Field(default=None, ge=0, le=51)
-    """Constant quality: smaller is better and larger on disk; where it is not given 23, 28, 23."""
+    """Constant quality; smaller is better and larger on disk. Absent: 23 for libx264 and h264_nvenc, 28 for libx265."""
     gop: int | None = Field(default=None, ge=1, le=300)
-    """Most frames between two key frames; half a second of them, at most 15, where it is not given."""
+    """Largest number of frames between two key frames; absent: half a second of frames, at most 15."""
     height: Height | None = None
-    """Height of all videos, the width in proportion; that of the camera where it is not given, or is smaller."""
+    """Height of all videos [pixels], with the width in proportion; absent, or not below the camera's: the camera's
+    height."""
     heights: dict[str, Height] = Field(default_factory=dict)
-    """The same by observation key of a camera; goes before `height`."""
+    """Height by observation key of a camera [pixels]; takes precedence over `height`."""
     queue_frames: int = Field(default=16, ge=1, le=64)
-    """Most pictures per camera that wait for the encoder; beyond it rows repeat the last picture."""
+    """Largest number of images per camera that wait for the encoder; beyond it rows repeat the last image."""
     max_lag_s: float = Field(default=0.4, gt=0.0, le=10.0)
-    """Pictures are taken as long as the encoder has all that waits done within so long [s]; others are flagged lost."""
+    """Longest time in which the encoder must be able to finish all waiting images [s]; beyond it new images are flagged
+    as lost."""
     give_up_s: float = Field(default=5.0, ge=1.0, le=60.0)
-    """An encoder that is so far behind is given up: its video ends, all else is recorded on [s]."""
+    """Backlog after which an encoder is given up [s]: its video ends, everything else is still recorded."""
     max_skew_s: float = Field(default=0.05, gt=0.0, le=5.0)
-    """How far apart in time the streams of one row may be before the row is flagged [s]; that of a `[collection]` goes
-    before it."""
+    """Largest difference between the times of the streams of one row [s]; beyond it the row is flagged. The value of a
+    `[collection]` takes precedence."""
     max_picture_age_s: float = Field(default=0.5, gt=0.0, le=60.0)
-    """Oldest picture that a row may have before the row is flagged and the camera named [s]."""
+    """Greatest age of an image in a row [s]; beyond it the row is flagged and the camera named."""
     flush_period_s: float = Field(default=0.5, gt=0.0, le=1.0)
-    """Longest time that rows and events stay in memory before they are written and synced [s]."""
+    """Longest time for which rows and events stay in memory before they are written and synced [s]."""
     min_free_bytes: int = Field(default=1 << 30, ge=0)
     """Free space below which nothing is recorded [bytes]."""
     heartbeat_timeout_s: float = Field(default=5.0, ge=1.0, le=60.0)
-    """Silence of the recorder that is told, and in which no run begins [s]. A run goes on: it is held where half of the
-    room for what waits to be recorded is taken."""
+    """Silence of the recorder after which it is reported and no run begins [s]. A run in progress continues; it is held
+    when half of the buffer for data waiting to be recorded is full."""
     drain_timeout_s: float = Field(default=10.0, gt=0.0)
-    """Longest time that the end of an episode waits for the encoders, and then for the disk [s]."""
+    """Longest time for which the end of an episode waits for the encoders, and then for the disk [s]."""
 
     @field_validator("codec", mode="before")
     @classmethod

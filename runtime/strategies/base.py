@@ -30,24 +30,26 @@ _MOST_SHARES = 4096  # contributions reported per chunk at most: they pass the r
 
 
 class StrategyParameters(Settings):
-    """The one set of parameters of all strategies; each module's `USES` names those that mean something to it."""
+    """Parameters of all strategies; each module's `USES` lists those that affect it."""
 
     execution_horizon: int | None = Field(default=None, ge=1)
-    """Control steps of each chunk that may be executed, counted from its observation; all where it is not given."""
+    """Except for ensemble: number of control steps of each chunk that may be executed, counted from its observation;
+    absent: all."""
     inference_rate: float | None = Field(default=None, gt=0)
-    """Requests per second [Hz]; back to back where it is not given."""
+    """Except for sync: requests per second [Hz]; absent: back to back."""
     k_max: int | None = Field(default=None, ge=0)
-    """Most rows that may be dropped as stale; beyond it the chunk is shifted and recorded as mistimed."""
+    """Except for sync: largest number of rows that may be dropped as stale; beyond it the chunk is shifted and recorded
+    as mistimed."""
     blend_window: Annotated[int, Field(ge=1)] | Literal["all"] = 8
-    """Steps over which a new chunk is blended in; "all" is the whole overlap."""
+    """For async and rtc: number of steps over which a new chunk is blended in; "all": the whole overlap."""
     blend_shape: BlendShape = "linear"
-    """How the old plan's weight falls over the window."""
+    """For async and rtc: decay of the old plan's weight over the window."""
     ensemble_m: float = Field(default=0.01, ge=0)
-    """Decay of the weights exp(-m * rank), rank 0 the oldest chunk (ACT, arXiv 2304.13705)."""
+    """For ensemble: decay m of the weights exp(-m * rank), rank 0 the oldest chunk (ACT, arXiv 2304.13705)."""
     ensemble_horizon: int = Field(default=8, ge=1)
-    """Most chunks that make one step; the newest are kept."""
+    """For ensemble: largest number of chunks that contribute to one step; the newest are used."""
     delay_quantile: float = Field(default=0.9, gt=0, le=1)
-    """Quantile of recent delays that is predicted for the next answer."""
+    """For rtc: quantile of recent delays that is the predicted delay of the next response."""
 
 
 @dataclass(frozen=True, slots=True)

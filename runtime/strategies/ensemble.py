@@ -16,7 +16,7 @@ USES = frozenset({"inference_rate", "k_max", "ensemble_m", "ensemble_horizon"})
 
 
 class Config(StrategyParameters):
-    """Ask while moving; every chunk that covers a step has a say in it, the oldest the greatest."""
+    """Request while moving; each step is the weighted mean of all chunks that cover it, the oldest weighted most."""
 
     kind: Literal["ensemble"] = "ensemble"
 

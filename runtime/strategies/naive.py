@@ -12,7 +12,7 @@ USES = frozenset({"execution_horizon", "inference_rate", "k_max"})
 
 
 class Config(StrategyParameters):
-    """Ask while moving; the newest chunk replaces the rest of the old one, with whatever jump there is."""
+    """Request while moving; the newest chunk replaces the remaining plan, even with a jump."""
 
     kind: Literal["naive"] = "naive"
 

@@ -22,7 +22,7 @@ USES = frozenset({"execution_horizon", "inference_rate", "k_max", "blend_window"
 
 
 class Config(StrategyParameters):
-    """Ask while moving; a new chunk is blended over from the rest of the old one."""
+    """Request while moving; a new chunk is blended into the remaining plan."""
 
     kind: Literal["async"] = "async"
 

@@ -22,7 +22,7 @@ USES = frozenset(
 
 
 class Config(StrategyParameters):
-    """Ask while moving; the policy is told what the robot is committed to and continues it."""
+    """Request while moving; the policy receives the committed actions and continues them."""
 
     kind: Literal["rtc"] = "rtc"
 

@@ -12,7 +12,7 @@ USES = frozenset({"execution_horizon"})
 
 
 class Config(StrategyParameters):
-    """Ask, execute the answer in order, ask again; the robot stands while it waits."""
+    """Request, execute the response in order, request again; the robot stands still while it waits."""
 
     kind: Literal["sync"] = "sync"
 

@@ -31,19 +31,19 @@ class LeaderGroup(Settings):
     """Topic and joints of the leader of one group."""
 
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z_][A-Za-z0-9_]*)+$")] | None = None
-    """sensor_msgs/JointState, its gripper among the numbers; the `leader` that the robot's description names for the
-    group where it is not given."""
+    """Topic of type sensor_msgs/JointState, with the gripper among its values; absent: the group's `leader` in the
+    robot's description."""
     joints: list[str] | None = None
-    """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
+    """Names of the group's joints in the messages, in the group's order; absent: those of the robot's description."""
 
 
 class LeaderGroups(Settings):
-    """Settings of a leader that both generations of ROS have in common."""
+    """Settings of a leader common to ROS 1 and ROS 2."""
 
     groups: dict[str, LeaderGroup] = Field(min_length=1)
-    """By the robot's groups; one that is absent is not led."""
+    """Topics and joints by name of the robot's group; an absent group is not led."""
     joint_names: Names = "check"
-    """"check" takes joints by their names, in any order; "ignore" takes the first numbers as they come."""
+    """"check" assigns joints by their names, in any order; "ignore" uses the first values in the order received."""
 
 
 class RosLeader(Leader):

@@ -23,7 +23,7 @@ class Config(ros2.Link, LeaderGroups):
     table: ClassVar[str] = TABLE
     kind: Literal["ros2"] = "ros2"
     qos: Quality = Quality()
-    """Of all its topics, where it is not as usual: best effort."""
+    """Quality of service of all leader topics, if it differs from best effort; durability must be volatile."""
 
     @model_validator(mode="after")
     def _only_news(self) -> Config:

@@ -37,9 +37,9 @@ class Config(Settings):
 
     kind: Literal["zmq"] = "zmq"
     endpoint: Endpoint = "tcp://127.0.0.1:5560"
-    """Where the leader publishes."""
+    """ZMQ endpoint at which the leader publishes."""
     insecure_link: bool = False
-    """Allow an endpoint beyond this machine although anybody on that network can drive the robot."""
+    """Allow an endpoint beyond this machine, although anyone on that network can drive the robot."""
 
     @model_validator(mode="after")
     def _stay_on_this_machine(self) -> Config:

@@ -23,7 +23,7 @@ TOLERANCE = 1e-6  # a frame is due this much early [s]: due times are sums of fl
 
 
 class Config(Settings):
-    """Plays one episode of a LeRobot dataset: v2.0, v2.1 or v3.0."""
+    """Playback of one episode of a LeRobot dataset: v2.0, v2.1 or v3.0."""
 
     kind: Literal["dataset"] = "dataset"
     path: str
@@ -31,7 +31,7 @@ class Config(Settings):
     episode: int = Field(default=0, ge=0)
     """Index of the episode in the dataset."""
     start_frame: int = Field(default=0, ge=0)
-    """Row with which a run begins."""
+    """Index of the row at which a run begins."""
     mapping: ColumnMapping = ColumnMapping()
     """Names of the dataset's columns."""
 

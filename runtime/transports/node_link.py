@@ -15,20 +15,21 @@ Endpoint = Annotated[str, Field(pattern=r"^(tcp|ipc|inproc)://.+")]
 
 
 class NodeSettings(Settings):
-    """Publisher of a node's observations, and their reception."""
+    """Endpoint of a node's observations, and their reception."""
 
     sub_endpoint: Endpoint = "tcp://127.0.0.1:5555"
-    """Where the node publishes observations."""
+    """ZMQ endpoint at which the node publishes observations."""
     encoding: Encoding = "bgr"
-    """Colour order of the node's pictures; an `encoding` field on the wire wins."""
+    """Colour order of the node's images; an `encoding` field in a message takes precedence."""
     disabled_cameras: list[str] = Field(default_factory=list)
-    """Observation keys of cameras that this deployment does without."""
+    """Observation keys of cameras that this deployment does not use."""
     detect_frozen: bool = True
-    """A picture exactly like the one before counts as no newer; off for simulated cameras that may stand still."""
+    """Whether an image identical to the previous one counts as not new; false for simulated cameras whose images may be
+    constant."""
     stalled_after_s: float = Field(default=1.0, gt=0)
-    """How long without a usable message until it is said what is missing [s]."""
+    """Time without a usable message after which the missing data are reported [s]."""
     simulated: bool = False
-    """The node is a simulated bench: it may be reset by us, and what it says is the truth of it is believed."""
+    """Whether the node is a simulated bench: the station may reset it, and accepts the ground truth that it reports."""
 
 
 # A connection that was cut silently is dropped after 4 s and opened again; the kernel's default may be 15 min.

@@ -36,17 +36,17 @@ REAL_TIME = True  # the robot does not wait for us
 
 
 class Link(Settings):
-    """Python and master of ROS 1, and the address of this machine."""
+    """Python interpreter and master of ROS 1, and the address of this machine."""
 
     table: ClassVar[str] = "transport"  # the deployment's table, for messages
     python: str = Field(default="/usr/bin/python3", min_length=1)
-    """The Python that has rospy; it needs nothing of ours."""
+    """Python interpreter that has rospy; it needs no packages of EVA Web."""
     master: str = "http://127.0.0.1:11311"
     """The robot's ROS_MASTER_URI."""
     address: str = "127.0.0.1"
-    """The address under which the robot's nodes reach this machine (ROS_IP)."""
+    """IP address of this machine at which the robot's nodes can reach it (ROS_IP)."""
     insecure_link: bool = False
-    """Allow a master or an address beyond this machine although anybody who reaches it can command the robot."""
+    """Allow a master or an address beyond this machine, although anyone who reaches it can command the robot."""
 
     @model_validator(mode="after")
     def _stay_on_this_machine(self) -> Link:

@@ -31,19 +31,21 @@ REAL_TIME = True  # the robot does not wait for us
 
 
 class Link(Settings):
-    """Which ROS 2, by which middleware, on which network."""
+    """Middleware, domain and network of ROS 2."""
 
     table: ClassVar[str] = "transport"  # the deployment's table, for messages
     middleware: Literal["dds", "rclpy"] = "dds"
-    """"dds" needs no ROS but the extra ros2; "rclpy" needs a ROS 2 whose Python is the one that runs this."""
+    """"dds" needs no ROS installation but the extra ros2; "rclpy" needs a ROS 2 installation for the Python that runs
+    this program, and insecure_link."""
     domain: int = Field(default=0, ge=0, le=232)
     """The robot's ROS_DOMAIN_ID."""
     network: str = Field(default="loopback", min_length=1)
-    """"loopback", the name or address of a network interface, or "environment" for what $CYCLONEDDS_URI says."""
+    """"loopback", the name or address of a network interface, or "environment" for the configuration in
+    $CYCLONEDDS_URI."""
     peers: list[str] = Field(default_factory=list)
-    """Addresses where nodes are looked for besides multicast; not on loopback."""
+    """Addresses at which nodes are searched in addition to multicast; only if `network` is an interface."""
     insecure_link: bool = False
-    """Allow a network beyond this machine although anybody on it can command the robot."""
+    """Allow a network beyond this machine, although anyone on it can command the robot."""
 
     @model_validator(mode="after")
     def _stay_on_this_machine(self) -> Link:
@@ -69,7 +71,7 @@ class Config(Link, RosSettings):
 
     kind: Literal["ros2"] = "ros2"
     qos: dict[str, Quality] = Field(default_factory=dict)
-    """By the name of the topic."""
+    """Quality of service by name of the topic."""
 
 
 def capabilities(config: Config) -> Capabilities:

@@ -29,9 +29,9 @@ class Config(NodeSettings):
 
     kind: Literal["zmq"] = "zmq"
     pub_endpoint: Endpoint = "tcp://127.0.0.1:5556"
-    """Where the node takes commands."""
+    """ZMQ endpoint at which the node receives commands."""
     insecure_link: bool = False
-    """Allow endpoints beyond this machine although anybody on that network can command the robot."""
+    """Allow endpoints beyond this machine, although anyone on that network can command the robot."""
 
     @model_validator(mode="after")
     def _stay_on_this_machine(self) -> Config:

@@ -25,29 +25,29 @@ Step = Annotated[float, Field(gt=0, le=1.0)]
 
 
 class VelocitySteps(Settings):
-    """Motion of a row of the answer at a velocity of 1.0; the defaults are DROID's, at 15 rows per second."""
+    """Motion per row of a response at a velocity of 1.0; the defaults are DROID's, at 15 rows per second."""
 
     joint: Step = 0.2
-    """Of each joint [rad]."""
+    """Motion of each joint [rad]."""
     linear: Step = 0.075
-    """Of the end effector [m]."""
+    """Translation of the end effector [m]."""
     angular: Step = 0.15
-    """Of the end effector [rad]."""
+    """Rotation of the end effector [rad]."""
 
 
 class ArenaActionSettings(Settings):
-    """Answers of a server of the RoboArena family."""
+    """Format of the responses of a server of the RoboArena family."""
 
     action_space: ActionSpace = "joint_position"
-    """What the rows are; a server that says otherwise is refused."""
+    """Content of the rows; a server that declares another action space is refused."""
     action_pose: PoseFormat = PoseFormat(orientation="euler")
-    """How poses are written in the answer, where action_space is a cartesian one."""
+    """Format of the poses in a response, with a cartesian action_space."""
     velocity_steps: VelocitySteps | None = None
-    """With joint_velocity or cartesian_velocity, which mean nothing without it: what 1.0 moves per row."""
+    """Motion per row at a velocity of 1.0; required with joint_velocity and cartesian_velocity."""
     action_rate: Rate | None = None
-    """Rows per second of the answer [Hz], 15 for DROID; the control rate where it is not given."""
+    """Rows per second of a response [Hz], 15 for DROID; absent: the control rate."""
     action_keys: Annotated[list[str], Field(min_length=1)] | None = None
-    """Names of the parts of an answer that comes in parts, in the order of the row; without it the server's own."""
+    """Names of the parts of a response that comes in parts, in the order of the row; absent: the server's own."""
 
 
 class ArenaActions:

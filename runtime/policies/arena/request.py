@@ -32,32 +32,36 @@ class ArenaRequestSettings(Settings):
     """Inputs of a server of the RoboArena family."""
 
     cameras: dict[str, Slot] = Field(default_factory=dict)
-    """Observation key = slot: "first" and "second" are the exterior views, "wrist", and "first_stereo" and so on the
-    right pictures of stereo cameras. Of these the ones that the server wants are sent."""
+    """Observation key = slot: "first" and "second" are the exterior views, "wrist" is the wrist camera; "first_stereo",
+    "second_stereo" and "wrist_stereo" are the right images of stereo cameras. Only the slots that the server requests
+    are sent."""
     numbering: Numbering = "0-based"
-    """How the request counts the exterior views: exterior_image_0_left first (RoboArena's servers, DreamZero,
-    IsaacLab-Arena), or exterior_image_1_left (the field's client). A wrong one is no error to a server."""
+    """Key of the first exterior view: exterior_image_0_left ("0-based": RoboArena's servers, DreamZero, IsaacLab-Arena)
+    or exterior_image_1_left ("1-based": the field's client). A server does not report a wrong numbering."""
     image_size: Size | None = None
-    """Height and width of pictures; without it what the server asks for. Both given have to agree."""
+    """Height and width of the images [pixels]; absent: those that the server requests. If both are given, they must
+    agree."""
     resize: Literal["pad", "stretch", "droid"] = "pad"
-    """"pad" keeps the aspect on black, "stretch" does not, "droid" does as the field's client: by Lanczos to
-    288 x 512, then to the size."""
+    """"pad" preserves the aspect ratio and fills with black, "stretch" does not preserve it; "droid" resizes as the
+    field's client does, with Lanczos to 288 x 512, then to the image size."""
     frames: Annotated[int, Field(ge=1, le=64)] = 1
-    """Pictures per camera: 1 sends the newest, [H, W, 3], and leaves the history to the server; more send the newest
-    that this policy was asked with, [T, H, W, 3], from the second request of a run on, the oldest repeated."""
+    """Images per camera. 1: the newest image, [H, W, 3], and the server handles the history; more: the images of the
+    newest requests, [T, H, W, 3], from the second request of a run on, padded by repeating the oldest."""
     frame_steps: Annotated[list[Steps], Field(min_length=2, max_length=16)] | None = None
-    """In the place of `frames`: which moments a request shows, in steps before it, oldest first, such as
-    [23, 16, 8, 0], as DreamZero's own clients do. The cameras are looked at between requests too."""
+    """Alternative to `frames`: ages in steps of the images in a request, oldest first and 0 last, such as [23, 16, 8,
+    0], as DreamZero's own clients send them. Images are also taken between requests."""
     frame_rate: Annotated[float, Field(gt=0, le=60)] = 15.0
-    """How many of these steps a second has [Hz]; DROID's have 15."""
+    """Rate of the steps of `frame_steps` [Hz]; 15 for DROID."""
     gripper: Convention = "droid"
-    """"droid": 0 is open, 1 closed, in observation and answer; "robot": the robot's own numbers."""
+    """Gripper convention in observation and response: "droid": 0 is open and 1 is closed; "robot": the robot's own
+    values."""
     cartesian_position: Literal["pose", "zeros"] = "pose"
-    """What goes under observation/cartesian_position: the end effector's pose, or zeros as simulators send them."""
+    """Content of observation/cartesian_position: the end effector's pose, or zeros as simulators send them."""
     observation_pose: PoseFormat = PoseFormat(orientation="euler", gripper=False)
-    """How that pose is written."""
+    """Format of the pose in observation/cartesian_position."""
     observation_eef: Literal["measured", "fk"] = "measured"
-    """Poses as the robot measures them, where it does; or as its joints have them in any case."""
+    """Source of the poses: "measured" by the robot if it measures them, else computed from the joints; "fk": always
+    computed from the joints."""
 
     @model_validator(mode="after")
     def _one_history(self) -> ArenaRequestSettings:

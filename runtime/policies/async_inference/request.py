@@ -31,30 +31,33 @@ _NATIVE = (480, 640)  # declared (height, width) of pictures without a size; the
 
 
 class RequestSettings(ActionLayoutSettings):
-    """Model that the server is to load, and its names of what it is shown."""
+    """Model for the server to load, and the model's names of its inputs."""
 
     policy_type: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
-    """LeRobot's name of the model's kind: act, smolvla, diffusion, tdmpc, vqbet, pi0, pi05, groot."""
+    """LeRobot's name of the model type: act, smolvla, diffusion, tdmpc, vqbet, pi0, pi05, groot."""
     checkpoint: Annotated[str, Field(min_length=1)]
-    """What the server loads: a folder on its machine, or a name on the hub."""
+    """Checkpoint that the server loads: a folder on its machine, or a name on the hub."""
     device: str = "cuda"
-    """Where the server runs it."""
+    """Device on which the server runs the model."""
     actions_per_chunk: Annotated[int, Field(ge=1, le=1000)] = 50
-    """Rows of an answer at most; a model that has fewer gives fewer."""
+    """Largest number of rows of a response; a model with shorter chunks returns fewer."""
     images: dict[str, str]
-    """The model's name of a picture, what follows "observation.images.", = observation key of a camera."""
+    """The model's image name, without the prefix "observation.images.", = observation key of a camera."""
     state: Dims | None = None
-    """Places of our state vector that the model's state has, in its order; all in ours where it is not given."""
+    """Indices of the station's state vector that form the model's state, in the model's order; absent: all, in the
+    station's order."""
     state_names: list[str] | None = None
-    """Names of these numbers; the server needs none in particular. Names of the joints where they are not given."""
+    """Names of these values; the server does not require particular names. Absent: the names of the joints."""
     actions: Dims | None = None
-    """Places of our row that the numbers of the model's row take, in its order; all in ours where it is not given."""
+    """Indices of the station's action row to which the values of the model's row belong, in the model's order; absent:
+    all, in the station's order."""
     gripper: Convention = "robot"
-    """How state and answers count grippers: the robot's own numbers, or "droid": 0 is open and 1 closed."""
+    """Gripper convention in state and responses: "robot": the robot's own values; "droid": 0 is open and 1 is
+    closed."""
     rename: dict[str, str] = Field(default_factory=dict)
-    """LeRobot's rename_map: keys of observations on the server that its model has under other names."""
+    """LeRobot's rename_map, for observation keys on the server that have other names in its model."""
     server_version: Literal["0.4", "0.3"] = "0.4"
-    """Of LeRobot on the server: 0.3 has its classes in another place. Newer ones are as 0.4."""
+    """Version of LeRobot on the server: 0.3 has its classes in other modules. Newer versions are like 0.4."""
 
 
 class AsyncRequest:

@@ -35,26 +35,28 @@ _MOST_STEPS = 64  # most steps of a modality; more pictures in one request are a
 
 
 class RequestSettings(ActionLayoutSettings):
-    """Which keys of the model hold what, and in what form the server wants them."""
+    """Keys of the model and their contents, and the server's message format."""
 
     dialect: Literal["nested", "sim_wrapper", "n1.5"] = "nested"
-    """"nested": N1.6 and N1.7; "sim_wrapper": the same started with --use-sim-policy-wrapper, with flat keys;
+    """"nested": N1.6 and N1.7; "sim_wrapper": the same versions started with --use-sim-policy-wrapper, with flat keys;
     "n1.5": flat keys without a batch axis."""
     video: dict[str, str]
-    """The model's video key = observation key of a camera; without the prefix "video."."""
+    """The model's video key, without the prefix "video.", = observation key of a camera."""
     state: Parts
-    """The model's state key = places of the state vector; without the prefix "state."."""
+    """The model's state key, without the prefix "state.", = indices of the state vector."""
     actions: Parts
-    """The model's action key = places of the row that its numbers take, in their order; together every place once."""
+    """The model's action key = indices of the action row that its values fill, in their order; every index must occur
+    exactly once in all keys together."""
     ignored_actions: list[str] = Field(default_factory=list)
-    """Action keys of the model that this robot has no use for."""
+    """Action keys of the model that this robot does not use."""
     gripper: Convention = "robot"
-    """How state and answers count grippers: the robot's own numbers, or "droid": 0 is open and 1 closed."""
+    """Gripper convention in state and responses: "robot": the robot's own values; "droid": 0 is open and 1 is
+    closed."""
     language_key: str | None = None
-    """The model's language key; the only one that it has where it is not given."""
+    """The model's language key; absent: the only one of the model."""
     history: Literal["none", "repeat", "nearest"] = "none"
-    """For models that see more than the newest moment: "repeat" shows that one for all; "nearest" shows, of the
-    moments at which it was asked since the last reset, those nearest to what it wants; "none" is an error then."""
+    """For models with inputs before the newest moment: "repeat" sends the newest moment for all; "nearest" sends, of
+    the moments requested since the last reset, those nearest to the model's; "none" is an error for such models."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,18 +23,19 @@ Rows = Literal["aligned", "whole"]
 
 
 class EnvelopeKeys(Settings):
-    """Keys of the envelope's parts, and count of the rows that the server takes off."""
+    """Keys of the envelope's parts, and number of rows that the server removes."""
 
     observation: Literal["obs", "observation"] = "obs"
     """Key of the observation."""
     flag: Literal["is_rtc", "use_rtc"] = "is_rtc"
-    """Key of whether a chunk is to be continued."""
+    """Key of the flag that requests the continuation of a chunk."""
     shift: str = ""
-    """Key under which a server is told how many rows to take off ("s_param" of one fork); "" where it is not."""
+    """Key of the number of rows that the server is to remove ("s_param" of one fork); "" if the server has none."""
     delay: str = ""
-    """Key under which it is told the predicted delay in rows ("d_param"); "" where it is not."""
+    """Key of the predicted delay in rows ("d_param"); "" if the server has none."""
     server_shift: int | None = None
-    """How many rows the server takes off by itself, where it is not told: 25 for the ancestor."""
+    """Number of rows that the server removes by itself, 25 for the original; required with rtc_rows = "aligned" if
+    `shift` is empty."""
 
 
 class OpenpiRtc(Dialect):

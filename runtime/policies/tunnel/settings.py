@@ -74,35 +74,35 @@ File = Annotated[str, AfterValidator(_path), HostReference.FILE]
 
 
 class TunnelSettings(Settings):
-    """An SSH tunnel to the policy server, by the system's ssh; policy.url is then as seen from its far end."""
+    """SSH tunnel to the policy server through the system's ssh; policy.url is then resolved at its far end."""
 
     host: Annotated[str, AfterValidator(_host)]
-    """Where the tunnel leads: a name, an address, or an alias of ssh's configuration."""
+    """Far end of the tunnel: a name, an address, or an alias of the ssh configuration."""
     user: Annotated[str, AfterValidator(_user)] | None = None
-    """Account there; as ssh's configuration has it where it is not given."""
+    """Account at the far end; absent: that of the ssh configuration."""
     port: int | None = Field(default=None, ge=1, le=65535)
-    """Port of the SSH server; as ssh's configuration has it where it is not given, else 22."""
+    """Port of the SSH server; absent: that of the ssh configuration, else 22."""
     identity_file: File | None = None
-    """Path of the private key on the station's machine, and then no other is tried; those of ssh's configuration and
-    of the agent where it is not given."""
+    """Path of the private key on the station's machine; no other key is then tried. Absent: the keys of the ssh
+    configuration and of the agent."""
     jump: list[Annotated[str, AfterValidator(_jump)]] = Field(default_factory=list)
-    """Hosts on the way, as user@host:port, in their order. What is said here of keys and hosts is not for them: it
-    comes from ssh's configuration."""
+    """Jump hosts in their order, as user@host:port. This table's keys and host keys do not apply to them; theirs come
+    from the ssh configuration."""
     host_keys: Literal["strict", "accept-new"] = "strict"
-    """"strict": the host's key has to be known; "accept-new": one that is seen for the first time is believed and
-    kept. A key that has changed is refused in any case."""
+    """"strict": the host's key must be known; "accept-new": the key of an unknown host is accepted and stored. A
+    changed key is always refused."""
     known_hosts_file: Annotated[str, AfterValidator(_path), HostReference.WRITTEN] | None = None
-    """Path of the known keys, where it is not ssh's own."""
+    """Path of the file with known host keys; absent: ssh's own."""
     ssh_config: Annotated[str, AfterValidator(_configuration), HostReference.FILE] | None = None
-    """Path of ssh's configuration in the place of ~/.ssh/config; "none" reads none."""
+    """Path of an ssh configuration that replaces ~/.ssh/config; "none" reads none."""
     session: bool = True
-    """Whether the command `cat` is run there, which ends with the tunnel. Without a session OpenSSH's server collects
-    what it sends, and answers come some 40 ms later; false for accounts that may run nothing."""
+    """Whether the command `cat` is run at the far end; it ends with the tunnel. Without a session OpenSSH's server
+    collects its output, and responses arrive about 40 ms later; false for accounts that may not run commands."""
     alive_interval: int = Field(default=5, ge=1, le=3600)
-    """Silence of the host after which it is asked whether it is there [s]; three times without an answer end the
-    tunnel, and another is made."""
+    """Silence of the host after which it is probed [s]; after three probes without a reply the tunnel is closed and
+    opened again."""
     connect_deadline: float = Field(default=10.0, ge=1, le=600)
-    """For the tunnel to be up [s], at set-up and whenever it is made again."""
+    """Longest time for opening the tunnel [s], at set-up and whenever it is opened again."""
 
     @property
     def where(self) -> str:

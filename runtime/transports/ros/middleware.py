@@ -17,15 +17,16 @@ Publish: TypeAlias = Callable[[bytes], None]
 
 
 class Quality(Settings):
-    """Quality of service of a topic, where it is not as usual."""
+    """Quality of service of a topic, if it differs from the usual."""
 
     reliability: Literal["best_effort", "reliable"] | None = None
-    """Commands are reliable, all else is best effort. A best-effort subscriber hears every publisher, a reliable one
-    reliable publishers alone; a best-effort publisher is heard by best-effort subscribers alone."""
+    """Absent: reliable for commands, best effort for everything else. A best-effort subscriber receives from every
+    publisher, a reliable one only from reliable publishers; a best-effort publisher reaches only best-effort
+    subscribers."""
     durability: Literal["volatile", "transient_local"] = "volatile"
-    """Whether who comes later is given the last messages; refused for commands."""
+    """Whether late subscribers receive the last messages (transient_local); refused for commands."""
     depth: int | None = Field(default=None, ge=1, le=1000)
-    """How many messages are kept for a reader that is behind: 1 command, 5 of all else."""
+    """Number of messages that are queued for a slow reader; absent: 1 for commands, 5 for everything else."""
 
     def merged_over(self, usual: Quality) -> Quality:
         """Return these settings, with unset keys from `usual`."""

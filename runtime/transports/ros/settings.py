@@ -19,28 +19,30 @@ if TYPE_CHECKING:
 
 
 class RosSettings(Settings):
-    """Settings that both generations of ROS have in common."""
+    """Transport settings common to ROS 1 and ROS 2."""
 
     topics: Topics = Topics()
-    """Topics that are not those of the robot's description."""
+    """Topics that differ from those in the robot's description."""
     disabled_cameras: list[str] = Field(default_factory=list)
-    """Observation keys of cameras that this deployment does without."""
+    """Observation keys of cameras that this deployment does not use."""
     eef: bool = False
-    """Listen to the poses that the robot measures of its end effectors; frames wait for them."""
+    """Whether to subscribe to the end-effector poses that the robot measures; observations then wait for them."""
     eef_commands: bool = False
-    """Publish poses to the robot's `eef_command` topics; needs publication.space = "eef"."""
+    """Whether to publish poses to the robot's `eef_command` topics; needs publication.space = "eef"."""
     commands_to: list[Target] = Field(default_factory=lambda: ["robot"], min_length=1, max_length=2)  # type: ignore[arg-type]
-    """Who is told: the robot, a simulation beside it on the robot's `simulation` topics, or both."""
+    """Recipients of commands: the robot, a simulation in parallel on the robot's `simulation` topics, or both."""
     max_skew_s: float = Field(default=0.1, gt=0, le=5)
-    """How far apart in time the messages of one observation may be [s]."""
+    """Largest difference between the times of the messages of one observation [s]."""
     stalled_after_s: float = Field(default=0.5, gt=0)
-    """Silence of a topic after which it is named [s]."""
+    """Silence of a topic after which it is reported [s]."""
     stamps: Literal["header", "arrival"] = "header"
-    """When a message was made: what its header says, or its arrival, for drivers that do not stamp."""
+    """Time of a message: "header" uses the stamp in its header; "arrival" its arrival, for drivers that set no
+    stamp."""
     joint_names: Names = "check"
-    """"check" takes joints by their names, in any order; "ignore" takes the first numbers as they come."""
+    """"check" assigns joints by their names, in any order; "ignore" uses the first values in the order received."""
     detect_frozen: bool = True
-    """A picture exactly like the one before counts as no newer; off for simulated cameras that may stand still."""
+    """Whether an image identical to the previous one counts as not new; false for simulated cameras whose images may be
+    constant."""
 
     @model_validator(mode="after")
     def _command_each_once(self) -> RosSettings:

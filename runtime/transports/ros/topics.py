@@ -20,33 +20,33 @@ Target = Literal["robot", "simulation"]
 
 
 class GroupTopics(Settings):
-    """Topics of one group where they are not those of the robot's description; "" for one that there is none of."""
+    """Topics of one group that differ from those in the robot's description; "" for a topic that does not exist."""
 
     state: TopicName | None = None
-    """sensor_msgs/JointState: where the group is."""
+    """sensor_msgs/JointState: measured joints of the group."""
     command: TopicName | None = None
-    """sensor_msgs/JointState: where it is told to go."""
+    """sensor_msgs/JointState: commanded joints of the group."""
     eef: TopicName | None = None
-    """geometry_msgs/PoseStamped: where its end effector is, in the group's own frame."""
+    """geometry_msgs/PoseStamped: measured pose of the end effector, in the group's own frame."""
     eef_command: TopicName | None = None
-    """geometry_msgs/PoseStamped: where its end effector is told to go."""
+    """geometry_msgs/PoseStamped: commanded pose of the end effector."""
     gripper_state: TopicName | None = None
-    """sensor_msgs/JointState: its gripper, where that is not among the numbers of `state`."""
+    """sensor_msgs/JointState: measured gripper, if its value is not part of `state`."""
     gripper_command: TopicName | None = None
-    """sensor_msgs/JointState: its gripper, where that is not among the numbers of `command`."""
+    """sensor_msgs/JointState: commanded gripper, if its value is not part of `command`."""
     simulation: TopicName | None = None
-    """sensor_msgs/JointState: the same command for a simulation that runs beside the robot."""
+    """sensor_msgs/JointState: the same command, for a simulation that runs in parallel with the robot."""
     joints: list[str] | None = None
-    """What the messages call the group's joints, in its order, where that is not what the robot's description does."""
+    """Names of the group's joints in the messages, in the group's order; absent: those of the robot's description."""
 
 
 class Topics(Settings):
-    """Topics that are not those of the robot's description."""
+    """Topics that differ from those in the robot's description."""
 
     cameras: dict[str, TopicName] = Field(default_factory=dict)
-    """By the logical name of the camera."""
+    """Image topics by logical name of the camera."""
     groups: dict[str, GroupTopics] = Field(default_factory=dict)
-    """By the name of the group."""
+    """Topics by name of the group."""
 
 
 @dataclass(frozen=True, slots=True)
