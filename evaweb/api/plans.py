@@ -316,7 +316,7 @@ def reveal(request: HttpRequest, name: str) -> Any:
     url_name="cameras",
 )
 def cameras(request: HttpRequest, name: str) -> Any:
-    """Return the caller's confirmation of the cameras, which is valid until the station restarts, at most half a day."""
+    """Return the caller's confirmation of the cameras; it is valid until the station restarts, at most half a day."""
     return CamerasOut.of(bench.current_camera_check(user=request.auth, station=station_get(name=name)))
 
 

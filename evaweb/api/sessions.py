@@ -207,7 +207,10 @@ def session(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-queue",
 )
 def queue(request: HttpRequest, uuid: UUID) -> Any:
-    """Return the jobs of a session: quality, previews, tables, publication. `POST /jobs/ID/retry` retries a failed one."""
+    """Return the jobs of a session: quality, previews, tables, publication.
+
+    `POST /jobs/ID/retry` retries a failed one.
+    """
     found = session_queue(session=selectors.session_get(uuid=uuid))
     return {
         "done": found.done,
@@ -224,7 +227,10 @@ def queue(request: HttpRequest, uuid: UUID) -> Any:
     url_name="session-open",
 )
 def open_session(request: HttpRequest, name: str, given: SessionIn) -> Any:
-    """Open a session with the station's present set-up. Requires an operator, while no other user commands the station."""
+    """Open a session with the station's present set-up.
+
+    Requires an operator, and that no other user commands the station.
+    """
     made = services.open_session(user=request.auth, station=station_get(name=name), **given.model_dump())
     return Status(201, SessionOut.of(made))
 

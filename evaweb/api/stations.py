@@ -269,7 +269,10 @@ def lease(request: HttpRequest, name: str, given: LeaseIn) -> Any:
     url_name="commands",
 )
 def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
-    """Send a command: set-up, run, stop, modes, strategy, motions, grippers. The same uuid again gets the first answer."""
+    """Send a command: set-up, run, stop, modes, strategy, motions, grippers.
+
+    The same uuid again gets the first answer.
+    """
     found, seen = selectors.station_get(name=name), visibility_for_request(request)
     order = given.model_dump(exclude=set(_NAMED))
     named = [name for name in _NAMED if getattr(given, name) is not None]
@@ -301,7 +304,10 @@ def command(request: HttpRequest, name: str, given: CommandIn) -> Any:
     "/{name}/estop", response={**ANSWERS, 409: CommandOut | ErrorOut}, summary="E-stop", url_name="estop"
 )
 def estop(request: HttpRequest, name: str, given: EStopIn | None = None) -> Any:
-    """Stop the robot now; any logged-in user may. The press goes to the station before it is written to the database."""
+    """Stop the robot now; any logged-in user may.
+
+    The press goes to the station before it is written to the database.
+    """
     # In a served lab evaweb.api.stop_gateway answers first, even if the database cannot verify the login.
     given, at = given or EStopIn(), timezone.now()
     identity, user = given.uuid or uuid4(), request.auth
