@@ -70,7 +70,7 @@ endif
 labs: setup-dev ## every other whole lab, one after the other, and properties with random examples: before an issue is resolved
 	@labs=0; \
 	$(PY) -m pytest -n 0 -m "lab" --durations=40 --durations-min=20 || labs=$$?; \
-	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "(hypothesis or exhaustive) and not story and not lab" --hypothesis-profile=random && exit $$labs
+	$(PY) -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "(hypothesis or exhaustive) and not story and not lab" --hypothesis-profile=random --durations=30 --durations-min=20 && exit $$labs
 
 lint: setup-dev ## ruff, mypy, the contracts of .importlinter, and how tests wait
 	$(PY) -m ruff check .

@@ -22,7 +22,7 @@ FEWER = {
     "loop": {"loop.RATES": [30.0]},
     "measures": {"measures._VARIANTS": ["", "fifo"]},
     "moving_target": {"moving_target.SEEDS": 1, "moving_target.DELAYS": [8]},
-    "pages": {"pages.LOADS": 1},
+    "pages": {"pages.LOADS": 1, "pages._LATER_MS": 100},
     "partial_credit": {"partial_credit.RUNS": 5, "partial_credit.PAIRS": 10},
     "recording": {
         "recording._KILLED_S": [1.0, 1.0],
