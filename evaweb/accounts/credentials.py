@@ -55,7 +55,7 @@ _Key = tuple[str, str]  # a kind, and the digest of a secret
 
 _AWAY = Pattern("credentials.database_away", "the database does not answer: {why}")
 _LATE = Pattern("credentials.database_late", "the database did not answer within {seconds:g} s")
-_NO_TURN = Pattern("credentials.no_turn", "the database has not come to this login within {seconds:g} s")
+_NO_TURN = Pattern("credentials.no_turn", "login lookup: not served within {seconds:g} s; try again")
 
 
 class Unverifiable(Exception):

@@ -69,13 +69,13 @@ def estop_unverified(station: str, why: Exception) -> None:
     """Log an e-stop that was executed without a verified user, at most once in 10 s per station."""
     before = _unverified.suffix_if_due(station)
     if before is not None:
-        log.error("an e-stop of %a is obeyed, of nobody knows whom: %s%s", station[:80], why, before)
+        log.error("e-stop from unknown user %a obeyed: %s%s", station[:80], why, before)
 
 
 def _named(username: Any) -> str:
     if get_user_model().objects.filter(username=username or "").exists():
         return ascii(username)
-    return f"a name that nobody has ({len(username or '')} characters)"
+    return f"an unknown name ({len(username or '')} characters)"
 
 
 def _where(request: HttpRequest | None) -> str:

@@ -21,7 +21,7 @@ from runtime.core.sentences import fixed, identity, plain, shows
 HIDDEN = fixed("blinding.hidden", "hidden until the reveal")
 COVERED = fixed(
     "blinding.covered",
-    "hidden until the reveal: look whether the robot stands safely, then resume, or stop and have the trial repeated",
+    "hidden until the reveal: check whether the robot stands safely, then resume, or stop and have the trial repeated",
 )
 
 COVERED_AT_REST = fixed(
@@ -183,9 +183,7 @@ def register_visibility_rule(find: Callable[[Any], Visibility]) -> None:
 def visibility_for_user(user: Any) -> Visibility:
     """Return the user's current Visibility. Raises: ImproperlyConfigured if no rule is registered."""
     if _find is None:
-        raise ImproperlyConfigured(
-            "nobody has declared what is hidden from whom (evaweb.plans.blinding_rules does)"
-        )
+        raise ImproperlyConfigured("blinding rules are not declared (evaweb.plans.blinding_rules does it)")
     return _find(user)
 
 

@@ -14,7 +14,7 @@ _COLLECTS_NOTHING_DEPLOYMENT_HAS_NO = Pattern(
 )
 _HAS_NOT_SEEN_PICTURE_EVERY = Pattern(
     "collect.setups.has_not_seen_picture_every",
-    "{station} has not seen a picture of every camera ({cameras}): look at those that are grey",
+    "{station} has no picture yet of these cameras: {cameras}; check those that are grey",
 )
 _SET_UP_DIFFERS_FROM = Pattern(
     "collect.setups.set_up_differs_from",

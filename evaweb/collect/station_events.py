@@ -54,7 +54,7 @@ def _session_of(episode: Episode) -> CollectSession | None:
         named = read_recorded_episode(journal_folder(episode.pk)).session.get("uuid")
         return CollectSession.objects.filter(pk=UUID(str(named))).first() if named else None
     except (RecordingError, ValueError) as error:
-        log.warning("nobody knows whether episode %s is one of a session: %s", episode.pk, error)
+        log.warning("episode %s: its session is unknown: %s", episode.pk, error)
         return None
 
 

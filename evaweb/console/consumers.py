@@ -59,7 +59,7 @@ _renewals: RequestCoalescer[Ack] = RequestCoalescer(
 )  # limited per station, because a station may hang
 _LOGIN_UNKNOWN = Pattern(
     "console.login_unknown",
-    "the database has not said for {seconds:.0f} s whose login this is; stopping works",
+    "login unknown: the database has not answered for {seconds:.0f} s; stopping works",
 )
 _NOT_SAID = _LOGIN_UNKNOWN(seconds=COUNTS_S)
 _under_way: set[asyncio.Task[None]] = set()  # tasks that continue after the page is closed

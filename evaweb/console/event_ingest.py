@@ -79,7 +79,7 @@ class StationEventIngester:
 
     def _log_retry(self, error: Exception) -> None:
         if not self._failing:
-            log.warning("what happens at %s is written down later: %s", self._station, error)
+            log.warning("%s: events are written later: %s", self._station, error)
         self._failing = True
         self._ended.wait(_TURN_S)
         self._news.set()

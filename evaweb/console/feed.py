@@ -23,7 +23,7 @@ from runtime.core.sentences import Pattern
 from runtime.ipc.bus import CodecError, Subscriber
 from runtime.ipc.session_state import complete_state_meaning
 
-_UNHEARD = Pattern("console.feed.unheard", "{station} has not been heard yet")
+_UNHEARD = Pattern("console.feed.unheard", "{station}: no message received yet")
 
 
 log = logging.getLogger(__name__)

@@ -120,7 +120,7 @@ def _published(work: JobContext, episode: Episode, folder: Path) -> Mapping[str,
         return {"published": False, "why": f"it was discarded by {label.by}"}
     success = success_of(scores_file(episode.uuid))
     if success is None and recorded.facts["status"] in (EpisodeStatus.INTERRUPTED, EpisodeStatus.FAILED):
-        return {"published": False, "why": f"it is {recorded.facts['status']} and nobody has scored it"}
+        return {"published": False, "why": f"it is {recorded.facts['status']} and has no score"}
     simulated = recorded.simulated or episode.station.simulated
     name = dataset_name(recorded, scored=success is not None, simulated=simulated)
     work.report_progress(f"into {name}")

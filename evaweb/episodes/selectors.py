@@ -172,7 +172,7 @@ def why_unrecorded(*, episode: Episode | None) -> str:
     folder, later = journal_folder(episode.uuid), "look again once it is closed"
     if not folder.is_dir() and station_elsewhere(episode.station):
         where = f"the computer of {episode.station}"
-        return f"{where} has not told yet what is in episode {episode.uuid} of its run: {later}"
+        return f"{where} has not sent yet what is in episode {episode.uuid} of its run: {later}"
     if not folder.is_dir():
         return f"episode {episode.uuid} of its run has no folder: nothing of it is on this disk"
     return "" if _rows_written(folder) else f"no row of episode {episode.uuid} is on the disk yet: {later}"

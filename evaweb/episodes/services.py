@@ -163,7 +163,9 @@ def outcome_change(row: Episode, seal: str | None) -> str:
     if seal is None:
         return f"is absent, though the recording was closed as {row.status}"
     if row.seal and seal != row.seal:
-        return "is not the one with which the recording was closed: nobody can say whether its files are as they were"
+        return (
+            "is not the one with which the recording was closed: whether its files are unchanged is unknown"
+        )
     return ""
 
 

@@ -238,7 +238,7 @@ class ChildProcesses:
     def _why(self, child: _Child) -> str:
         path = self._logs / f"{child.program.name}.log"
         lines = path.read_text("utf-8", "replace").strip().splitlines()
-        return f"{lines[-1] if lines else 'it said nothing'} (see {path})"
+        return f"{lines[-1] if lines else 'no output'} (see {path})"
 
     def _restart(self, child: _Child, code: int, now: float) -> None:
         """Restart it with the same addresses; its announcement is known and goes to its log."""

@@ -269,7 +269,7 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
             append_durably(file, text.encode() + b"\n")
     except OSError as error:
         if isinstance(error, AppendError) and not error.is_restored:
-            done = "what was written could not be taken back: the next reconcile may take it for said"
+            done = "what was written could not be removed: the next reconcile may read it as valid"
         raise NotWritten(_NOT_KEPT(strerror=error.strerror, path=path, done=done)) from error
 
 

@@ -37,7 +37,7 @@ class Rating(models.Model):
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoint it was.")
     at = models.DateTimeField(default=timezone.now)
 
-    append_only = AppendOnly("what a second rater said is never changed or removed")
+    append_only = AppendOnly("a second rating is never changed or removed")
 
     class Meta:
         ordering = ("trial", "pk")
@@ -169,7 +169,7 @@ class Judgement(models.Model):
     )
     at = models.DateTimeField(default=timezone.now)
 
-    append_only = AppendOnly("what a judge said is never changed or removed")
+    append_only = AppendOnly("a judge's verdict is never changed or removed")
 
     class Meta:
         ordering = ("trial", "pk")

@@ -33,7 +33,7 @@ _HELD_BY = Pattern(
     "stations.leases.held_by",
     "{who} has {station}: ask for it, and it can be handed over",
 )
-_NOBODY_HAS = Pattern("stations.leases.nobody_has", "nobody has {station}: take it")
+_NOBODY_HAS = Pattern("stations.leases.nobody_has", "{station} has no operator: take it")
 _HELD_ALREADY = Pattern("stations.leases.held_already", "this page has {station} already")
 _NOT_ASKED = Pattern(
     "stations.leases.not_asked",

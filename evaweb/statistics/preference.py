@@ -205,7 +205,7 @@ class _Design:
             raise StatisticsError(f"whether a ranking exists could not be decided: {found.message}")
         if -found.fun > 1e-9 * len(d):
             raise NotIdentifiedError(
-                "some policies, or those seen first, never lost to the rest: how much better they are has no bound",
+                "some policies, or those shown first, never lost to the others: how much better they are has no bound",
                 self.components(),
             )
 

@@ -74,7 +74,7 @@ _UNFINISHED = Pattern(
 _SOURCE = Pattern("trials.services.source", "source = {source!r}; allowed: {values}")
 _BENCH_SAYS_NOTHING = Pattern(
     "trials.services.bench_says_nothing",
-    "source = truth: the bench of trial {trial} has said nothing of it; allowed: human",
+    "source = truth: the bench of trial {trial} reported no truth; allowed: human",
 )
 _BENCH_SAYS_OTHERWISE = Pattern(
     "trials.services.bench_says_otherwise",

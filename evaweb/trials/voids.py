@@ -37,7 +37,7 @@ _ASKED_ALREADY = Pattern(
 )
 _NOBODY_ASKS = Pattern(
     "trials.voids.nobody_asks",
-    "trial {trial} is {label}: nobody asks for its void",
+    "trial {trial} is {label}: there is no request to void it",
 )
 _ASKED_BY_YOU = Pattern(
     "trials.voids.asked_by_you",

@@ -118,7 +118,7 @@ def _idle(sheet: RobotDraft) -> Iterator[str]:
     if sheet.unassigned_joints or sheet.held:
         yield ""
     if sheet.unassigned_joints:
-        yield f"# {GUESS}: nobody commands {', '.join(sheet.unassigned_joints)}."
+        yield f"# {GUESS}: not commanded: {', '.join(sheet.unassigned_joints)}."
     if sheet.held:
         yield f"# {GUESS}: floating or planar, and held where the URDF draws them: {', '.join(sheet.held)}."
 

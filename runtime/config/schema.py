@@ -333,8 +333,8 @@ class Deployment(Settings):
     def _can_be_stopped_without_the_lab(self) -> Deployment:
         if self.lease.lost == "finish" and self.panel is None:
             raise ConfigurationError(
-                'lease.lost = "finish": the robot goes on while nobody commands it, so somebody beside it must be able '
-                'to stop it; allowed with a [panel], else "hold"'
+                'lease.lost = "finish": the robot moves on while it has no operator, so a person beside it '
+                'must be able to stop it; allowed with a [panel], else "hold"'
             )
         return self
 

@@ -66,7 +66,7 @@ class NonBlockingHandler(logging.Handler):
                 continue
             dropped, self._dropped = self._dropped, 0
             if dropped:
-                line = f"({dropped} lines were dropped: nobody took them)\n".encode() + line
+                line = f"({dropped} lines were dropped: not read in time)\n".encode() + line
             self._put(line)
 
     def _put(self, line: bytes) -> None:

@@ -127,7 +127,7 @@ class Listener:
         except (TransportError, OSError) as error:
             if self._told != str(error):
                 self._told = str(error)
-                log.error("nobody can connect to %s at %s: %s", self._name, self._path, error)
+                log.error("%s at %s accepts no connections: %s", self._name, self._path, error)
             return False
         log.warning(
             "clients cannot connect to %s any more, or others can: it is %s now", self._name, self._path

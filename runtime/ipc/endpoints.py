@@ -164,7 +164,7 @@ def connection_problem(endpoint: str) -> str:
     except PermissionError:
         return f"{path} cannot be reached: give {path.parent} back to {account_name(os.geteuid())}, mode 0700; {mend}"
     except OSError as error:
-        return f"nobody listens at {path} ({error.strerror}): {mend}"
+        return f"{path}: no process listens there ({error.strerror}): {mend}"
     finally:
         probe.close()
     return ""

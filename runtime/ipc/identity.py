@@ -85,8 +85,8 @@ class Key:
             return self._secret
         if not stat.S_ISREG(found.st_mode) or found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise ConfigurationError(
-                f"the key {self.path} has the mode {stat.S_IMODE(found.st_mode):04o}: whoever reads it can sign "
-                "commands as anybody; allowed: a file with 0600; remove it, and another is made"
+                f"the key {self.path} has the mode {stat.S_IMODE(found.st_mode):04o}: a reader can sign commands "
+                "as any user; allowed: a file with 0600; remove it, and another is made"
             )
         if found.st_uid not in (os.geteuid(), _ROOT):
             raise ConfigurationError(

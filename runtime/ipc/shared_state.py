@@ -25,7 +25,9 @@ from runtime.ipc.shared_memory import Record, Ring, align_size
 _FOR_SECONDS = Pattern("shared.for_seconds", "for {seconds:.1f} s")
 _FOR_SECONDS_WHILE = Pattern("shared.for_seconds_while", "for {seconds:.1f} s, while {stage}")
 _SINCE_RESTART = fixed("shared.since_restart", "since it was restarted")
-_JOINTS_NOT_SEEN = fixed("shared.joints_not_seen", "control has not seen the joints for long enough yet")
+_JOINTS_NOT_SEEN = fixed(
+    "shared.joints_not_seen", "control has not received joint positions for long enough yet"
+)
 
 _LINE = 64
 PICTURE_SLOTS = 12  # 0.4 s of a camera at 30 Hz: the longest that media may be late

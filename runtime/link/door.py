@@ -264,7 +264,7 @@ class Door:
         try:
             message, parts = read([frame.bytes for frame in frames[1:]])
         except CodecError as error:
-            self._flood(peer, f"it said what cannot be read: {error}")
+            self._flood(peer, f"unreadable message: {error}")
             return None
         return Arrival(route, peer.key, message, parts)
 

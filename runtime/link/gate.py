@@ -244,7 +244,7 @@ class Gate:
             return self._handle(arrival)
         except Exception:
             log.exception("what a station's computer says cannot be taken up")
-            self._door.cut(arrival.route, "the lab cannot take up what it said: see the log of its gate")
+            self._door.cut(arrival.route, "the lab could not process its message: see the log of its gate")
             return ""
 
     def _handle(self, arrival: Arrival) -> str:

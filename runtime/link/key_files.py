@@ -150,8 +150,8 @@ def _read(path: Path) -> bytes:
         found = os.stat(path, follow_symlinks=False)
         if not stat.S_ISREG(found.st_mode) or found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise ConfigurationError(
-                f"the key {path} has the mode {stat.S_IMODE(found.st_mode):04o}: whoever reads it is taken for its "
-                "owner; allowed: a file with 0600"
+                f"the key {path} has the mode {stat.S_IMODE(found.st_mode):04o}: a reader can act as its owner; "
+                "allowed: a file with 0600"
             )
         if found.st_uid not in (os.geteuid(), _ROOT):
             raise ConfigurationError(

@@ -256,7 +256,7 @@ class LabStreams:
     def _pass_on(self, arrival: Arrival, bundle: Bundle, flow: _Flow) -> None:
         flow.credit -= 1
         if flow.credit < -_SLACK or len(bundle.streams) != len(arrival.parts):
-            self._door.cut(arrival.route, "it sends what nobody has asked for")
+            self._door.cut(arrival.route, "it sends data that was not requested")
             return
         if flow.credit < 0:
             return
@@ -287,7 +287,7 @@ class LabStreams:
             if sender.may_send(message):
                 incoming.handle(sender.station, arrival.route, message, arrival.parts[0])
             else:
-                self._cut_sender(arrival.route, "it sends what nobody has asked for")
+                self._cut_sender(arrival.route, "it sends data that was not requested")
 
     def _answer_senders(self) -> None:
         """Send the answers about episodes, and count what each station may send now."""

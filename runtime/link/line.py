@@ -148,7 +148,7 @@ class Line:
         # Before reading: a command that arrives after a silence may be old, so it is dropped with the connection.
         lost = LOST_EPISODES_S if self._low else LOST_S
         if now - self._heard_at > (lost if self.up else _GREETED_S):
-            self.drop(f"nothing was heard of the lab for {now - self._heard_at:.1f} s")
+            self.drop(f"no message from the lab for {now - self._heard_at:.1f} s")
             return []
         heard = self._received(now)
         if self.socket is not None and (trouble := self._connection_problem()):
@@ -214,7 +214,7 @@ class Line:
             except zmq.Again:
                 break
             except CodecError as error:
-                self.drop(f"the lab has said what cannot be read: {error}", _REFUSED_S)
+                self.drop(f"unreadable message from the lab: {error}", _REFUSED_S)
                 return []
             self._heard_at = now
             if isinstance(message, Welcome):

@@ -140,7 +140,7 @@ class ReplayPolicy(Policy):
             )
         if poses and journal.manifest.get("kind") == IMPORTED:
             raise PolicyError(
-                f"{self._config.path} was imported: nobody knows in which frames its poses are; allowed: "
+                f"{self._config.path} was imported: the frames of its poses are unknown; allowed: "
                 'policy.space = "joint"'
             )
         names = journal.manifest["robot"][key]

@@ -234,7 +234,7 @@ class StarvlaPolicy(WebsocketPolicy):
         rows = parse_action_rows("normalized_actions", data["normalized_actions"], self._width)
         if self._config.statistics is None:
             raise ActionSpaceError(
-                "the server answers with normalized_actions, which are no robot's numbers; allowed: a server that "
+                "the server returned normalized_actions; allowed: a server that "
                 "un-normalises them, or its statistics in policy.statistics (low, high, mask)"
             )
         return self._config.statistics.denormalize(rows)

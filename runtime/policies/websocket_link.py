@@ -83,7 +83,7 @@ _REQUEST_NOT_TAKEN = Pattern(
 )
 _UNSOLICITED = Pattern(
     "policy.server.unsolicited",
-    "{url} sent a message of {bytes} bytes that nobody had asked for: an answer came twice, by the "
+    "{url} sent an unrequested message of {bytes} bytes: an answer came twice, by the "
     "server or by what stands before it, and the last one may have been another question's; the "
     "connection is dropped",
 )

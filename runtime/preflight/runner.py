@@ -271,7 +271,7 @@ class PreflightRunner:
             ]
         if chunk.model_relative is None:
             return [
-                "nobody says whether the model's own rows are absolute; relative ones (openpi's delta joint actions) "
-                'would be continued wrongly: set policy.rtc_model_rows = "absolute" or "relative"'
+                "it is not declared whether the model's own rows are absolute; relative ones (openpi's delta joint "
+                'actions) would be continued wrongly: set policy.rtc_model_rows = "absolute" or "relative"'
             ]
         return []

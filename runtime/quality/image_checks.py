@@ -227,7 +227,7 @@ class _RepeatCheck:
             (
                 "skipped",
                 self._skipped,
-                "are the one before again, and nobody said so: the camera is slower than the rows",
+                "repeat the picture before without being marked as repeated: the camera is slower than the rows",
             ),
         ):
             share = count / shown if shown else 0.0

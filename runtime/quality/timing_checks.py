@@ -129,7 +129,7 @@ class TimingCheck:
         settings = self._settings
         age = settings.joint_age_s if stream in JOINTS else settings.picture_age_s
         said: dict[str, tuple[Severity, str, float | None, float | None]] = {
-            "capture_unknown": ("info", f"{where}: nobody knows when {stream} was captured", None, None),
+            "capture_unknown": ("info", f"{where}: the capture times of {stream} are unknown", None, None),
             "time_missing": ("error", f"{where}: {stream} is not a number", None, None),
             "time_order": ("error", f"{where}: {stream} does not go forwards, by {value:.4f} s", value, 0.0),
             "gap": (

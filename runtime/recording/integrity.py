@@ -8,9 +8,7 @@ from typing import Any, Literal
 
 from runtime.core.errors import RecordingError
 
-UNSEALED = (
-    "it is from before recordings had digests: nobody can say whether its files are as they were written"
-)
+UNSEALED = "it is from before recordings had digests: whether its files are as they were written is unknown"
 
 State = Literal["sound", "damaged", "unsealed", "open"]
 

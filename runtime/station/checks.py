@@ -55,8 +55,8 @@ def _check_collection(made: StationSpec) -> None:
         kind = made.deployment.transport.kind
         leads = kind if kind in variants("runtime.teleoperators") else "zmq"
         raise SetupError(
-            f'collection.source = "node" with transport {kind!r}, over which a robot is neither told to follow a '
-            "leader of its own and to leave off, which every stop of ours has to, nor says what it applied; allowed: "
+            f'collection.source = "node" with transport {kind!r}, which can neither switch a robot\'s own leader on '
+            "and off, as every stop has to, nor report what the robot applied; allowed: "
             f'the transport zmq, or source = "relay" with collection.leader.kind = {leads!r}'
         )
 

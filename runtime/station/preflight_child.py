@@ -33,7 +33,7 @@ _UNREADABLE = fixed(
     "preflight.unreadable",
     "the station failed to read what its process said: see the station's log",
 )
-_SAID_NOTHING = Pattern("preflight.said_nothing", "its process ended with {code} and said nothing")
+_SAID_NOTHING = Pattern("preflight.said_nothing", "its process exited with {code} and no output")
 
 _ROOM_S = 10.0  # [s] beside the policy's own deadlines: kinematics, a slow machine
 _GRACE_S = 180.0  # [s] after the deadline, for a process that compiles kinematics

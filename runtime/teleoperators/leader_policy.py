@@ -25,9 +25,9 @@ _BECAUSE = Pattern("leader.because", ": {why}")
 _SAYS_NOTHING = Pattern("leader.says_nothing", "{who} says nothing")
 _SILENT = Pattern(
     "leader.silent",
-    "{who} has said nothing for {seconds:.2f} s, allowed {allowed:g} (collection.max_age_s){because}",
+    "{who}: last message {seconds:.2f} s ago; allowed: {allowed:g} s (collection.max_age_s){because}",
 )
-_SAID_NOTHING = Pattern("leader.said_nothing", "{who} has said nothing{because}")
+_SAID_NOTHING = Pattern("leader.said_nothing", "{who}: no message yet{because}")
 _JOINTS_SHAPE = Pattern("leader.joints_shape", "the observation has joints of shape {shape}")
 _NODE_LEADER = fixed("leader.node_leader", "the node's own leader")
 _NODE_DRIVES = fixed(

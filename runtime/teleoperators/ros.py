@@ -151,8 +151,8 @@ class RosLeader(Leader):
 
 def _silence(topic: str, match: Match) -> str:
     if match.peers:
-        return f"{topic} says nothing new"
-    return match.refused or f"nobody publishes {topic}"
+        return f"{topic}: no new message"
+    return match.refused or f"{topic} has no publisher"
 
 
 def _groups_by_name(led: Mapping[str, LeaderGroup], robot: Robot) -> dict[str, Group]:

@@ -73,7 +73,7 @@ _STOPPED = Pattern(
 )
 _NEVER_CAME = Pattern(
     "node.never_came",
-    "waiting for the node at {endpoint}: nothing has come for {seconds:.1f} s: see that it runs, and that it "
+    "waiting for the node at {endpoint}: no message for {seconds:.1f} s: check that it runs, and that it "
     "publishes where transport.sub_endpoint says",
 )
 _TRUTH_UNDECLARED = fixed(

@@ -141,7 +141,7 @@ def test_who_is_logged_in_goes_on_and_stops_while_the_name_is_locked(ann, live):
 def test_a_name_that_nobody_has_is_locked_as_well_and_not_logged(db, caplog):
     assert locked(name="Hunter2").status_code == 429
     said = [row.getMessage() for row in caplog.records if row.name == "evaweb.accounts.login_audit"]
-    assert said[0] == "login of a name that nobody has (7 characters) failed from 10.0.0.5"
+    assert said[0] == "login of an unknown name (7 characters) failed from 10.0.0.5"
     assert "Hunter2" not in caplog.text
 
 
@@ -189,7 +189,7 @@ def test_a_crowd_of_unverified_presses_is_a_line_in_ten_seconds_of_each_station(
     now[0] = 11.0
     login_audit.estop_unverified("bench-1", TimeoutError("no turn"))
     assert [record.getMessage() for record in caplog.records] == [
-        "an e-stop of 'bench-1' is obeyed, of nobody knows whom: no turn",
-        "an e-stop of 'bench-2' is obeyed, of nobody knows whom: no turn",
-        "an e-stop of 'bench-1' is obeyed, of nobody knows whom: no turn (499 before it)",
+        "e-stop from unknown user 'bench-1' obeyed: no turn",
+        "e-stop from unknown user 'bench-2' obeyed: no turn",
+        "e-stop from unknown user 'bench-1' obeyed: no turn (499 before it)",
     ]

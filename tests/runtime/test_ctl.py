@@ -162,7 +162,7 @@ def test_a_script_waits_for_the_end_of_what_it_asked_for(run, capsys):
     ("words", "last", "says"),
     [
         (["step"], status("holding", reason="policy lost"), "running no longer: holding, policy lost"),
-        (["move", "--pose", "home"], running("waiting", 9), "it was ended before its end"),
+        (["move", "--pose", "home"], running("waiting", 9), "it ended early"),
     ],
 )
 def test_what_went_wrong_meanwhile_is_no_success(run, capsys, words, last, says):

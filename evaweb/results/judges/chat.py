@@ -317,11 +317,13 @@ def _read(content: bytes, n: int) -> CaseJudgement:
     if choice.message.refusal or choice.finish_reason == "content_filter":
         raise NoVerdict(f"it refused: {choice.message.refusal or 'its filter of contents did'}")
     if choice.finish_reason not in (None, "stop"):
-        raise NoVerdict(f"it did not come to its end: '{choice.finish_reason}'")  # whole: it may have the key
+        raise NoVerdict(
+            f"the answer is incomplete: finish_reason = '{choice.finish_reason}'"
+        )  # whole: it may have the key
     try:
         lines = _Answer.model_validate_json(choice.message.content or "").milestones
     except ValidationError as error:
-        raise NoVerdict(f"what it said is not what was asked for: {_wrong(error)}") from None
+        raise NoVerdict(f"the answer is not in the requested form: {_wrong(error)}") from None
     numbers = sorted(line.number for line in lines)
     if numbers != list(range(1, n + 1)):
         raise NoVerdict(f"it spoke of the milestones {numbers!r:.60}; asked were 1 to {n}")

@@ -142,4 +142,4 @@ def _unable(user: Any, views: Sequence[dict[str, Any] | None]) -> str:
     if role_of(user) is Role.VIEWER:
         return "operators judge: you may look"
     unseen = [view["code"] for view in views if view is not None and not view["seen"]]
-    return f"without pictures nobody can judge {' and '.join(unseen)}" if unseen else ""
+    return f"pictures are needed to judge {' and '.join(unseen)}" if unseen else ""

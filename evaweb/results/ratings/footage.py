@@ -15,7 +15,7 @@ from runtime.datasets.video_frames import VideoFrames
 
 _WITHOUT_PICTURES_NOBODY_CAN_JUDGE = Pattern(
     "results.ratings.video_available.without_pictures_nobody_can_judge",
-    "without pictures nobody can judge {told}",
+    "pictures are needed to judge {told}",
 )
 
 

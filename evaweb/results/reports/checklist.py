@@ -104,10 +104,10 @@ def _blind(plan: Plan) -> Item:
         for row in looked_behind(plan)
     ]
     words = (
-        f"looked before the reveal: {', '.join(looked)}; they ran no trial from then on, but nobody is kept from "
-        "standing by or pressing an e-stop"
+        f"looked before the reveal: {', '.join(looked)}; they ran no trial from then on, "
+        "but they could still stand by or press an e-stop"
         if looked
-        else "nobody looked before the reveal"
+        else "no looks before the reveal"
     )
     return Item("Operators blind", "partly" if looked else "yes", f"a fresh code for every trial; {words}")
 

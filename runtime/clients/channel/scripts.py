@@ -128,7 +128,7 @@ class Scripts:
                     script.client.renew()
                     continue
                 script.client.release()
-                told.append(f"{holder} has said nothing for {silence:.1f} s: its lease is over")
+                told.append(f"{holder}: no message for {silence:.1f} s; its lease has ended")
             except TransportError as fault:  # the lease of an unreachable station expires by itself
                 if silence <= self._silence:
                     continue

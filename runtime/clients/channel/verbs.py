@@ -217,7 +217,7 @@ def _grip(action: str, side: str) -> Callable[[VerbContext], CommandSequence]:
 
 
 def _untaken(scene: VerbContext) -> CommandSequence:
-    scene.refuse("nobody takes over from a policy here: web:halt, or a run in the mode manual")
+    scene.refuse("takeover is not available here; allowed: web:halt, or a run in the mode manual")
 
 
 _INTENTS: dict[str, Callable[[VerbContext], CommandSequence]] = {
@@ -337,8 +337,10 @@ VERBS: dict[str, Verb] = {
     "clear_replay": _unsupported(_REPLAY),
     "set_replay_fps": _unsupported(_REPLAY),
     "replay_seek": _unsupported(_REPLAY),
-    "rollout_intervention_enabled": Verb(_intervention, "nothing for 0; 1 is refused: nobody takes over"),
-    "rollout_intervention_abandon": Verb(_untaken, "refused: nobody takes over from a policy"),
+    "rollout_intervention_enabled": Verb(
+        _intervention, "0 does nothing; 1 is refused: takeover is not available"
+    ),
+    "rollout_intervention_abandon": Verb(_untaken, "refused: takeover is not available"),
     "rl_select_task": _unsupported(_LEARNING),
     "rl_select_policy": _unsupported(_LEARNING),
     "rl_select_critic": _unsupported(_LEARNING),

@@ -31,7 +31,7 @@ class Settled:
         if failed:
             return failed[-1]
         if wants and not any(event["kind"] == wants for event in self.events):
-            return f"it was ended before its end ({wants} was not told)"
+            return f"it ended early ({wants} was not reported)"
         return ""
 
 

@@ -12,8 +12,8 @@ _TAKEN = re.compile(r"Address already in use|cannot listen to port")
 _ADVICE = (
     (
         r"Permission denied",
-        "correct policy.tunnel.user or identity_file; nobody is asked for a passphrase, so a key that has one has to "
-        "be in the agent of whoever starts the station",
+        "correct policy.tunnel.user or identity_file; a passphrase is never asked for, "
+        "so a key that has one has to be in the agent of the user who starts the station",
     ),
     (
         r"has changed and you have requested|REMOTE HOST IDENTIFICATION",
@@ -21,7 +21,7 @@ _ADVICE = (
     ),
     (
         r"Host key verification failed|host key is known",
-        "compare its fingerprint with whoever runs it and add it to the known hosts (ssh to it once by hand), or set "
+        "compare its fingerprint with its administrator and add it to the known hosts (ssh to it once by hand), or set "
         'policy.tunnel.host_keys = "accept-new"',
     ),
     (
@@ -38,7 +38,7 @@ def port_was_taken(said: Sequence[str]) -> bool:
 
 def explain_exit(said: Sequence[str], code: int) -> str:
     """Return the last two lines of ssh's output, with advice if there is some."""
-    told = "; ".join(list(said)[-2:]) or f"ssh ended with {code} and said nothing"
+    told = "; ".join(list(said)[-2:]) or f"ssh exited with {code} and no output"
     if code not in (_OWN_FAULT, *_SIGNALS):
         return f"{told}: {_OVER}"
     return next((f"{told}: {advice}" for pattern, advice in _ADVICE if re.search(pattern, told)), told)

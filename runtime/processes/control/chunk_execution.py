@@ -24,7 +24,7 @@ from runtime.strategies.base import ArrivedChunk, Merge, MergeResult, join
 log = logging.getLogger(__name__)
 _CHUNK_UNUSABLE = Pattern("control.chunk_unusable", "control cannot use it: {kind}: {error}")
 _CHUNK_SHAPE = Pattern("control.chunk_shape", "it has the shape {shape}; expected [H, {width}], H from 1 on")
-_CHUNK_BEGIN = Pattern("control.chunk_begin", "it means to begin at {given} numbers; expected {expected}")
+_CHUNK_BEGIN = Pattern("control.chunk_begin", "intended start: {given} values; expected {expected}")
 _TOO_FAR = Pattern(
     "control.too_far",
     "{where}, allowed {allowed:g} (safety.jump): approach it, or start elsewhere",

@@ -29,7 +29,7 @@ _OF_THE_LAST = Pattern(
 )
 _JOINTS_MISSING = Pattern(
     "control.joints_missing",
-    "{why}: the run stands, and goes on by itself where they are back before they are {seconds:g} s old",
+    "{why}: the run is held, and continues by itself if they are back before they are {seconds:g} s old",
 )
 _JOINTS_BACK = Pattern("control.joints_back", "joints again after {seconds:.2f} s: the run goes on")
 _BACK_ELSEWHERE = Pattern(

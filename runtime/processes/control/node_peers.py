@@ -50,8 +50,8 @@ class NodeHandover:
         self._refused = refused
 
 
-_UNHEARD = Pattern("control.unheard", "nobody listens to {place}")
-_HEARD = fixed("control.heard", "all commands are heard")
+_UNHEARD = Pattern("control.unheard", "{place}: no subscriber")
+_HEARD = fixed("control.heard", "all command topics have a subscriber")
 
 _EVERY_S = 2.0
 Say = Callable[[str, str, Mapping[str, object]], None]

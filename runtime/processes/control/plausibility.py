@@ -21,7 +21,7 @@ _BEYOND_LIMITS = Pattern(
 )
 _NOT_SEEN_LONG_ENOUGH = Pattern(
     "control.not_seen_long_enough",
-    "joints have not been seen for {seconds:g} s yet",
+    "joint positions have been received for less than {seconds:g} s",
 )
 _TOO_FAST = Pattern(
     "control.too_fast",

@@ -45,7 +45,7 @@ _OTHER_RUN = fixed("control.other_run", "control is not following that run any m
 _MERGED_BY = Pattern("control.merged_by", "chunks are merged by {strategy} from now on")
 _LEFT_ALONE = fixed(
     "control.left_alone",
-    "nobody knows where the robot is since it was left alone: set up again",
+    "the robot's position is unknown since its commands ended: set up again",
 )
 _NO_MOTION = Pattern("control.no_motion", "a motion to {goal} is none: expected {expected} numbers")
 _MOTION_SPEED = Pattern("control.motion_speed", "a motion at {speed} of its speed; allowed: above 0 up to 1")
@@ -54,7 +54,7 @@ _CONTRADICTION = fixed("control.contradiction", "joints contradict each other")
 _NO_FRESH_JOINTS = fixed("control.no_fresh_joints", "no fresh joints")
 _SIMULATION_UNPLACED = Pattern(
     "control.simulation_unplaced",
-    "{why}: nobody knows where the simulation is to begin",
+    "{why}: the start pose of the simulation is unknown",
 )
 _ROBOT_UNSEEN = Pattern("control.robot_unseen", "{why}: nothing is sent to a robot unseen")
 _RELEASED = fixed("control.released", "e-stop released")
@@ -67,7 +67,7 @@ _AFTER_MISSING_JOINTS = Pattern(
 _WHAT_HELD = fixed("control.what_held", "held where the robot is")
 _MOVED_AWAY = Pattern(
     "control.moved_away",
-    "the robot is {distance:.2f} rad from where it was told to hold: holding where it is",
+    "the robot is {distance:.2f} rad from its hold target: holding where it is",
 )
 
 __all__ = ["Tick", "TickSettings"]

@@ -28,7 +28,7 @@ from runtime.station.run import Run
 from runtime.station.spec import StationSpec
 from runtime.teleoperators.leader_policy import LeaderPolicy
 
-_NOT_YET = fixed("collect.not_armed_yet", "nobody has armed it since it was set up")
+_NOT_YET = fixed("collect.not_armed_yet", "not armed since set-up")
 _NOT_SET_UP = fixed("collect.not_set_up", "the station is not set up to collect")
 _SETUP_BEGUN = fixed("collect.setup_begun", "a set-up has begun")
 _ARMED = fixed("collect.armed", "armed: the next demonstration may begin")
@@ -39,7 +39,7 @@ _SHORT = Pattern(
 )
 _NOBODY_DID_ANYTHING = Pattern(
     "collect.nobody_did_anything",
-    "nobody has done anything for {minutes:g} minutes",
+    "no activity for {minutes:g} minutes",
 )
 _NODE_NEVER_REPORTED = Pattern(
     "collect.node_never_reported",

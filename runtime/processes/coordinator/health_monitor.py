@@ -40,14 +40,14 @@ _RELEASED = fixed("health.released", "e-stop released: set up again")
 _LEASE_ENDED = fixed("health.lease_ended", "the lease was not renewed: claim it, then resume or stop")
 _GOES_ON = Pattern(
     "health.goes_on",
-    "nobody commands the station: the lease was not renewed; the scored run goes on to its {seconds:g} s, and whoever "
-    "is there can stop it",
+    "no operator: the lease was not renewed; the scored run continues to its {seconds:g} s, "
+    "and a person beside the robot can stop it",
 )
 _PANEL_GONE = fixed(
     "health.panel_gone",
-    "nobody commands the station: its panel ended as well; claim the lease, then resume or stop",
+    "no operator: its panel ended as well; claim the lease, then resume or stop",
 )
-_CONNECTED = fixed("health.connected", "the robot is seen: press Set up")
+_CONNECTED = fixed("health.connected", "the robot is connected: press Set up")
 _LINK_LOST = Pattern("health.link_lost", "no observation for {seconds:.1f} s: {who}")
 _ASK_FOR_NODE = fixed("health.ask_for_node", "is the execution node running?")
 _RECEPTION_SILENT = fixed("health.reception_silent", "our process reception does not answer")

@@ -11,7 +11,7 @@ _NEEDS_A_HOLDER = fixed("lease.needs_a_holder", "a lease needs the name of its h
 _EPOCH_IMPOSSIBLE = Pattern("lease.epoch_impossible", "epoch {epoch} is impossible; allowed: 0 to {highest}")
 _HELD_FOR_ANOTHER = Pattern("lease.held_for_another", "{holder} holds the lease for another {seconds:.1f} s")
 _EPOCH_OVER = Pattern("lease.epoch_over", "epoch {epoch} is over, the lease is in epoch {newest}")
-_NOBODY_HOLDS = fixed("lease.nobody_holds", "nobody commands the station: take it first")
+_NOBODY_HOLDS = fixed("lease.nobody_holds", "the station has no operator: take it first")
 _HELD_BY = Pattern("lease.held_by", "{holder} holds the lease")
 _OTHER_EPOCH = Pattern("lease.other_epoch", "epoch {epoch} is not the lease's epoch {newest}")
 

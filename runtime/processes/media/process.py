@@ -54,7 +54,7 @@ _COORDINATOR_SILENT = fixed(
     "media.coordinator_silent",
     "the coordinator has given no sign of life since it was restarted",
 )
-_END_NEVER_TOLD = fixed("media.end_never_told", "its end was never told, and another recording begins")
+_END_NEVER_TOLD = fixed("media.end_never_told", "no end received; another recording begins")
 _STILL_WRITING = fixed(
     "media.still_writing",
     "the last episode is still being written: is the disk slow? try again in a moment",

@@ -44,4 +44,4 @@ class OptionalChild:
         steady = self._now() - self._begun >= _STEADY_S
         self._pause = SHORTEST_S if steady else min(2 * self._pause, LONGEST_S)
         self._due = self._now() + self._pause
-        log.error("%s ended with %d: started again in %g s", self._name, code, self._pause)
+        log.error("%s: exited with %d; restart in %g s", self._name, code, self._pause)

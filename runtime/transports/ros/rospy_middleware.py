@@ -173,7 +173,7 @@ class TcpRosMiddleware(Middleware):
         if word["trouble"] != self._trouble:
             self._trouble = word["trouble"]
             if self._trouble:
-                log.warning("%s; what is connected goes on, nobody new is found", self._trouble)
+                log.warning("%s; existing connections continue, new nodes are not found", self._trouble)
             else:
                 log.info("the ROS master at %s answers again", self._site.master)
         if word["stale"] > self._stale:

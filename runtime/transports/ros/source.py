@@ -45,7 +45,7 @@ _WAITING = Pattern("ros.waiting", "waiting for {streams}: {why}")
 _SILENT = Pattern("ros.silent", "waiting for {stream} ({topic}): nothing for {seconds:.1f} s")
 _UNUSABLE = Pattern("ros.unusable", "waiting for {stream} ({topic}): nothing usable for {seconds:.1f} s")
 _BECAUSE = Pattern("ros.because", "{what}: {why}")
-_NO_PUBLISHER = fixed("ros.no_publisher", "nobody publishes it")
+_NO_PUBLISHER = fixed("ros.no_publisher", "no publisher")
 _APART = Pattern(
     "ros.apart",
     "no message of {apart} is within {skew:g} s of the newest of {slowest}, whose stamps are {behind:.2f} s "

@@ -129,7 +129,7 @@ class TopicPlan:
 
     def _state(self, group: Group) -> Iterator[StreamSpec]:
         names = self._names(group)
-        topic = self._required(group, "state", "every group says where it is")
+        topic = self._required(group, "state", "every group needs a topic of its joint positions")
         apart = self._topic(group, "gripper_state")
         index = None if group.gripper is None else group.gripper.index
         if not apart or index is None:
@@ -163,7 +163,7 @@ class TopicPlan:
         index = None if group.gripper is None else group.gripper.index
         topic = self._topic(group, "command")
         if not topic and not (posed and (apart or index is None)):
-            self._required(group, "command", "every number of the robot has to be told")
+            self._required(group, "command", "every value of the robot's command needs a topic")
         if apart and index is not None:
             yield CommandTopic(apart, "JointState", dims[index : index + 1], names[index : index + 1])
             names, dims = names[:index] + names[index + 1 :], dims[:index] + dims[index + 1 :]

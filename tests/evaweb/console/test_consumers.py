@@ -364,7 +364,7 @@ def test_a_run_goes_on_for_a_minute_without_the_database_and_stops_work_for_long
         now[0] += 2
         if not loaded_anew:
             await page.say(type="aim", id=2, args={"pose": "home"})
-            assert "has not said for 60 s whose login" in (await page.told("aimed"))["reason"]
+            assert "has not answered for 60 s" in (await page.told("aimed"))["reason"]
             await page.say(type="renew", epoch=lease.epoch)
             refused = await page.told("renewed")
             assert (refused["ok"], refused["lost"], refused["reason"]) == (False, False, consumers._NOT_SAID)

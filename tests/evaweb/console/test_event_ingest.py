@@ -188,7 +188,7 @@ def test_a_locked_database_delays_and_loses_nothing(scribe, live, runtime, servi
     with caplog.at_level(logging.WARNING):
         for number in range(3):
             runtime.emit("state", str(number))
-        until(lambda: "is written down later: database is locked" in caplog.text)
+        until(lambda: "events are written later: database is locked" in caplog.text)
     locked.clear()
     services.wait(lambda: [number for _, number, _ in services.trials] == [1, 2, 3])
 

@@ -196,25 +196,25 @@ def test_who_has_chosen_is_refused_in_words(german, live, ann):
     )
     said = refused.json()
     assert (refused.status_code, said["id"]) == (409, "stations.leases.nobody_has")
-    assert said["error"] == f"nobody has {live}: take it"
+    assert said["error"] == f"{live} has no operator: take it"
     english, there = shown_by_node([{**said, "text": said["error"]}])
     assert (english[0], there[0]) == (said["error"], f"niemand hat {live}")
 
 
 @pytest.mark.django_db(transaction=True)
 def test_a_stations_event_refusal_and_state_are_shown_in_words(german, live, runtime, ann):
-    runtime.enter(SessionEvent.CONNECTED, fixed("health.connected", "the robot is seen: press Set up"))
+    runtime.enter(SessionEvent.CONNECTED, fixed("health.connected", "the robot is connected: press Set up"))
     (event,) = connection_to(live.name).events_since(0)[1]
     assert (event["text"], event["id"]) == (
-        "disconnected -> idle: the robot is seen: press Set up",
+        "disconnected -> idle: the robot is connected: press Set up",
         "session.changed",
     )
     snapshot = connection_to(live.name).status()
 
     english, there = shown_by_node([event, snapshot])
-    assert english[0] == "disconnected → idle: the robot is seen: press Set up"
+    assert english[0] == "disconnected → idle: the robot is connected: press Set up"
     assert there[0] == "von getrennt nach in Ruhe, weil Bilder kommen an"
-    assert english[1]["reason"] == snapshot["reason"] == "the robot is seen: press Set up"
+    assert english[1]["reason"] == snapshot["reason"] == "the robot is connected: press Set up"
     assert (there[1]["reason"], there[1]["state_is"]["label"]) == ("Bilder kommen an", "in Ruhe")
     assert there[1]["state"] == "idle"
 

@@ -158,7 +158,7 @@ def test_poses_of_others_are_sent_to_no_robot(data: Path, tmp_path: Path) -> Non
     policy = replay.build(
         replay.Config(path=path, space="eef"), robots.load_robot("agilex_piper"), VirtualClock(), 30.0
     )
-    with pytest.raises(PolicyError, match="was imported: nobody knows in which frames its poses are"):
+    with pytest.raises(PolicyError, match="was imported: the frames of its poses are unknown"):
         policy.connect()
 
 

@@ -76,7 +76,7 @@ def test_a_run_elsewhere_has_no_evidence_until_its_computer_has_told_and_is_not_
     told = {"uuid": "00000000-0000-4000-8000-000000000001"}
     services.record_opened(station=elsewhere, uuid=told["uuid"])
     why = why_unrecorded(episode=Episode.objects.get())
-    assert why.startswith(f"the computer of {elsewhere} has not told yet"), why
+    assert why.startswith(f"the computer of {elsewhere} has not sent yet"), why
     closed = services.record_closed(station=elsewhere, data=told | {"status": "interrupted", "rows": 90})
     assert why_unrecorded(episode=closed) == ""
 

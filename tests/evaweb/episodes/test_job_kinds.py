@@ -165,7 +165,7 @@ def test_an_interrupted_episode_is_published_only_where_it_was_scored(closed: Cl
     episode = closed("interrupted")
     job = publish(episode)
     assert job.status == JobStatus.DONE
-    assert job.result == {"published": False, "why": "it is interrupted and nobody has scored it"}
+    assert job.result == {"published": False, "why": "it is interrupted and has no score"}
     assert not (data / "datasets").exists()
     score(data, episode, False)
     assert publish(episode).result["published"] is True

@@ -252,7 +252,7 @@ def test_what_cannot_be_taken_back_is_said_to_be_there(settings, tmp_path, monke
         raise FULL
 
     monkeypatch.setattr(os, "fsync", broken)
-    with pytest.raises(NotWritten, match="could not be taken back: the next reconcile may take it for said"):
+    with pytest.raises(NotWritten, match="could not be removed: the next reconcile may read it as valid"):
         REVIEWS.append(uuid4(), {})
 
 

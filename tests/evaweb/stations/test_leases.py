@@ -165,7 +165,7 @@ def test_who_gets_a_station_has_got_what_they_asked_for(live, ann, bob):
 
 
 def test_what_nobody_has_is_not_asked_for(live, bob):
-    with pytest.raises(Conflict, match="nobody has Bench 1: take it"):
+    with pytest.raises(Conflict, match="Bench 1 has no operator: take it"):
         leases.request_handover(user=bob, station=live, page="p2")
 
 

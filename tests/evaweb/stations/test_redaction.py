@@ -28,7 +28,7 @@ JUMPS = Pattern("safety.jumps", "{joint} jumps {distance:.2f} rad, allowed {allo
 OLD = Pattern("safety.joints_old", "joint readings are {seconds:.2f} s old (limit {allowed:g} s)")
 MISSING = Pattern(
     "control.joints_missing",
-    "{why}: the run stands, and goes on by itself where they are back before they are {seconds:g} s old",
+    "{why}: the run is held, and continues by itself if they are back before they are {seconds:g} s old",
 )
 STARVED = Pattern("control.starved", "no usable chunk for {seconds:.1f} s")
 TUNED = Pattern("operations.tuned_to", "strategy {strategy}, task {task!r}")

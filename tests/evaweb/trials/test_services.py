@@ -258,7 +258,7 @@ def test_in_the_name_of_a_bench_nobody_scores_anything_but_what_it_says(bench):
             user=bench.operator, trial=trial, milestones=bench.ticks(*reached), source="truth"
         )
 
-    with pytest.raises(EvaError, match=r"the bench of trial .* has said nothing of it"):
+    with pytest.raises(EvaError, match=r"the bench of trial .* reported no truth"):
         score(True, False, False)
     Trial.objects.filter(pk=trial.pk).update(truth={"milestones": {"held": True, "on_plate": False}})
     for ticks, said in (((True, False, True), "on the plate"), ((True, True, False), "lifted")):

@@ -165,7 +165,7 @@ def test_a_lease_that_was_lost_is_told_when_it_is_renewed(client, station):
     client.claim()
     station.time += 5.0
     client._renewed -= 1.0
-    with pytest.raises(Refused, match="nobody commands the station"):
+    with pytest.raises(Refused, match="the station has no operator"):
         client.renew()
 
 

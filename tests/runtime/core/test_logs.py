@@ -60,7 +60,7 @@ def test_a_terminal_that_takes_nothing_stops_nobody_and_what_was_dropped_is_coun
     while not read.endswith(b"the end\n"):
         read += os.read(pipe["reading"], 65536)
     shown = [line for line in read.split(b"\n") if b"dropped" in line]
-    assert shown[0].endswith(b" lines were dropped: nobody took them)")
+    assert shown[0].endswith(b" lines were dropped: not read in time)")
     assert sum(int(line.split()[0].strip(b"(")) for line in shown) > log.LINES_KEPT
 
 
@@ -84,7 +84,7 @@ def test_a_terminal_that_is_gone_does_not_end_the_thread():
     os.dup2(moved, writing)
     lines.handle(record("but this"))
     lines.flush()
-    assert os.read(reading, 4096) == b"(1 lines were dropped: nobody took them)\nINFO but this\n"
+    assert os.read(reading, 4096) == b"(1 lines were dropped: not read in time)\nINFO but this\n"
     for end in (reading, writing, moved):
         os.close(end)
 

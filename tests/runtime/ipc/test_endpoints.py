@@ -207,7 +207,7 @@ def test_a_socket_that_clients_cannot_trust_to_be_there_is_none(runtime_dir: Pat
 def test_what_is_wrong_with_a_socket_is_said_with_what_to_do(runtime_dir: Path) -> None:
     path = runtime_dir / "estop-1"
     assert connection_problem(f"ipc://{path}").startswith(
-        f"nobody listens at {path} (No such file or directory): where"
+        f"{path}: no process listens there (No such file or directory): where"
     )
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(path))

@@ -128,7 +128,8 @@ def test_where_nobody_listens_it_is_said_that_nothing_was_sent_and_what_to_do(
         send_urgent(context, endpoints, GUARD, PRESS, 0.1)
     endpoints.write("guard", {"estop": f"ipc://{folder}/nobody"})
     with pytest.raises(
-        NotSent, match=r"estop was not sent: nobody listens at .*: press again; else start it again"
+        NotSent,
+        match=r"estop was not sent: .*: no process listens there .*: press again; else start it again",
     ):
         send_urgent(context, endpoints, GUARD, PRESS, 0.1)
 

@@ -29,7 +29,7 @@ def test_a_key_is_its_accounts_alone(tmp_path):
 def test_a_key_that_others_can_read_is_none(tmp_path, mode):
     key_files.make_station_key(tmp_path)
     key_files.key_path(tmp_path).chmod(mode)
-    with pytest.raises(ConfigurationError, match="whoever reads it is taken for its owner"):
+    with pytest.raises(ConfigurationError, match="a reader can act as its owner"):
         key_files.station_key(tmp_path)
 
 

@@ -101,7 +101,7 @@ def test_a_lab_that_says_nothing_is_left_and_dialled_anew(line, door, clock):
     clock.now += 0.02
     line.turn()
     assert not line.up
-    assert "nothing was heard of the lab for 0.9 s" in line.why
+    assert "no message from the lab for 0.9 s" in line.why
     clock.now += 1.0
     assert greeted(line, door) != first
 

@@ -275,7 +275,9 @@ def test_normalised_rows_are_refused_without_statistics_and_undone_with_them() -
     with serving(answering({"normalized_actions": rows[None]})) as url:
         with (
             policy_at(url) as policy,
-            pytest.raises(PolicyError, match=r"no robot's numbers; allowed: .*policy\.stat"),
+            pytest.raises(
+                PolicyError, match=r"the server returned normalized_actions; allowed: .*policy\.stat"
+            ),
         ):
             policy.infer(seen(FRANKA))
         with policy_at(url, statistics=statistics) as policy:

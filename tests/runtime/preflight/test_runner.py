@@ -125,7 +125,7 @@ def test_what_works_and_is_worth_knowing_is_noted(flown: Any) -> None:
 @pytest.mark.parametrize(
     ("relative", "noted"),
     [
-        (None, "nobody says whether the model's own rows are absolute"),
+        (None, "it is not declared whether the model's own rows are absolute"),
         (True, "are not continued"),
         (False, ""),
     ],

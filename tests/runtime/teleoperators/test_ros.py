@@ -87,13 +87,13 @@ def test_an_arm_that_falls_silent_or_repeats_itself_makes_the_leader_silent_and_
     bench: Bench,
 ) -> None:
     bench.hand.found = {"/leader/left": Match(1), "/leader/right": Match(0)}
-    assert bench.leader.problem == "/leader/left says nothing new; nobody publishes /leader/right"
+    assert bench.leader.problem == "/leader/left: no new message; /leader/right has no publisher"
     for stamp in (5, 5, 5):
         bench.say("/leader/right", np.zeros(7), RIGHT.joints, stamp=stamp)
         bench.say("/leader/left", np.zeros(7))
         bench.clock.advance(0.1)
     assert bench.newest.arrived == 10.0
-    assert bench.leader.problem == "nobody publishes /leader/right"
+    assert bench.leader.problem == "/leader/right has no publisher"
 
 
 @pytest.mark.parametrize(

@@ -268,7 +268,7 @@ def test_a_clock_far_from_ours_ages_nothing(ros_master: RosMaster, node: Node) -
 @needs_ros1
 def test_nobody_at_the_topics_is_said(ros_master: RosMaster, caplog: pytest.LogCaptureFixture) -> None:
     with listening(ros_master) as source:
-        assert f"left_arm joints ({LEFT}): nothing for" in said(source, "nobody publishes it")
+        assert f"left_arm joints ({LEFT}): nothing for" in said(source, "no publisher")
     sink = ros1.sink(ros1.Config(master=ros_master.uri), ROBOT, MonotonicClock())
     sink.connect()
     with contextlib.closing(sink):

@@ -311,7 +311,7 @@ def test_why_no_frame_comes_is_said_once_for_each_reason(node: Node) -> None:
 
         wait_for(news)
         assert re.fullmatch(
-            rf"waiting for the node at {node.obs}: nothing has come for [\d.]+ s: see that it runs, and that it "
+            rf"waiting for the node at {node.obs}: no message for [\d.]+ s: check that it runs, and that it "
             "publishes where transport.sub_endpoint says",
             told.pop(),
         )

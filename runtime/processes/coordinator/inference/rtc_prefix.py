@@ -16,8 +16,8 @@ from runtime.processes.coordinator.inference.chunk_mixture import Mixture, Mixtu
 
 _MODEL_ROWS_RELATIVE = fixed(
     "rtc.model_rows_relative",
-    "RTC: the model's own rows are relative to an observation that is over, and nobody but the model can say what they"
-    " are from the next one on: they are not continued, requests go out without them",
+    "RTC: the model's own rows are relative to an earlier observation, and only the model can convert them"
+    " to the next one: they are not continued, requests go out without them",
 )
 _DELAY_BEYOND_PLAN = Pattern(
     "rtc.delay_beyond_plan",
@@ -228,7 +228,7 @@ class RtcPrefix:
     ) -> Float32 | None:
         """Return the rows of `held`, with those for `steps` as planned, relative to `observation`."""
         assert observation is not None, (
-            "rows that are not absolute need the observation that they are said from"
+            "rows that are not absolute need the observation that they are relative to"
         )
         known = [shares for shares in made if shares is not None and shares.keys() <= self._merged.keys()]
         if len(known) < len(made):

@@ -17,7 +17,7 @@ from runtime.processes.coordinator.path_check import PathCheck
 from runtime.station.spec import StationSpec
 
 _GOING = Pattern("motion.going", "going to {where}")
-_NOT_COME = Pattern("motion.not_come", "control has not come to {where} within {seconds:.1f} s")
+_NOT_COME = Pattern("motion.not_come", "control did not reach {where} within {seconds:.1f} s")
 _NOT_ARRIVED = Pattern(
     "motion.not_arrived",
     "the arm did not arrive: {joint} is {distance:.2f} rad from {where}; is it blocked, or is another "

@@ -35,7 +35,7 @@ _THE_FIRST_ACTION = fixed("setup.the_first_action", "the policy's first action")
 _POLICY_UNUSABLE = fixed("setup.policy_unusable", "what the policy says of itself cannot be used")
 _ZERO_JOINTS = Pattern(
     "setup.zero_joints",
-    "{joints} read exactly 0 rad: look whether the robot stands so, or an encoder is dead",
+    "{joints} read exactly 0 rad: check whether the robot stands so, or an encoder is dead",
 )
 _NO_FAULT_NAMED = fixed("setup.no_fault_named", "no fault named")
 _DRIVES_DISABLED = Pattern(

@@ -58,9 +58,7 @@ def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None)
     except OSError as error:
         raise NoXmlRpcAnswer(error.strerror or str(error) or type(error).__name__) from error
     except Exception as error:
-        raise NoXmlRpcAnswer(
-            f"what answers there is none: {type(error).__name__}: {str(error)[:200]}"
-        ) from error
+        raise NoXmlRpcAnswer(f"not a ROS master: {type(error).__name__}: {str(error)[:200]}") from error
     if code == 1:
         return value
     if default is None:

@@ -99,8 +99,8 @@ def test_a_judge_without_a_key_sends_none():
     [
         (message(None, refusal="I do not judge robots."), "it refused: I do not judge robots."),
         (message("", "content_filter"), "it refused: its filter"),
-        (message('{"milestones": [', "length"), "it did not come to its end: 'length'"),
-        (message("The block was held."), "what it said is not what was asked for: Invalid JSON"),
+        (message('{"milestones": [', "length"), "the answer is incomplete: finish_reason = 'length'"),
+        (message("The block was held."), "the answer is not in the requested form: Invalid JSON"),
         (message('```json\n{"milestones": []}\n```'), "not what was asked for: Invalid JSON"),
         (message(None), "not what was asked for"),
         (message("[]"), "not what was asked for"),

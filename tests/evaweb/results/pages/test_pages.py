@@ -408,7 +408,7 @@ def test_without_pictures_nothing_is_judged(plan, carry_out, as_):
         journal_folder(episode.uuid).mkdir(parents=True)
     for page in ("rate", "prefer"):
         text = client.get(f"/result/{page}/").content.decode()
-        assert "without pictures nobody can judge" in text
+        assert "pictures are needed to judge" in text
         assert 'disabled aria-describedby="unable"' in text
 
 

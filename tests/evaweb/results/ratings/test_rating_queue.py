@@ -256,7 +256,7 @@ def test_what_has_no_pictures_is_passed_over_and_named(plan, carry_out, rater, b
     assert rating_queue.next_to_rate(rater).found is None  # it is empty
     Episode.objects.filter(pk=first.trial.episode_id).update(frames=100)  # its preview may come yet
     assert rating_queue.next_to_rate(rater)[::2] == (first, ())
-    with pytest.raises(Conflict, match=f"nobody can judge {first.code}: There is no preview yet"):
+    with pytest.raises(Conflict, match=f"pictures are needed to judge {first.code}: There is no preview yet"):
         rating_queue.save_rating(
             user=rater, plan=plan, code=first.code, milestones=bench.ticks(True, True, True)
         )

@@ -62,7 +62,7 @@ def test_the_lease_of_a_silent_script_is_given_up_once(world):
     script = world.holding("a")
     world.now += 10.5
     (told,) = world.scripts.poll()
-    assert told == "a has said nothing for 10.5 s: its lease is over"
+    assert told == "a: no message for 10.5 s; its lease has ended"
     assert not script.holds
     assert world.scripts.poll() == []
     assert world.made["a"].done == ["give_up"]

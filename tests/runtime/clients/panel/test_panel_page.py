@@ -58,7 +58,7 @@ def test_whoever_stands_at_the_robot_sees_it_and_stops_it(panel, browser, tmp_pa
     panel.station.ready()
     reason = fixed("health.of_this_test", "nobody commands the station")
     panel.station.do(lambda: panel.station.session._enter(SessionState.RUNNING, reason))
-    Telling(Endpoints(panel.folder), "the lab of building 4").update("nothing was heard of the lab for 0.9 s")
+    Telling(Endpoints(panel.folder), "the lab of building 4").update("no message from the lab for 0.9 s")
     page = browser.new_page(viewport=WIDTHS["phone"])
     faults = []
     page.on("pageerror", lambda error: faults.append(str(error)))

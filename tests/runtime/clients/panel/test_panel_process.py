@@ -132,7 +132,7 @@ def test_it_says_since_when_the_lab_is_lost(panel):
         uplink.update("")
         told = json.loads(panel.ask("GET", "/state", headers=entered)[2])["lab"]
         assert told == {"lab": "the lab", "since": 0.0, "why": ""}
-        uplink.update("nothing was heard of the lab for 0.9 s")
+        uplink.update("no message from the lab for 0.9 s")
         uplink.update("the lab does not answer at this address")
         told = json.loads(panel.ask("GET", "/state", headers=entered)[2])["lab"]
         assert told == {"lab": "the lab", "since": 1000.0, "why": "the lab does not answer at this address"}

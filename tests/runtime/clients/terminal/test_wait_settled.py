@@ -81,7 +81,7 @@ def test_events_are_told_as_they_come_and_a_dropped_chunk_is_a_failure():
 def test_a_motion_that_did_not_arrive_is_a_failure():
     ended = [running("moving", 10), running("waiting", 11), running("waiting", 14, newest_event=1)]
     found, _, _ = settled(*ended, events=[event(1, "command")])
-    assert found.failure("motion_done") == "it was ended before its end (motion_done was not told)"
+    assert found.failure("motion_done") == "it ended early (motion_done was not reported)"
     found, _, _ = settled(*ended, events=[event(1, "motion_done")])
     assert found.failure("motion_done") == ""
 

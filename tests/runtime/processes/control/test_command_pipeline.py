@@ -70,7 +70,7 @@ def test_without_joints_nobody_knows_where_a_simulation_is_to_begin():
     bench.feed = False
     bench.say("follow", run=1, mode="sim")
     bench.run(2)
-    assert "nobody knows where" in bench.said("unmeasured")[0].text
+    assert "start pose of the simulation is unknown" in bench.said("unmeasured")[0].text
     assert np.isnan(simulated(bench)).all()
     assert bench.records()[-1].source == "none"
 

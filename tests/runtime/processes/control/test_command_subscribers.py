@@ -73,12 +73,12 @@ def test_nothing_is_said_where_all_is_heard_and_who_knows_is_not_asked_at_every_
 
 def test_who_does_not_hear_is_said_once_and_that_it_does_once(desk: Desk) -> None:
     desk.mouth.found = {"/right": WHY, "/left": ""}
-    said = ("commands_unheard", f"nobody listens to /left; {WHY}", {"unheard": desk.mouth.found})
+    said = ("commands_unheard", f"/left: no subscriber; {WHY}", {"unheard": desk.mouth.found})
     assert desk.go(30.0) == [said]
     desk.mouth.found = {"/right": WHY}
     assert desk.go(30.0) == [("commands_unheard", WHY, {"unheard": {"/right": WHY}})]
     desk.mouth.found = {}
-    assert desk.go(30.0) == [("commands_heard", "all commands are heard", {"unheard": {}})]
+    assert desk.go(30.0) == [("commands_heard", "all command topics have a subscriber", {"unheard": {}})]
     assert desk.go(30.0) == []
 
 
@@ -93,7 +93,7 @@ def test_a_main_that_is_started_anew_is_told_again_when_it_is_there(desk: Desk) 
     desk.shared.beat("coordinator", 0.0)
     assert desk.go(5.0) == []
     desk.shared.beat("coordinator", desk.now)
-    assert [text for _, text, _ in desk.go(5.0)] == ["nobody listens to /left"]
+    assert [text for _, text, _ in desk.go(5.0)] == ["/left: no subscriber"]
 
 
 def test_it_is_in_the_status_before_anything_is_set_up_and_leaves_it(

@@ -48,9 +48,9 @@ def alone(station: Station, seconds: float) -> Station:
 def test_a_scored_run_goes_on_to_its_limit_without_its_holder(running: Running) -> None:
     station = alone(running(FINISH, **TRIAL), 6.0)
     assert station.state is SessionState.RUNNING
-    assert station.reason.startswith("nobody commands the station: the lease was not renewed; the scored run")
+    assert station.reason.startswith("no operator: the lease was not renewed; the scored run")
     assert station.coordinator.snapshot()["lease"]["holder"] == ""
-    assert station.events("state")[-1].startswith("running -> running: nobody commands the station")
+    assert station.events("state")[-1].startswith("running -> running: no operator")
     sent = len(station.robot.commands)
     alone(station, 3.5)
     assert len(station.robot.commands) > sent
@@ -83,7 +83,7 @@ def test_it_holds_as_soon_as_nobody_could_stop_it_any_more(running: Running) -> 
     Endpoints(station.spec.deployment.station_dir).withdraw("panel")
     alone(station, 0.5)
     assert station.state is SessionState.HOLDING
-    assert station.reason.startswith("nobody commands the station: its panel ended as well")
+    assert station.reason.startswith("no operator: its panel ended as well")
 
 
 @pytest.mark.some(1)

@@ -59,12 +59,12 @@ def test_silence_ends_it(lease):
     lease.claim("anna", 0, 10.0)
     assert lease.current(14.999) is not None
     assert lease.current(15.0) is None
-    assert lease.check("anna", 1, 15.0) == "nobody commands the station: take it first"
+    assert lease.check("anna", 1, 15.0) == "the station has no operator: take it first"
 
 
 def test_a_lease_that_has_ended_cannot_be_renewed(lease):
     lease.claim("anna", 0, 10.0)
-    assert lease.renew("anna", 1, 15.0) == "nobody commands the station: take it first"
+    assert lease.renew("anna", 1, 15.0) == "the station has no operator: take it first"
     assert lease.current(15.0) is None
 
 

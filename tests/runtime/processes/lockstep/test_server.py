@@ -330,7 +330,7 @@ def test_a_lease_that_is_not_renewed_in_the_peoples_time_holds_the_robot(client:
     client.turn(5)
     assert client.state is SessionState.HOLDING
     assert "the lease was not renewed" in client.reason
-    assert client.ask("resume").reason == "nobody commands the station: take it first"
+    assert client.ask("resume").reason == "the station has no operator: take it first"
 
 
 def test_a_lease_ends_while_time_stands_still_too(client: Client) -> None:

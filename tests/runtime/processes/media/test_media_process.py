@@ -328,7 +328,7 @@ def test_a_recording_whose_end_was_never_told_is_closed_where_another_one_begins
     messages = [decode(payload) for payload in desk.shared.rings["media_events"].drain()]
     (closed,) = [m for m in messages if isinstance(m, EpisodeClosed)]
     assert (closed.uuid, closed.status, closed.rows) == ("one", "interrupted", 1)
-    assert closed.reason == "its end was never told, and another recording begins"
+    assert closed.reason == "no end received; another recording begins"
     opened = [m for m in messages if isinstance(m, EpisodeOpened)][-1]
     assert (opened.uuid, opened.error) == ("two", "")
     assert desk.media.recording

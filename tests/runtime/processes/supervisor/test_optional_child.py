@@ -50,7 +50,7 @@ def test_who_ends_is_started_again_after_a_pause_with_one_line_in_the_log(world,
         assert len(world.started) == 1
         world.wait(0.2)
     assert len(world.started) == 2
-    assert [record.message for record in caplog.records] == ["channel ended with 3: started again in 2 s"]
+    assert [record.message for record in caplog.records] == ["channel: exited with 3; restart in 2 s"]
 
 
 def test_who_ends_again_and_again_is_started_less_and_less_often(world):

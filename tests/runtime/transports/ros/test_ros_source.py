@@ -151,7 +151,7 @@ def test_who_is_at_the_other_side_is_said_with_it(bench: Bench) -> None:
     bench.clock.advance(1.0)
     assert bench.source.receive(0.0) is None
     assert bench.news() == [
-        "waiting for cam_wrist (/wrist): nothing for 2.0 s: nobody publishes it; waiting for cam_high (/high): "
+        "waiting for cam_wrist (/wrist): nothing for 2.0 s: no publisher; waiting for cam_high (/high): "
         f"nothing for 2.0 s: {refusal}; waiting for arm joints (/state): nothing for 2.0 s"
     ]
 
@@ -167,7 +167,7 @@ def test_a_cause_that_is_found_later_is_told_later_and_once(bench: Bench) -> Non
     bench.hand.found = {"/high": Match(0), "/wrist": Match(1), "/state": Match(1)}
     bench.clock.advance(2.0)
     assert bench.source.receive(0.0) is None
-    assert "(/high): nothing for 2.0 s: nobody publishes it" in " ".join(bench.news())
+    assert "(/high): nothing for 2.0 s: no publisher" in " ".join(bench.news())
     bench.hand.found["/high"] = Match(0, "/high is published as something else")
     for _ in range(20):
         bench.clock.advance(0.1)

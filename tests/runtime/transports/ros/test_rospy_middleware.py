@@ -360,8 +360,8 @@ def test_a_master_that_starts_later_is_waited_for_and_named_meanwhile(
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        (b"HTTP/1.0 404 Not Found\r\n\r\n", "what answers there is none: ProtocolError"),
-        (b"nonsense\r\n", "what answers there is none: BadStatusLine"),
+        (b"HTTP/1.0 404 Not Found\r\n\r\n", "not a ROS master: ProtocolError"),
+        (b"nonsense\r\n", "not a ROS master: BadStatusLine"),
         (b"", "Remote end closed connection without response"),
     ],
 )

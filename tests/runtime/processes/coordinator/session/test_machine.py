@@ -396,7 +396,7 @@ def test_every_command_needs_the_lease(kind):
     assert bench.give(kind, holder="ben").reason == "anna holds the lease"
     assert bench.give(kind, epoch=7).reason == "epoch 7 is not the lease's epoch 1"
     bench.clock.advance(5.0)
-    assert bench.give(kind).reason == "nobody commands the station: take it first"
+    assert bench.give(kind).reason == "the station has no operator: take it first"
     assert bench.effects.done == []
 
 
@@ -425,9 +425,9 @@ def test_a_run_that_nobody_commands_takes_stops_of_everybody_and_no_other_comman
     assert (bench.session.state, bench.session.reason) == (S.RUNNING, "nobody commands")
     assert bench.effects.done == []
     refused = {bench.give(kind, holder="ben").reason for kind in COMMANDS if kind not in STOPPING}
-    assert refused == {"nobody commands the station: take it first"}
+    assert refused == {"the station has no operator: take it first"}
     assert bench.give("halt", holder="ben").status == "accepted"
-    assert bench.give("stop", holder="ben").reason == "nobody commands the station: take it first"
+    assert bench.give("stop", holder="ben").reason == "the station has no operator: take it first"
 
 
 def test_who_claims_a_run_that_nobody_commands_has_it_as_it_goes_on():

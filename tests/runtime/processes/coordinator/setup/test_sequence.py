@@ -213,7 +213,7 @@ def test_a_motion_that_control_never_finishes_ends_it(tmp_path: Path) -> None:
     station.command("setup")
     without_control(station, 10.0)
     assert station.state is SessionState.IDLE
-    assert "control has not come to the pose 'home' within" in station.reason
+    assert "control did not reach the pose 'home' within" in station.reason
     station.close()
 
 
