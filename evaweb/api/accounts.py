@@ -14,7 +14,7 @@ router = Router(tags=["accounts"])
 
 
 class AccountOut(Schema):
-    """The user that asks."""
+    """The authenticated user."""
 
     username: str
     name: str
@@ -23,6 +23,6 @@ class AccountOut(Schema):
 
 @router.get("/me", response={200: AccountOut, **FAILURES}, summary="The user that asks", url_name="me")
 def get_account(request: HttpRequest) -> Any:
-    """User of the session or the token, with name and role."""
+    """Return the user of the session or the token, with name and role."""
     user = request.auth
     return {"username": user.get_username(), "name": user.get_full_name(), "role": role_of(user)}

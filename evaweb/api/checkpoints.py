@@ -17,7 +17,7 @@ router = Router(tags=["checkpoints"])
 
 
 class CheckpointOut(Schema):
-    """A trained policy; how it is reached is an administrator's business."""
+    """A trained policy, without the address of its server, which only administrators see."""
 
     id: int
     name: str
@@ -49,7 +49,7 @@ def checkpoints(request: HttpRequest, paging: Query[Paging], inactive: bool = Fa
     """Return the checkpoints that operators may choose.
 
     With `inactive` also those that are switched off, with `tag` only those with this tag. Checkpoints of a blind plan
-    are left out unless the caller has looked behind the blind.
+    are left out unless the caller has unblinded it.
     """
     rows = selectors.checkpoint_list(all_of_them=inactive, tag=tag, sight=visibility_for_request(request))
     return paging.page(rows, CheckpointOut)

@@ -20,7 +20,7 @@ router = Router(tags=["datasets"])
 
 
 class CheckOut(Schema):
-    """Findings of the newest check; `remarks` are no damage; not `fresh`: the dataset has changed since."""
+    """Findings of the newest check; `remarks` are not damage; `fresh` is false if the dataset has changed since."""
 
     at: datetime
     problems: list[str]
@@ -29,7 +29,7 @@ class CheckOut(Schema):
 
 
 class DatasetOut(Schema):
-    """One dataset; its name is its folder, relative to the data folder. With a `problem` the rest is empty."""
+    """One dataset, named by its folder relative to the data folder. With a `problem` all other fields are empty."""
 
     name: str
     version: str
@@ -53,7 +53,7 @@ class DatasetOut(Schema):
 
 
 class DatasetEpisodeOut(Schema):
-    """One episode of a dataset; `uuid` is that of the recording, null for one of others."""
+    """One episode of a dataset; `uuid` is that of its recording, null if it was not recorded by this lab."""
 
     index: int
     rows: int

@@ -44,7 +44,7 @@ _WITH = ("station", "trial__checkpoint", "trial__handout", "trial__verdict", "de
 
 
 class DamageOut(Schema):
-    """One file that is not what was recorded; `rows` and `times` [s] have first and last, of events.jsonl lines."""
+    """One file that differs from the recorded one; `rows` and `times` [s] are the first and last affected."""
 
     file: str
     what: str
@@ -56,11 +56,11 @@ class DamageOut(Schema):
 class EpisodeOut(Schema):
     """One recorded run or demonstration; `trial` is the id of the trial that it was recorded for.
 
-    `result` is success, partial (of demonstrations) or fail; "" where nobody has said. `away_since` is since when it is
-    closed on its station's computer and not here yet; null where it is here.
+    `result` is success, partial (of demonstrations) or fail; "" if it was not rated. `away_since` is the time since
+    which the closed recording is only on its station's computer; null if it is here.
 
-    While it is hidden from the caller which checkpoint made it, the trial's code stands for the checkpoint, and what
-    else would tell is empty.
+    While its checkpoint is hidden from the caller, the trial's code replaces the checkpoint's name, and every other
+    field that could reveal it is empty.
     """
 
     uuid: UUID
@@ -116,7 +116,9 @@ def _result(episode: Episode, trial: Any) -> str:
 
 
 class EpisodeDetail(EpisodeOut):
-    """With the figures of the control loop at its end, and how smoothly the robot moved (SPARC; null: not known)."""
+    """An episode with the final figures of the control loop, and the smoothness of its motion (SPARC; null if
+    unknown).
+    """
 
     configuration_hash: str
     control: dict[str, Any]
@@ -141,7 +143,7 @@ class EpisodeDetail(EpisodeOut):
 
 
 class Filters(Schema):
-    """Which episodes are meant."""
+    """Filters of episodes."""
 
     station: str = ""
     mode: EpisodeMode | None = None
@@ -222,10 +224,10 @@ def request_export(request: HttpRequest, uuid: UUID) -> Any:
     url_name="episode-publish-asked",
 )
 def episode_publish_asked(request: HttpRequest, uuid: UUID) -> Any:
-    """Write the episode into its dataset, or again with the score that counts now. Requires an operator.
+    """Write the episode into its dataset, or update it there with its current score. Requires an operator.
 
-    A demonstration is published as by its session: it must be labelled success or partial, and be neither discarded nor
-    failed by a review.
+    A demonstration is published under the rules of its session: it must be labelled success or partial, and be neither
+    discarded nor failed by a review.
     """
     require_role(request.auth, Role.OPERATOR)
     found = _found(uuid)

@@ -15,7 +15,7 @@ router = Router(tags=["find"])
 
 
 class FoundOut(Schema):
-    """One thing: its name, a few words on it, and the address of its page."""
+    """One match: its name, a short description, and the address of its page."""
 
     title: str
     detail: str
@@ -23,7 +23,7 @@ class FoundOut(Schema):
 
 
 class GroupOut(Schema):
-    """Things of one kind, the best fitting first, at most eight; `more` where there are others."""
+    """Matches of one kind, the best first, at most eight; `more` is true if there are others."""
 
     name: str
     items: list[FoundOut]
@@ -31,7 +31,7 @@ class GroupOut(Schema):
 
 
 class AllFoundOut(Schema):
-    """What fits, by kind."""
+    """All matches, grouped by kind."""
 
     groups: list[GroupOut]
 
@@ -40,7 +40,7 @@ class AllFoundOut(Schema):
 def find(request: HttpRequest, q: str) -> Any:
     """Find stations, trials by number and code, episodes by uuid, plans, checkpoints, scenes, datasets and pages.
 
-    All words of `q` (1 to 200 characters) must match. What is hidden from the caller is not found.
+    All words of `q` (1 to 200 characters) must match. Hidden things are not found.
     """
     user: Any = request.auth  # type: ignore[attr-defined]
     return {"groups": selectors.find(query=q, user=user, sight=visibility_for_request(request))}

@@ -19,11 +19,11 @@ router = Router(tags=["jobs"])
 
 
 class JobOut(Schema):
-    """One piece of work; `error` is that of the last attempt.
+    """One job; `error` is that of its last attempt.
 
-    `attempts` counts those that ended in an error, `deaths` the workers that ended or went silent over it.
-    Before the reveal a job of a blind trial has no key, no times and no words for a user who has not looked; other work
-    than that on a recording has no words either: they may name a server.
+    `attempts` counts the attempts that ended in an error, `deaths` the workers that died or became silent during it.
+    Before the reveal, a job of a blind trial has neither key, times nor texts for a user who has not unblinded the
+    plan. Jobs other than those of recordings have no texts either, because these may name a server.
     """
 
     id: int

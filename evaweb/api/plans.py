@@ -31,10 +31,10 @@ router = Router(tags=["plans"])
 
 
 class PlanOut(Schema):
-    """One version of a plan. While it is blind for the caller, `document`, `digest` and `key` are empty, and of
-    `closed_because` only that its design has ended is told.
+    """One version of a plan.
 
-    `counted` trials of `total` have their score; `attempts` were handed out.
+    While it is blind for the caller, `document`, `digest` and `key` are empty, and `closed_because` states only that
+    its design has ended. `counted` of `total` trials are scored; `attempts` were handed out.
     """
 
     name: str
@@ -85,7 +85,7 @@ class PlanOut(Schema):
 
 
 class HandoutOut(Schema):
-    """The trial that was handed out; `reason`: what became of the attempt before."""
+    """The trial that was handed out; `reason` tells why the attempt before it does not count."""
 
     code: str
     number: int
@@ -95,13 +95,13 @@ class HandoutOut(Schema):
 
 
 class StationIn(Body):
-    """Which station."""
+    """Station that runs the trial."""
 
     station: str
 
 
 class ReleaseSlotsIn(Body):
-    """Which station's trials are given to others, and why."""
+    """Station whose unused trials are released to others, and the reason."""
 
     station: str
     reason: Annotated[str, Field(min_length=1, max_length=2000)]
@@ -120,7 +120,7 @@ class Reason(Body):
 
 
 class RegionIn(Body):
-    """A named rectangle: its left upper corner and its size, as shares of the picture's width and height."""
+    """A named rectangle: its upper left corner and its size, as fractions of the picture's width and height."""
 
     name: str
     x: float
@@ -136,7 +136,7 @@ class RegionsIn(Body):
 
 
 class RegionOut(Schema):
-    """Match of one region, from 1 to 0; its object lies so many pixels to the right and down, null: it is not seen."""
+    """Match of one region, 0 to 1, and its object's offset to the right and down [pixels]; null if not found."""
 
     name: str
     at: list[float]
@@ -147,7 +147,7 @@ class RegionOut(Schema):
 
 
 class CameraMatchOut(Schema):
-    """Picture of one camera, its reference ("": none), and how well they match, from 1 down."""
+    """Picture of one camera, its reference ("" for none), and how well they match, at most 1."""
 
     camera: str
     picture: str
@@ -156,13 +156,13 @@ class CameraMatchOut(Schema):
 
 
 class LayoutOut(CameraMatchOut):
-    """The same with each region of the reference."""
+    """A camera's match together with the match of each region of its reference."""
 
     regions: list[RegionOut]
 
 
 class BenchOut(Schema):
-    """What one camera shows now: its reference, how well they match, from 1 down, and each region of it."""
+    """Current view of one camera: its reference, how well they match (at most 1), and the match of each region."""
 
     camera: str
     reference: str
@@ -186,13 +186,13 @@ class CamerasOut(Schema):
 
 
 class CamerasIn(Body):
-    """`first`: what a camera without a reference shows becomes its reference."""
+    """Confirmation of the cameras; with `first` the current picture becomes the reference of a camera without one."""
 
     first: StrictBool = False
 
 
 class ReferenceIn(Body):
-    """Of which position of which scene; without a scene of the cameras at all."""
+    """Scene and position that the references belong to; without a scene they identify the cameras themselves."""
 
     scene: str | int | None = None
     position: int | None = None
@@ -210,7 +210,7 @@ class ReferenceOut(Schema):
 
     @staticmethod
     def of(row: Reference) -> dict[str, Any]:
-        """With the user who took it."""
+        """Return the reference with the user who created it."""
         return {
             "id": row.pk,
             "camera": row.camera,
@@ -222,7 +222,7 @@ class ReferenceOut(Schema):
 
 
 class LayoutIn(Body):
-    """Why a lower match than the plan's least is accepted."""
+    """Reason for accepting a match below the plan's minimum."""
 
     override: str = ""
 
@@ -292,8 +292,9 @@ def close(request: HttpRequest, name: str, given: Reason) -> Any:
 
 @router.post("/plans/{name}/look", response={200: PlanOut, **FAILURES}, summary="Look", url_name="plan-look")
 def unblind(request: HttpRequest, name: str) -> Any:
-    """Show the caller what is behind the blind before the reveal: it is recorded, and the caller can run none of the
-    plan's trials from then on.
+    """Show the caller the hidden checkpoints before the reveal; this is recorded.
+
+    From then on the caller can run none of the plan's trials.
     """
     found = plan_get(name=name, user=request.auth)
     record_unblinding(found, request.auth)
@@ -304,7 +305,7 @@ def unblind(request: HttpRequest, name: str) -> Any:
     "/plans/{name}/reveal", response={200: PlanOut, **FAILURES}, summary="Reveal it", url_name="plan-reveal"
 )
 def reveal(request: HttpRequest, name: str) -> Any:
-    """Publish which checkpoint was which; it cannot be undone. Requires the plan's owner or an administrator."""
+    """Publish the checkpoint of every trial; this cannot be undone. Requires the plan's owner or an administrator."""
     found = plan_get(name=name, user=request.auth)
     return PlanOut.of(services.reveal_plan(user=request.auth, plan=found), request.auth)
 
@@ -327,7 +328,7 @@ def cameras(request: HttpRequest, name: str) -> Any:
     url_name="cameras-confirm",
 )
 def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
-    """Confirm that each camera shows what its reference shows; the current images are stored with it.
+    """Confirm that each camera shows its reference; the current pictures are stored with the confirmation.
 
     Requires an operator.
     """
@@ -342,7 +343,7 @@ def cameras_confirm(request: HttpRequest, name: str, given: CamerasIn) -> Any:
     url_name="references",
 )
 def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
-    """Store the cameras' current images as the reference of how the position is laid out. Requires an operator."""
+    """Store the cameras' current pictures as the references of a position's layout. Requires an operator."""
     position = None
     if given.scene is not None:
         scene = trials.scene_get(name=given.scene)
@@ -358,7 +359,7 @@ def references(request: HttpRequest, name: str, given: ReferenceIn) -> Any:
     url_name="reference-regions",
 )
 def regions(request: HttpRequest, id: int, given: RegionsIn) -> Any:
-    """Create another reference with the same image and these regions, in which the bench is compared.
+    """Create another reference with the same picture and these regions, in which the bench is compared.
 
     Requires an operator.
     """
@@ -395,9 +396,8 @@ def bench_match(request: HttpRequest, id: int) -> Any:
     url_name="achieved",
 )
 def record_layout(request: HttpRequest, id: int, given: LayoutIn) -> Any:
-    """Record before the run what the cameras show and how well it matches the position's references.
-
-    Requires an operator.
+    """Record before the run the cameras' pictures and their match with the position's references. Requires an
+    operator.
     """
     taken = bench.record_layout(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
     return Status(201, [_seen(row) for row in taken])

@@ -26,9 +26,9 @@ router = Router(tags=["preflights"])
 
 
 class PreflightOut(Schema):
-    """One preflight. `report` is what `python -m runtime.preflight --json` says, null while it is under way.
+    """One preflight; `report` is the output of `python -m runtime.preflight --json`, null while it runs.
 
-    `hidden` says why a part of it is kept back from the caller; `reason` why there is no report.
+    `hidden` is the reason why a part of it is hidden from the caller, `reason` why there is no report.
     """
 
     id: UUID
@@ -62,14 +62,14 @@ class PreflightOut(Schema):
 
 
 class PreflightIn(Body):
-    """Which checkpoint, by name or id, with the deployment of which station; without one the first that can."""
+    """Checkpoint, by name or id, and the station whose deployment is used; without one, the first that supports it."""
 
     checkpoint: str | int
     station: Annotated[str, Field(max_length=63)] = ""
 
 
 class PreflightFilters(Schema):
-    """Of which checkpoint, by name or id; without one of all."""
+    """Filter of preflights by checkpoint (name or id)."""
 
     checkpoint: str = ""
 

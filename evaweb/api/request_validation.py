@@ -99,7 +99,7 @@ class BoundedParser(Parser):
 
 
 def _without_unknown(given: Any) -> Any:
-    """Return the body; a stop without its unknown fields, because they must not prevent it."""
+    """Return the body; the body of a stop without its unknown fields, because they must not prevent the stop."""
     from evaweb.api.stations import CommandIn  # imported here: stations is validated by this module
 
     if not _stops(given):

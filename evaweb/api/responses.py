@@ -16,9 +16,9 @@ _MOST_SAID = 10  # errors listed per request
 
 
 class ErrorOut(Schema):
-    """Why it was not done: a sentence for a person, and for a page in another language its id and arguments.
+    """Reason of a refusal: a sentence for people, and its id and arguments for pages in other languages.
 
-    Sentences that were written by others, such as an operating system, have neither.
+    Sentences from elsewhere, such as the operating system, have neither.
     """
 
     error: str
@@ -27,13 +27,13 @@ class ErrorOut(Schema):
 
 
 class Body(Schema):
-    """What is posted. An unknown field is refused, because one that is misspelt does nothing."""
+    """Base of request bodies; unknown fields are refused, because a misspelt field would have no effect."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class Page(Schema, Generic[Row]):
-    """Some rows of many; `total` counts all that fit the filters."""
+    """One page of rows; `total` counts all rows that match the filters."""
 
     total: int
     limit: int
@@ -42,7 +42,7 @@ class Page(Schema, Generic[Row]):
 
 
 class Paging(Schema):
-    """Which of the rows are wanted."""
+    """Range of rows to return."""
 
     limit: Annotated[int, Field(ge=1, le=MAX_PAGE_SIZE)] = 100
     offset: Annotated[int, Field(ge=0, le=2**53)] = 0

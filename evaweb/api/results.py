@@ -57,7 +57,7 @@ _PLAN = "/plans/{name}/{int:version}"
 
 
 class TrialFilters(Schema):
-    """Which trials are meant, all of them together; "" where it does not matter."""
+    """Filters of trials, which must all match; "" matches everything."""
 
     scene: str = ""
     position: str = ""
@@ -95,11 +95,13 @@ class RatingOut(Schema):
 
 
 class JudgementOut(Schema):
-    """What an automatic judge said of a trial.
+    """Verdict of an automatic judge on a trial.
 
-    `milestones` is JSON: [[text, reached, probability that it was], ...], null twice for no verdict; `reason` says why
-    there is none at all. `pictures` is JSON: [[camera, time in s, SHA-256], ...] of those it was shown; `prompt` is the
-    SHA-256 of the words.
+    `milestones` is JSON: [[text, reached, probability of having been reached], ...], with two nulls if the judge gave
+    no
+    verdict on it; `reason` tells why there is none at all. `pictures` is JSON: [[camera, time in s, SHA-256], ...] of
+    the
+    pictures that the judge was shown; `prompt` is the SHA-256 of the prompt.
     """
 
     uuid: UUID
@@ -153,7 +155,7 @@ class PreferenceOut(Schema):
 
 
 class ScoreRow(Schema):
-    """One score of a trial; the newest of a trial counts, the others are what it replaced."""
+    """One score of a trial; only the newest counts."""
 
     uuid: UUID
     trial: int
@@ -179,7 +181,7 @@ class ScoreRow(Schema):
 
 
 class PlannerIn(Schema):
-    """A question to the planner; see its page."""
+    """Wanted difference and available time, as on the planner's page."""
 
     rate: Annotated[float, Field(ge=0, le=1)] = _USUAL.rate
     better: Annotated[float, Field(ge=0, le=1)] = _USUAL.better
@@ -199,11 +201,11 @@ class PlannerIn(Schema):
     url_name="plan-results",
 )
 def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilters]) -> Any:
-    """Of each checkpoint, of each pair, of raters, automatic judges and preferences; intervals are at 95 %.
+    """Return the results of checkpoints, pairs, raters, automatic judges and preferences, with 95 % intervals.
 
-    What the plan's design decided stands in `headline` and `planned`; all else describes. A comparison whose design has
-    not ended (`standing` is "open") has neither test nor evidence. Of a revealed plan the figures are of the scores at
-    the reveal; `corrected` has rates with those of now, where they differ.
+    `headline` and `planned` contain what the plan's design has decided; all other fields describe. A comparison whose
+    design has not ended (`standing` is "open") has neither test nor evidence. For a revealed plan the figures are
+    of the scores at the reveal; `corrected` has the rates with the current scores, if they differ.
     """
     plan, which = _seen(request, name, version, only)
     analysis = with_planned_letters(plan, caching.cached_analysis(plan, which))
@@ -233,9 +235,7 @@ def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilt
     url_name="plan-integrity",
 )
 def integrity(request: HttpRequest, name: str, version: int) -> Any:
-    """Return looks, voids, corrections, amendments, deviations and delays, and the headline with the doubtful trials
-    left out.
-    """
+    """Return looks, voids, corrections, amendments, deviations, delays, and the headline without doubtful trials."""
     plan, _ = _seen(request, name, version, TrialFilters())
     return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **integrity_document(plan)}
 
@@ -247,8 +247,10 @@ def integrity(request: HttpRequest, name: str, version: int) -> Any:
     url_name="plan-simulated",
 )
 def simulated(request: HttpRequest, name: str, version: int) -> Any:
-    """Return the comparison with each plan of the same checkpoints on simulated benches: rates, rank correlation, mean
-    maximum rank violation, and prediction-powered differences (null with fewer than eight matched trials).
+    """Return the comparison with each plan of the same checkpoints on simulated benches.
+
+    It has rates, rank correlation, mean maximum rank violation, and prediction-powered differences (null with fewer
+    than eight matched trials).
     """
     plan, _ = _seen(request, name, version, TrialFilters())
     user: Any = request.auth  # type: ignore[attr-defined]
@@ -320,9 +322,7 @@ def checkpoint(
 def comparison(
     request: HttpRequest, name: str, version: int, first: str, second: str, only: Query[TrialFilters]
 ) -> Any:
-    """Return difference, tests and evidence of the first checkpoint minus the second, in whichever order the page has
-    them.
-    """
+    """Return difference, tests and evidence of the first checkpoint minus the second."""
     plan, which = _seen(request, name, version, only)
     analysis = caching.cached_analysis(plan, which)
     found = analysis.comparison_of(first, second)
@@ -345,8 +345,9 @@ def outcomes(
     paging: Query[Paging],
     format: Format = "json",
 ) -> Any:
-    """Return the trials in the order in which they were handed out, also those that do not count; CSV and Parquet have
-    all.
+    """Return the trials in the order in which they were handed out, including those that do not count.
+
+    CSV and Parquet have all of them, without pages.
     """
     plan, which = _seen(request, name, version, only)
     if format != "json":
@@ -364,7 +365,7 @@ def outcomes(
 def scores(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
-    """Return the scores, also those that were corrected."""
+    """Return all scores, including those that were corrected later."""
     plan, _ = _seen(request, name, version, TrialFilters())
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "scores", rows, ScoreRow, paging, format)
@@ -422,7 +423,7 @@ def preferences(
     "/planner", response={200: dict[str, Any], **FAILURES}, summary="How many trials", url_name="planner"
 )
 def planner(request: HttpRequest, asked: Query[PlannerIn]) -> Any:
-    """Return the trials and robot hours for a wanted difference, and the power of the trials that there is time for."""
+    """Return the trials and robot hours needed for a difference, and the power of as many trials as the time allows."""
     question = question_of({name: str(value) for name, value in asked.model_dump().items()})
     user: Any = request.auth  # type: ignore[attr-defined]
     return {"question": asked.model_dump(), **table_of(question, user.pk)}

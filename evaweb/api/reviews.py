@@ -23,7 +23,7 @@ _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class FlagOut(Schema):
-    """A finding in the frames `first` to `last`, both included; -1 both where it is about no frame."""
+    """A finding in the frames `first` to `last`, both included; both are -1 if it concerns no frame."""
 
     kind: str
     severity: Literal["info", "warning", "error"]
@@ -43,7 +43,7 @@ class CountOut(Schema):
 
 
 class QualityOut(Schema):
-    """Findings of the checks; `unchecked` says what could not be judged."""
+    """Findings of the quality checks; `unchecked` lists what could not be checked."""
 
     episode: str
     frames: int
@@ -57,7 +57,7 @@ class QualityOut(Schema):
 
 
 class ReviewOut(Schema):
-    """One reviewer's verdict or note, of one `frame` or of all; the newest pass or fail counts."""
+    """One reviewer's verdict or note on a `frame` or the whole episode; the newest pass or fail counts."""
 
     uuid: UUID
     verdict: str
@@ -74,7 +74,7 @@ class ReviewOut(Schema):
 
 
 class SegmentOut(Schema):
-    """A part of an episode, both frames included; `milestone` is what is reached at its last one."""
+    """A segment of an episode, first and last frame included; `milestone` is the one reached at its last frame."""
 
     uuid: UUID
     first: int
@@ -95,7 +95,7 @@ class SegmentOut(Schema):
 
 
 class LabelOut(Schema):
-    """A word for parts of episodes; `key` begins and ends such a part in Replay."""
+    """A label for segments of episodes; `key` starts and ends such a segment in Replay."""
 
     words: str
     colour: SegmentLabel.Colour
@@ -103,9 +103,9 @@ class LabelOut(Schema):
 
 
 class EpisodeReviewsOut(Schema):
-    """All that is said of an episode: reviews newest first, segments in order, the report where there is one.
+    """Reviews (newest first), segments (in order) and quality report of an episode.
 
-    `covered`: how much of that others say, kept from whoever may still have to judge its trial.
+    `covered` counts those of others that are hidden from a caller who may still have to judge its trial.
     """
 
     verdict: ReviewOut | None
@@ -117,7 +117,7 @@ class EpisodeReviewsOut(Schema):
 
 
 class ReviewIn(Body):
-    """A verdict, or a note that leaves the verdict as it is; of the moment `frame`, or of the whole episode."""
+    """A verdict, or a note without one, on the moment `frame` or the whole episode."""
 
     verdict: Annotated[str, Field(description="pass, fail or note")]
     note: str = ""
@@ -125,7 +125,7 @@ class ReviewIn(Body):
 
 
 class SegmentIn(Body):
-    """A part of the episode; with `segment`, one of one's own is changed."""
+    """A segment of the episode; with `segment` it replaces one of the caller's own."""
 
     first: _Frame
     last: _Frame
@@ -135,14 +135,14 @@ class SegmentIn(Body):
 
 
 class TagsIn(Body):
-    """Tags to put on it and to take off; each is kept in small letters."""
+    """Tags to add and to remove; they are stored in lower case."""
 
     add: Annotated[list[str], Field(default_factory=list, max_length=30)]
     remove: Annotated[list[str], Field(default_factory=list, max_length=30)]
 
 
 class TagsOut(Schema):
-    """Its tags now, and what of that was changed."""
+    """The episode's tags afterwards, and the changes."""
 
     tags: list[str]
     added: list[str]
@@ -150,14 +150,14 @@ class TagsOut(Schema):
 
 
 class TagOut(Schema):
-    """A tag of the lab, and how many episodes have it."""
+    """A tag of the lab and the number of episodes that have it."""
 
     words: str
     episodes: int
 
 
 class NextOut(Schema):
-    """An episode without a pass or fail, None where there is no other; `waiting` counts all."""
+    """Next episode without a verdict, null if there is none; `waiting` counts all of them."""
 
     episode: UUID | None
     waiting: int
@@ -181,7 +181,7 @@ def next_unreviewed(request: HttpRequest, after: UUID | None = None) -> Any:
     url_name="segment-labels",
 )
 def labels(request: HttpRequest) -> Any:
-    """Return the labels in the lab's order without retired ones; segments may have other labels."""
+    """Return the labels in the lab's order, without retired ones, which segments may still have."""
     return selectors.labels_offered()
 
 
@@ -270,7 +270,7 @@ def quality(request: HttpRequest, uuid: UUID) -> Any:
     url_name="episode-quality-asked",
 )
 def request_quality(request: HttpRequest, uuid: UUID) -> Any:
-    """Queue the quality checks of an episode, again if there were any.
+    """Queue the quality checks of an episode, even if it was checked before.
 
     Requires an operator. The job reports the progress.
     """

@@ -25,7 +25,7 @@ class PositionOut(Schema):
 
 
 class MilestoneOut(Schema):
-    """One step on the way to success; `truth` is the name that a simulated bench has for it."""
+    """One step towards success; `truth` is its name in the ground truth of a simulated bench."""
 
     id: int
     order: int

@@ -29,7 +29,7 @@ _Target = Annotated[
 
 
 class SessionOut(Schema):
-    """One task demonstrated at one station for one dataset; `closed_at` null while it goes on."""
+    """One task demonstrated at one station for one dataset; `closed_at` is null while the session is open."""
 
     uuid: UUID
     station: str
@@ -49,7 +49,7 @@ class SessionOut(Schema):
 
 
 class CountsOut(Schema):
-    """Episodes: `saved` are whole and not discarded, those by result among them; `cut` ended in a fault."""
+    """Numbers of episodes: `saved` are complete and not discarded, also counted by result; `cut` ended in a fault."""
 
     saved: int
     success: int
@@ -71,7 +71,7 @@ class SessionEventOut(Schema):
 
 
 class DemonstrationOut(Schema):
-    """An episode of the session with its newest label, "" while it has none."""
+    """An episode of the session with its newest label, "" if it has none."""
 
     episode: UUID
     status: str
@@ -86,7 +86,10 @@ class DemonstrationOut(Schema):
 
 
 class SessionDetail(SessionOut):
-    """With set-up, counts, history and episodes, the newest first; `folder` is its dataset's, `version` "" if new."""
+    """A session with set-up, counts, history and episodes (newest first).
+
+    `folder` is that of its dataset; `version` is "" if the dataset is new.
+    """
 
     setup: dict[str, Any]
     counts: CountsOut
@@ -131,7 +134,7 @@ class SessionDetail(SessionOut):
 
 
 class SessionIn(Body):
-    """Task to be demonstrated; `dataset` "" takes the one that the deployment names."""
+    """Task to be demonstrated; with `dataset` "" the deployment's dataset is used."""
 
     task: str
     dataset: str = ""
@@ -145,7 +148,7 @@ class TargetIn(Body):
 
 
 class PublishIn(Body):
-    """Which results are published, and the version of a dataset that is new, "" for the usual one."""
+    """Results to be published, and the version of a new dataset ("" for the default)."""
 
     results: Annotated[
         list[Literal["success", "partial", "fail"]],
@@ -155,7 +158,7 @@ class PublishIn(Body):
 
 
 class QueuedOut(JobOut):
-    """A job that is not done, with how long it still takes [s] where that is known."""
+    """A job that has not finished, with its remaining time [s] if known."""
 
     episode: UUID
     left_s: float | None
@@ -167,7 +170,7 @@ class QueuedOut(JobOut):
 
 
 class QueueOut(Schema):
-    """Failed, running and waiting work for the session's episodes; `left_s` of all that runs and waits."""
+    """Failed, running and waiting jobs of a session's episodes; `left_s` is the time for the latter two."""
 
     done: int
     total: int

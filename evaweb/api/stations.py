@@ -72,7 +72,7 @@ class RequestOut(Schema):
 
 
 class LeaseOut(Schema):
-    """Holder of a station's lease, "" for none, and the requests that wait for it."""
+    """Holder of a station's lease ("" for none), and the open requests for it."""
 
     holder: str
     user: str
@@ -82,7 +82,7 @@ class LeaseOut(Schema):
 
     @staticmethod
     def of(station: Station) -> dict[str, Any]:
-        """Return the lease as the database has it now."""
+        """Return the lease as stored in the database now."""
         lease = selectors.lease_open(station=station)
         return {
             "holder": lease.holder if lease else "",
@@ -112,10 +112,10 @@ class StationOut(Schema):
 
 
 class StationDetail(StationOut):
-    """With the runtime's newest snapshot, or why there is none, and the trial that is not finished.
+    """A station with the runtime's newest snapshot, or the reason why there is none, and its unfinished trial.
 
-    While the station has to do with a blind plan the snapshot is without what tells which checkpoint it is set up for,
-    and says so: "veiled".
+    While the station runs a blind plan, everything that reveals its checkpoint is removed from the snapshot, which is
+    then marked "veiled".
     """
 
     snapshot: dict[str, Any] | None
@@ -124,9 +124,10 @@ class StationDetail(StationOut):
 
 
 class LeaseIn(Body):
-    """Action on a lease; `request` is the id of another user's, `reason` why an administrator takes it.
+    """Action on a lease; `request` is the id of another user's request, `reason` is an administrator's for taking it.
 
-    `move` brings one's own lease from another page to this one."""
+    `move` transfers the caller's own lease from another page to this one.
+    """
 
     action: Literal["claim", "give_up", "request", "withdraw", "hand_over", "decline", "move", "take"]
     page: PageId
@@ -135,14 +136,14 @@ class LeaseIn(Body):
 
 
 def _no_trial(args: dict[str, Any]) -> dict[str, Any]:
-    """Refuse `trial` in the args: the run of a trial is checked first, see evaweb.trials.station_commands."""
+    """Reject a `trial` in the args: a trial's run is checked first, see evaweb.trials.station_commands."""
     if "trial" in args:
         raise ValueError("args name a trial: name it beside them, as `trial`")
     return args
 
 
 class ReplayIn(Body):
-    """A recorded episode, by its uuid or as DATASET:INDEX; `robot` is whose numbers those of a dataset are."""
+    """A recorded episode, by its uuid or as DATASET:INDEX; `robot` names the robot of a dataset's values."""
 
     episode: Annotated[str, Field(min_length=1, max_length=220)]
     space: Literal["joint", "eef"] = "joint"
@@ -150,10 +151,10 @@ class ReplayIn(Body):
 
 
 class CommandIn(Body):
-    """A discrete verb; boot and sequence are those of the snapshot that it was decided by.
+    """A discrete command; `boot` and `sequence` are those of the snapshot that the decision was based on.
 
-    With `trial`, set-up and run get their arguments from the trial, with `session` from what is collected;
-    `checkpoint`, by name or id, and `replay` are for a set-up without one. Tables of one's own are for administrators.
+    With `trial`, set-up and run get their arguments from the trial, with `session` from the collecting session.
+    `checkpoint` (name or id) and `replay` are for a set-up without them. Only administrators may pass their own tables.
     """
 
     uuid: UUID
@@ -170,9 +171,9 @@ class CommandIn(Body):
 
 
 class CommandOut(Schema):
-    """Result of a command: 200 accepted or done, 409 refused or failed, 504 not known.
+    """Result of a command: 200 accepted or done, 409 refused or failed, 504 unknown.
 
-    Of a trial of a blind plan `reason` and `data` are without what tells which checkpoint it is of.
+    For a trial of a blind plan, `reason` and `data` do not contain what would reveal its checkpoint.
     """
 
     uuid: UUID
@@ -185,7 +186,7 @@ class CommandOut(Schema):
 
 
 class EStopIn(Schema):
-    """Why; the same uuid again is the same press. Pressing is never refused for what is said with it."""
+    """Reason of a press; the same uuid again is the same press. No content makes a press invalid."""
 
     uuid: UUID | None = None
     why: str = "pressed"
@@ -205,7 +206,7 @@ class EStopIn(Schema):
 
 
 class TrialIn(Body):
-    """Next trial; scene and checkpoint by name or id, the position by its number."""
+    """Trial to be prepared: scene and checkpoint by name or id, the position by its number."""
 
     scene: str | int
     position: int

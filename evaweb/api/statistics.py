@@ -18,7 +18,7 @@ router = Router(tags=["statistics"])
 
 
 class StatisticsOut(Schema):
-    """One checkpoint at one scene. Rates never stand without n and interval; null where n is 0."""
+    """Summary of one checkpoint at one scene. Every rate comes with n and an interval; null if n is 0."""
 
     scene: str
     scene_title: str
@@ -68,7 +68,7 @@ class StatisticsOut(Schema):
 
 
 class Statistics(Schema):
-    """All rows, by scene and checkpoint name: their order is no ranking."""
+    """All summaries, sorted by scene and checkpoint name, which is no ranking."""
 
     method: str
     items: list[StatisticsOut]

@@ -139,7 +139,10 @@ class StopGateway:
         return await _answered(self._as_of_here(scope), asked[1], asked[2], body)
 
     async def _ready(self, scope: dict[str, Any]) -> Answered:
-        """Return the caller's name, which also caches their credentials, so that a first press needs no lookup."""
+        """Return the caller's name.
+
+        This also caches the credentials, so that the first press needs no lookup.
+        """
         try:
             user = (await _resolve_presser(scope)).username
         except Unverifiable:
@@ -250,7 +253,7 @@ async def _resolve_presser(scope: dict[str, Any]) -> Login:
 
 
 async def _resolve_stopper(scope: dict[str, Any]) -> tuple[str, Login]:
-    """Return kind of credential and login of the client that stops.
+    """Return the kind of credential and the login of the client that stops.
 
     Raises:
         Refused: If they are missing, unknown, or cannot be verified.

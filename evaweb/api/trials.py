@@ -29,7 +29,7 @@ router = Router(tags=["trials"])
 
 
 class Filters(Schema):
-    """Which trials are meant: each by name (or id), all of them together."""
+    """Filters of trials by names or ids, which must all match."""
 
     evaluation: str = ""
     checkpoint: str = ""
@@ -50,10 +50,10 @@ _Columns: Any = create_model(
 
 
 class TrialOut(_Columns):
-    """One attempt, flat; success, score, note and rater are those of the newest score.
+    """One attempt as a flat row; success, score, note and rater are those of its newest score.
 
-    `code` is what a trial of a plan was handed out under, "" for others. While it is hidden from the caller which
-    `checkpoint` it is of, the code stands there too.
+    `code` is the blind code of a trial of a plan, "" for others. While its checkpoint is hidden from the caller, the
+    code also replaces `checkpoint`.
     """
 
     @staticmethod
@@ -63,7 +63,7 @@ class TrialOut(_Columns):
 
 
 class OutcomeOut(Schema):
-    """A milestone as it was when it was scored."""
+    """A milestone as it was at the time of scoring."""
 
     order: int
     text: str
@@ -74,7 +74,7 @@ class OutcomeOut(Schema):
 
 
 class ScoreOut(Schema):
-    """One rater's score; the newest one counts, none is ever changed."""
+    """One rater's score; only a trial's newest score counts."""
 
     uuid: UUID
     rater: str
@@ -100,7 +100,7 @@ class ScoreOut(Schema):
 
 
 class VoidRequestOut(Schema):
-    """A void of a scored trial of a blind plan, which a second operator agrees to or refuses; `answer` "" till then."""
+    """Request to void a scored trial of a blind plan; `answer` is "" until a second operator has answered it."""
 
     uuid: UUID
     reason: str
@@ -132,7 +132,7 @@ _Detail: Any = create_model(
 
 
 class TrialDetail(_Detail):
-    """A trial with all its scores, the newest first, and what a simulated bench says of its end."""
+    """A trial with all its scores (newest first), and the ground truth of a simulated bench at its end."""
 
     @staticmethod
     def of(trial: Trial, sight: Visibility) -> dict[str, Any]:
@@ -143,10 +143,10 @@ class TrialDetail(_Detail):
 
 
 class ScoreIn(Body):
-    """A score: every milestone of the scene by id; `success` only where none of them is required.
+    """A score: every milestone of the scene by id; `success` only if the scene requires none of them.
 
-    A trial that has a score takes another one as a correction, with a `reason`. After a lost answer a client sends the
-    same again: with its `uuid`, or word by word, it is the first score once more.
+    For a scored trial it is a correction and needs a `reason`. If the answer was lost, a client sends the same again:
+    the `uuid`, or else identical content, identifies it as the first score.
     """
 
     milestones: Annotated[dict[str, StrictBool], Field(default_factory=dict)]
@@ -171,7 +171,7 @@ class ScoreIn(Body):
 
 
 class FailureIn(Body):
-    """Why a scored trial failed; null leaves that level as it is, "" takes it away."""
+    """Phase and cause of a failure; null leaves that field unchanged, "" clears it."""
 
     failure: str | None = None
     failure_phase: str | None = None
@@ -188,7 +188,7 @@ class Reason(Body):
 
 
 class VoidAnswer(Reason):
-    """Whether the trial is to be voided; a refusal with its reason."""
+    """Agreement to a void, or a refusal with its reason."""
 
     agree: StrictBool
 
@@ -229,7 +229,7 @@ def score(request: HttpRequest, id: int, given: ScoreIn) -> Any:
     url_name="failure",
 )
 def failure(request: HttpRequest, id: int, given: FailureIn) -> Any:
-    """Correct the failure's phase and cause and nothing else; the score before stays in the record.
+    """Correct only the failure's phase and cause; the earlier score stays in the record.
 
     Requires an operator.
     """
@@ -240,10 +240,10 @@ def failure(request: HttpRequest, id: int, given: FailureIn) -> Any:
 
 @router.post("/{int:id}/void", response={200: TrialDetail, **FAILURES}, summary="Void it", url_name="void")
 def void(request: HttpRequest, id: int, given: Reason) -> Any:
-    """Take it out of the count, with a reason; operators. Its repetition is another attempt.
+    """Void the trial, with a reason; it is then repeated as another attempt. Requires an operator.
 
-    A scored trial of a blind plan is void_asked then, until a second blind operator has answered; without an answer
-    within 14 days, or at the reveal, it counts.
+    A scored trial of a blind plan becomes void_asked until a second blind operator answers; without an answer within 14
+    days, or at the reveal, it counts.
     """
     voids.void_trial(user=request.auth, trial=selectors.trial_get(id=id), reason=given.reason)
     return TrialDetail.of(selectors.trial_get(id=id), visibility_for_request(request))
