@@ -116,9 +116,7 @@ def _result(episode: Episode, trial: Any) -> str:
 
 
 class EpisodeDetail(EpisodeOut):
-    """An episode with the final figures of the control loop, and the smoothness of its motion (SPARC; null if
-    unknown).
-    """
+    """An episode with the control loop's final figures and its smoothness (SPARC; null if unknown)."""
 
     configuration_hash: str
     control: dict[str, Any]

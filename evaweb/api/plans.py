@@ -396,8 +396,9 @@ def bench_match(request: HttpRequest, id: int) -> Any:
     url_name="achieved",
 )
 def record_layout(request: HttpRequest, id: int, given: LayoutIn) -> Any:
-    """Record before the run the cameras' pictures and their match with the position's references. Requires an
-    operator.
+    """Record before the run what the cameras show, and how well it matches the position's references.
+
+    Requires an operator.
     """
     taken = bench.record_layout(user=request.auth, trial=trials.trial_get(id=id), override=given.override)
     return Status(201, [_seen(row) for row in taken])
