@@ -59,9 +59,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(_: argparse.Namespace) -> int:
-    """q q^T is linear in the matrix; its row with the largest diagonal entry is the numerically safest
-    multiple of q.
-    """
+    """Print the name and title of every robot; return 1 if one of them cannot be loaded."""
     broken = 0
     for name in robot_names():
         try:

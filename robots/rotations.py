@@ -75,7 +75,10 @@ def transform_of(pose: Float64) -> Float64:
 
 
 def quaternion_of_matrix(matrix: Float64) -> Float64:
-    """Return the unit quaternions [..., 4] with w >= 0 of rotations [..., 3, 3]."""
+    """Return the unit quaternions [..., 4] with w >= 0 of rotations [..., 3, 3].
+
+    4 q q^T is linear in the matrix; its row with the largest diagonal entry is the numerically safest multiple of q.
+    """
     outer = (matrix.reshape(*matrix.shape[:-2], 9) @ _OUTER).reshape(*matrix.shape[:-2], 4, 4) + _IDENTITY
     largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     if matrix.ndim == 2:
