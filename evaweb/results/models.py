@@ -71,7 +71,7 @@ class Preference(models.Model):
     blind = models.BooleanField(help_text="Whether the rater could not know which checkpoints they were.")
     at = models.DateTimeField(default=timezone.now)
 
-    append_only = AppendOnly("what somebody preferred is never changed or removed")
+    append_only = AppendOnly("a preference is never changed or removed")
 
     class Meta:
         ordering = ("plan", "pk")

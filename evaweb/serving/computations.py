@@ -51,9 +51,7 @@ _SPENT = Pattern(
     "your questions have taken {spent:.0f} s of computing; allowed: {at_once:g} s at once. Try again in {seconds:d} s",
 )
 _CROWDED = fixed("web.computing.crowded", "too many questions are being computed: try again in a few seconds")
-_LOST = fixed(
-    "web.computing.lost", "the process that computes has ended: try again; the log of the web says more"
-)
+_LOST = fixed("web.computing.lost", "the computing process has ended: try again; see the log of the web")
 
 
 class Busy(EvaError):

@@ -33,7 +33,7 @@ _NOWHERE = Pattern(
 )
 _NO_METHOD = Pattern("web.no_method", "{method:.20} is not possible at this address; allowed: {allowed}")
 _DATABASE_AWAY = fixed("web.database_away", "the database is busy or gone: try again")
-_FAILED = fixed("web.failed", "this failed; the log of the web says why")
+_FAILED = fixed("web.failed", "this failed; see the log of the web")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):

@@ -14,7 +14,7 @@ from runtime.core.sentences import Pattern
 
 _ALLOWED_OTHER_WORDS_NONE_WHERE = Pattern(
     "trials.failures.allowed_other_words_none_where",
-    "{field} = {words!r}; allowed: other words, or none where nothing is said of it",
+    "{field} = {words!r}; allowed: other words, or none if it is not specified",
 )
 _BUT_TRIAL_SUCCESS_LEAVE_EMPTY = Pattern(
     "trials.failures.but_trial_success_leave_empty",

@@ -386,7 +386,7 @@ class Trial(models.Model):
     changed_at = models.DateTimeField(auto_now=True)
 
     append_only = AppendOnly(
-        "of a scored trial it is never changed what was tried, where, by whom, and what was said of it",
+        "a scored trial's checkpoint, position, operator and scores are never changed",
         (
             *(
                 "uuid",
@@ -476,7 +476,7 @@ class VoidRequest(models.Model):
     answered_at = models.DateTimeField(null=True, blank=True)
 
     append_only = AppendOnly(
-        "what was asked for is answered once, never changed or removed",
+        "an answered request is never changed or removed",
         except_columns=("answer", "answer_reason", "answered_by", "answered_at"),
         never=(
             "OLD.answer <> '' AND (NEW.answer <> OLD.answer OR NEW.answer_reason <> OLD.answer_reason OR "

@@ -86,8 +86,8 @@ _UUID_OF_ANOTHER_SCORE = Pattern(
 )
 _SAID_BEFORE = Pattern(
     "trials.services.said_before",
-    "you said just this of trial {trial} before, and it was corrected since: where it is not that message once more, "
-    "give another reason, or a uuid",
+    "you sent just this for trial {trial} before, and it was corrected since: unless it is that message once "
+    "more, give another reason, or a uuid",
 )
 _SCORED_ALREADY = Pattern(
     "trials.services.scored_already",

@@ -61,9 +61,7 @@ def check_term(given: str) -> None:
     if given != given.strip():
         raise ValidationError(_sentence(given, "words without blanks around them"))
     if is_unspecified(given):
-        raise ValidationError(
-            _sentence(given, "other words: these stand for failures of which nothing was said")
-        )
+        raise ValidationError(_sentence(given, "other words: these mean a failure that is not specified"))
 
 
 def check_milestones(texts: Sequence[str]) -> None:

@@ -53,7 +53,8 @@ def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> 
         return FileCamera(key, settings, clock, threaded=not virtual)
     if virtual:
         raise SetupError(
-            f"cameras.{key}: kind {kind!r} goes on by itself, and lockstep has no real time; allowed there: 'file'"
+            f"cameras.{key}: kind {kind!r} runs in real time, and lockstep has a clock of its own; allowed "
+            "there: 'file'"
         )
     return LiveCamera(key, kind, settings, _address(key, settings), clock)
 

@@ -39,7 +39,7 @@ class Jpegs:
             self._pictures += 1
             yield picture
         if len(self._held) > MOST_BYTES:
-            raise ValueError(f"what it sends as a picture has no end within {MOST_BYTES >> 20} MiB")
+            raise ValueError(f"a picture that it sends has no end within {MOST_BYTES >> 20} MiB")
 
     @property
     def is_single(self) -> bool:

@@ -92,7 +92,7 @@ def _device(error: Exception, address: Address) -> str:
         return "it is no camera"
     if number == errno.EINVAL:
         asked = ", ".join(f"{key} = {value}" for key, value in address.options.items())
-        return f"it cannot do what it is asked for ({asked or 'nothing in particular'})"
+        return f"it cannot do what was requested ({asked or 'nothing in particular'})"
     return f"it cannot be read: {getattr(error, 'strerror', '') or type(error).__name__}"
 
 
@@ -102,7 +102,7 @@ def _no_video(error: Exception, address: Address) -> str:
     if parts.scheme in ("rtsp", "rtsps", "http", "https") and not _resolves(parts.hostname or ""):
         return f"the host {parts.hostname} is not known"
     if parts.scheme in ("rtsp", "rtsps"):
-        return "what answers there is no RTSP server with a video"
+        return "the server there is not an RTSP server with a video"
     if parts.scheme in ("http", "https"):
         given = _content_type(address.shown)
         if given.startswith("multipart/"):

@@ -210,7 +210,7 @@ class VideoStream:
         except TooLargeError as error:
             raise CameraError(str(error)) from None
         except ValueError:
-            raise CameraError(f"its pixel format {frame.format.name} cannot be made RGB") from None
+            raise CameraError(f"its pixel format {frame.format.name} cannot be converted to RGB") from None
 
 
 # A live stream is analysed only briefly, and frames are not delayed for reordering.

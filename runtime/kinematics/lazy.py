@@ -80,4 +80,4 @@ class LazyKinematics(Kinematics):
         except RuntimeFault:
             raise
         except Exception as error:  # of a compiler or library; the coordinator must survive it
-            raise SetupError(f"kinematics cannot be made: {type(error).__name__}: {error}") from error
+            raise SetupError(f"kinematics cannot be created: {type(error).__name__}: {error}") from error

@@ -91,7 +91,7 @@ def _exchange(
             elif over:
                 break
     except CodecError as error:
-        raise TransportError(f"{endpoint} answers what cannot be read: {error}") from None
+        raise TransportError(f"{endpoint}: unreadable answer: {error}") from None
     finally:
         ended(dealer, monitor)
     raise TransportError(

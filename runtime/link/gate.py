@@ -57,7 +57,7 @@ _PENDING_S = 30.0
 _HOPE_S = 0.8  # [s] that a press waits for a link just lost before its sender is answered
 _HELD_S = 5.0  # [s] after which a press that could not be sent is dropped
 _MOST_HELD = 64
-_LOST = "the link to its computer is lost: it goes on by its own rules"
+_LOST = "the link to its computer is lost: it continues by its own rules"
 _NOT_RUNNING = "its computer is linked, and the station does not run there: start it"
 
 
@@ -243,7 +243,7 @@ class Gate:
         try:
             return self._handle(arrival)
         except Exception:
-            log.exception("what a station's computer says cannot be taken up")
+            log.exception("a message of a station's computer cannot be processed")
             self._door.cut(arrival.route, "the lab could not process its message: see the log of its gate")
             return ""
 

@@ -158,7 +158,7 @@ class _Desk:
             log.exception("%s: an episode cannot be taken in", self._shelf.station)
             self._shelf.drop()
             episode = getattr(message, "episode", "")
-            return [Declined(episode, "the lab cannot take it in: its log says why", _LATER_S)]
+            return [Declined(episode, "the lab cannot store it: see its log", _LATER_S)]
 
 
 @dataclass(slots=True)

@@ -143,7 +143,7 @@ class LabStreams:
                 self._handle(arrival)
             except Exception:  # streams of other stations must go on
                 log.exception("streams of a station's computer cannot be taken up")
-                self._door.cut(arrival.route, "the lab cannot take up what it sends: see the log of its gate")
+                self._door.cut(arrival.route, "the lab cannot process what it sends: see the log of its gate")
         self._answer_senders()
         for route in self._door.gone:
             self._forget_sender(route)
@@ -300,7 +300,7 @@ class LabStreams:
             else:
                 sender.offered -= 1
             if not self._door.send(route, message):
-                self._cut_sender(route, "it does not read what it is asked for", _SOON_S)
+                self._cut_sender(route, "it does not read what it requested", _SOON_S)
 
     def _cut_sender(self, route: bytes, why: str, again_s: float = 30.0) -> None:
         self._forget_sender(route)

@@ -250,5 +250,5 @@ class Line:
                 )
             if event["event"] in (zmq.EVENT_DISCONNECTED, zmq.EVENT_CLOSED):
                 return "the lab does not answer at this address, or has closed the connection", None
-            return "who answers at this address is not this lab, or speaks another protocol", None
+            return "the server at this address is not this lab, or speaks another protocol", None
         return None

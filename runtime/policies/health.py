@@ -86,7 +86,8 @@ def _get_status(
     status = _STATUS.match(answer)
     if status is None:
         raise WrongProtocolError(
-            f"{url}: what listens there is no web server, it says {answer[:40]!r}: check host, port and policy.kind"
+            f"{url}: a server listens there that is not a web server, it answers {answer[:40]!r}: check host, "
+            "port and policy.kind"
         )
     return int(status[1]), status[2].decode("latin-1").strip()
 

@@ -31,7 +31,7 @@ _OTHER_PROTOCOL = Pattern(
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 log = logging.getLogger(__name__)
-_REPEATED = fixed("policy.server.repeated", "the answer is byte for byte the one before, to another question")
+_REPEATED = fixed("policy.server.repeated", "the answer is byte for byte the one before, to another request")
 
 
 class ServerSettings(Settings):

@@ -254,8 +254,8 @@ class PreflightRunner:
         answers = [call.ms for call in self._policy.calls if call.name == "infer"] if self._policy else []
         if len(answers) > 1 and answers[1] > 1000.0 * chunk.seconds:
             made.append(
-                f"an answer takes {answers[1]:.0f} ms and is {1000.0 * chunk.seconds:.0f} ms of motion: the robot will "
-                "stand and wait"
+                f"an answer takes {answers[1]:.0f} ms and is {1000.0 * chunk.seconds:.0f} ms of motion: the "
+                "robot will stop and wait"
             )
         return made
 

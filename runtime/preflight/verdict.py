@@ -92,7 +92,7 @@ _ADVICE = {
     "correct the table, never guess.",
     PreflightVerdict.NOT_FINITE: "The model computes what is no number: look at its checkpoint and its normalisation.",
     PreflightVerdict.CONTRADICTION: "Server and deployment say different things: correct the one that is wrong.",
-    PreflightVerdict.FAILED: "Read the sentence; it is none of the usual cases.",
+    PreflightVerdict.FAILED: "Read the sentence; this is not one of the usual cases.",
 }
 
 # The first match counts, so subclasses precede their base.

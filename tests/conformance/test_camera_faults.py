@@ -18,7 +18,7 @@ NO_MJPEG = "no MJPEG stream: it answers with {}, not multipart/x-mixed-replace"
 ON_OPENING = {
     "rtsp": {
         "mute": MUTE,
-        "garbage": "what answers there is no RTSP server with a video",
+        "garbage": "the server there is not an RTSP server with a video",
         "not_found": "404: there is nothing at that path",
         "no_login": LOGIN,
         "silent": MUTE,

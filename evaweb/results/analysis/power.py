@@ -181,7 +181,7 @@ class _Desk:
                 found = replace(so_far, fault=str(error))
             except Exception:
                 log.exception("power of %s", asked)
-                found = replace(so_far, fault="it could not be computed: the log of the web says why")
+                found = replace(so_far, fault="it could not be computed: see the log of the web")
             with self._changed:
                 self._found[asked] = found
                 self._changed.notify_all()

@@ -269,7 +269,7 @@ def _no_answer(error: Exception, deadline: _Deadline) -> str:
     if isinstance(error, OSError):
         return f"the server cannot be reached: {error.strerror or type(error).__name__}"
     if isinstance(error, UnicodeError):
-        return "the server's name is none that a machine can have"
+        return "the server's name is not a valid host name"
     return f"the server does not speak HTTP as is usual: {type(error).__name__}"
 
 
@@ -312,7 +312,7 @@ def _read(content: bytes, n: int) -> CaseJudgement:
     try:
         completion = _Completion.model_validate_json(content)
     except ValidationError as error:
-        raise NoVerdict(f"the answer is no completion: {_wrong(error)}") from None
+        raise NoVerdict(f"the answer is not a completion: {_wrong(error)}") from None
     choice = completion.choices[0]
     if choice.message.refusal or choice.finish_reason == "content_filter":
         raise NoVerdict(f"it refused: {choice.message.refusal or 'its filter of contents did'}")

@@ -38,8 +38,8 @@ from runtime.core.sentences import Pattern, fixed
 
 _TRIAL_RATED_BY_SECOND_PERSON = Pattern(
     "results.ratings.judging.trial_rated_by_second_person",
-    "trial {trial} is to be rated by a second person, and that may be you: rate it first (Result, Rate "
-    "again), then correct what is said of it",
+    "trial {trial} is to be rated by a second person, and that may be you: rate it first (Result, Rate again), "
+    "then correct its score",
 )
 _TRIAL_NOT_ONE_THOSE_RATED = Pattern(
     "results.ratings.judging.trial_not_one_those_rated",
@@ -72,7 +72,7 @@ _YOU_HAVE_SEEN_RESULTS_RATER = Pattern(
 _HAS_NO_TRIAL = Pattern("results.ratings.judging.has_no_trial", "{plan} has no trial {code!r:.20}")
 _OTHERWISE_WHAT_SAID_STANDS = Pattern(
     "results.ratings.judging.otherwise_what_said_stands",
-    "{twice}, and otherwise: what was said stands",
+    "{twice}, with another answer: the first one counts",
 )
 
 _STATES = (PlanState.FROZEN, PlanState.CLOSED, PlanState.REVEALED)

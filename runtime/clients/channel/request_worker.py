@@ -134,4 +134,4 @@ class RequestWorker:
         try:
             self._keep()
         except Exception:  # a lease that is not renewed expires, and the robot holds
-            log.exception("what is due beside messages was not done")
+            log.exception("periodic work was not done")

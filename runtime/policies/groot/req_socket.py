@@ -178,7 +178,7 @@ class ReqLink:
             )
         if said[0] != 0xFF or len(said) < len(_SIGNATURE) or said[9] != 0x7F:
             raise WrongProtocolError(
-                f"what listens at {self._url} does not speak ZMQ (it says {said[:40]!r}): "
+                f"the server at {self._url} does not speak ZMQ (it answers {said[:40]!r}): "
                 "check host, port and policy.kind"
             )
 

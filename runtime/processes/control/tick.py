@@ -47,7 +47,7 @@ _LEFT_ALONE = fixed(
     "control.left_alone",
     "the robot's position is unknown since its commands ended: set up again",
 )
-_NO_MOTION = Pattern("control.no_motion", "a motion to {goal} is none: expected {expected} numbers")
+_NO_MOTION = Pattern("control.no_motion", "a motion to {goal}: expected {expected} values")
 _MOTION_SPEED = Pattern("control.motion_speed", "a motion at {speed} of its speed; allowed: above 0 up to 1")
 _ESTOP = fixed("control.estop", "e-stop")
 _CONTRADICTION = fixed("control.contradiction", "joints contradict each other")

@@ -64,7 +64,7 @@ def make_policy(
     except Exception as error:  # of the policy's own code; the coordinator must survive it
         logging.getLogger(__name__).exception("the policy's own code failed")
         raise ConfigurationError(
-            f"policy {settings.kind!r} cannot be made: {type(error).__name__}: {error}"
+            f"policy {settings.kind!r} cannot be created: {type(error).__name__}: {error}"
         ) from error
 
 
@@ -74,7 +74,7 @@ def _leader_policy(spec: StationSpec, clock: Clock, leader: Callable[[StationSpe
 
     wanted = spec.deployment.collection
     if wanted is None:
-        raise ConfigurationError("this deployment has no [collection]: it says nothing of who leads")
+        raise ConfigurationError("this deployment has no [collection]: there is no leader")
     if wanted.source == "node":
         return NodeDrivenPolicy()
     return LeaderPolicy(

@@ -34,7 +34,7 @@ from runtime.station.spec import StationSpec
 
 _RECORDING_OPEN_OF_OTHER_MANIFEST = fixed(
     "operations.recording_open_of_other_manifest",
-    "a recording is open, whose manifest says another policy or task: record stop first",
+    "a recording with another policy or task in its manifest is open: record stop first",
 )
 _COLLECT_WITHOUT_COLLECTION = fixed(
     "operations.collect_without_collection",

@@ -178,8 +178,8 @@ def check(spec: StationSpec) -> None:
         lasting = (name for name, module in known.items() if not getattr(module, "REAL_TIME", False))
         allowed = ", ".join(sorted(lasting))
         raise SetupError(
-            f"transport.kind = {kind!r} with --lockstep: what is at its other end goes on in real time, and lockstep "
-            f"has a clock of its own; allowed: {allowed}, or leave --lockstep out"
+            f"transport.kind = {kind!r} with --lockstep: its other end runs in real time, and lockstep has a "
+            f"clock of its own; allowed: {allowed}, or leave --lockstep out"
         )
 
 

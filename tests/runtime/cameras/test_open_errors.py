@@ -37,7 +37,7 @@ def test_whatever_ends_at_the_deadline_was_mute() -> None:
     assert explain_open_error(invalid, RTSP, 5.01, 5.0, opening=True) == "mute: it sent no picture within 5 s"
     assert (
         explain_open_error(invalid, RTSP, 0.01, 5.0, opening=True)
-        == "what answers there is no RTSP server with a video"
+        == "the server there is not an RTSP server with a video"
     )
 
 

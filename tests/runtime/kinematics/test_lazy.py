@@ -98,7 +98,7 @@ def test_in_lockstep_it_is_made_at_once() -> None:
     ("error", "said"),
     [
         (SetupError("numba is not installed"), "numba is not installed"),
-        (OSError("no room"), "kinematics cannot be made: OSError: no room"),
+        (OSError("no room"), "kinematics cannot be created: OSError: no room"),
     ],
 )
 def test_what_cannot_be_made_is_said_to_who_solves_and_forward_goes_on(error: Exception, said: str) -> None:

@@ -63,7 +63,7 @@ def test_a_server_that_is_well_is_asked_at_its_own_port_with_the_key() -> None:
     [
         ([b"HTTP/1.1 503 Service Unavailable\r\n\r\n"], True, "is not well: /healthz says HTTP 503"),
         ([b"HTTP/1.1 404 Not", b" Found\r\n\r\n"], False, "HTTP 404 Not Found, expected 200: another server"),
-        ([b"SSH-2.0-OpenSSH_9.6\r\n"], False, "is no web server, it says b'SSH-2.0"),
+        ([b"SSH-2.0-OpenSSH_9.6\r\n"], False, "that is not a web server, it answers b'SSH-2.0"),
         ([b"HTTP/1.1 2"], True, r"gave no answer within 0\.2 s"),
         ([], True, r"gave no answer within 0\.2 s"),
     ],

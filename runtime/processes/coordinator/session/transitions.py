@@ -50,7 +50,7 @@ _MODE_WITHOUT_COMMIT = Pattern(
 )
 _APPROACHING = fixed(
     "session.approaching",
-    "the robot is on its way to where the chunk begins: wait, or cancel",
+    "the robot is moving to the start of the chunk: wait, or cancel",
 )
 _NO_CHUNK_SHOWN = fixed("session.no_chunk_shown", "no chunk is shown: step first")
 _MODE_WITHOUT_CANCEL = Pattern(

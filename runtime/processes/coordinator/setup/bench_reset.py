@@ -28,7 +28,7 @@ _CANNOT_RESET = Pattern("bench.cannot_reset", "the bench cannot be reset: {why}"
 _NOT_RESET = Pattern("bench.not_reset", "the bench was not reset within {seconds:g} s: {why}")
 _NODE_REFUSED = Pattern("bench.node_refused", "the robot refused it ({reasons})")
 _NODE_SILENT = fixed("bench.node_silent", "the node does not answer to it")
-_NO_TRUTH = fixed("bench.no_truth", "the node says no truth of a bench; does it simulate one?")
+_NO_TRUTH = fixed("bench.no_truth", "the node reports no ground truth of a bench; does it simulate one?")
 
 _RESET_S = 3.0  # [s] for a simulated bench to be laid out
 _REPEAT_S = 0.2  # [s] a control word may be lost

@@ -32,7 +32,7 @@ from runtime.station.spec import StationSpec
 
 _THE_POSE = Pattern("setup.the_pose", "the pose {pose!r}")
 _THE_FIRST_ACTION = fixed("setup.the_first_action", "the policy's first action")
-_POLICY_UNUSABLE = fixed("setup.policy_unusable", "what the policy says of itself cannot be used")
+_POLICY_UNUSABLE = fixed("setup.policy_unusable", "the policy's metadata cannot be used")
 _ZERO_JOINTS = Pattern(
     "setup.zero_joints",
     "{joints} read exactly 0 rad: check whether the robot stands so, or an encoder is dead",

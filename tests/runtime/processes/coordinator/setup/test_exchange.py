@@ -131,7 +131,7 @@ def test_a_policy_that_does_not_fit_the_robot_is_refused_before_the_former_is_cl
 def test_a_policy_whose_own_code_fails_is_refused_and_ends_nothing(tmp_path: Path) -> None:
     station = Station(stubbed(tmp_path)).ready()
     station.stubs.unfit = ZeroDivisionError("0 / 0")
-    with pytest.raises(SetupError, match="policy 'mock' cannot be made: ZeroDivisionError: 0 / 0"):
+    with pytest.raises(SetupError, match="policy 'mock' cannot be created: ZeroDivisionError: 0 / 0"):
         station.command("setup", policy=OTHER)
     assert (station.state, station.coordinator.inference.policy) == (SessionState.READY, station.policy)
     station.close()
@@ -315,7 +315,7 @@ def test_a_bench_that_is_not_reset_in_time_ends_the_set_up(tmp_path: Path) -> No
     station.prepare(bench=BENCH)
     assert station.state is SessionState.IDLE
     assert station.reason == (
-        "the bench was not reset within 3 s: the node says no truth of a bench; does it simulate one?"
+        "the bench was not reset within 3 s: the node reports no ground truth of a bench; does it simulate one?"
     )
     assert 10 <= len(station.robot.told) <= 16
     station.close()

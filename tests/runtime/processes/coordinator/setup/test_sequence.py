@@ -346,7 +346,7 @@ def test_what_goes_wrong_with_an_answer_ends_the_set_up_and_not_main(
 
 def test_what_a_policy_says_of_itself_ends_the_set_up_and_not_main(tmp_path: Path) -> None:
     station = with_horizon(tmp_path, 5, horizon="twenty")
-    assert "what the policy says of itself cannot be used: TypeError" in failed(station)
+    assert "the policy's metadata cannot be used: TypeError" in failed(station)
     station.close()
 
 
