@@ -169,7 +169,7 @@ class Judgement(models.Model):
     )
     at = models.DateTimeField(default=timezone.now)
 
-    append_only = AppendOnly("a judge's verdict is never changed or removed")
+    append_only = AppendOnly("the verdict of a judge is never changed or removed")
 
     class Meta:
         ordering = ("trial", "pk")

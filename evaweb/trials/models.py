@@ -386,7 +386,7 @@ class Trial(models.Model):
     changed_at = models.DateTimeField(auto_now=True)
 
     append_only = AppendOnly(
-        "a scored trial's checkpoint, position, operator and scores are never changed",
+        "checkpoint, position, operator and scores of a scored trial are never changed",
         (
             *(
                 "uuid",
