@@ -334,7 +334,7 @@ def _repeated(handout: Handout) -> bool:
 
 
 def _of_two(trial: Trial) -> bool:
-    """Whether two operators must agree to a void: in a blind plan, or for a failure by the plan.
+    """Whether two operators must agree to a void: in a blind plan, or if the plan counts the trial as a failure.
 
     Otherwise an unwelcome trial could be repeated instead.
     """

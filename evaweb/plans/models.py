@@ -17,7 +17,7 @@ from evaweb.trials.tables import check_strategy
 
 
 class PlanState(models.TextChoices):
-    """Where a plan stands; evaweb.plans.services alone moves it."""
+    """State of a plan; only evaweb.plans.services changes it."""
 
     DRAFT = "draft", "draft"
     FROZEN = "frozen", "running"
@@ -49,7 +49,7 @@ class Allocation(models.TextChoices):
 
 
 class Comparing(models.TextChoices):
-    """Comparisons that a plan's question is about; they share alpha."""
+    """Comparisons that answer a plan's question; they share alpha."""
 
     PAIR = "pair", "first and second"
     CONTROL = "control", "each checkpoint with the first"

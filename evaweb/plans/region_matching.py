@@ -52,7 +52,7 @@ _Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Region(BaseModel):
-    """A named rectangle: its left upper corner and its size, as shares of the picture's width and height."""
+    """A named rectangle: its upper left corner and its size, as fractions of the picture's width and height."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
