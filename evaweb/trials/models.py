@@ -282,7 +282,7 @@ class Evaluation(models.Model):
 
 
 class TrialStatus(models.TextChoices):
-    """Where a trial stands; evaweb.trials.services alone moves it."""
+    """Status of a trial; only evaweb.trials.services changes it."""
 
     PREPARED = "prepared", "prepared"
     RUNNING = "running", "running"
