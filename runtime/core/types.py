@@ -18,6 +18,7 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 Space = Literal["joint", "eef"]
+ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim", "unknown"]
 ActionMode = Literal["absolute", "relative", "delta"]
 RelativeFrame = Literal["base", "tool"]
 Result = Literal["success", "partial", "fail"]  # of an episode, as its operator judged it

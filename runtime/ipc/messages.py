@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from runtime.core import sentences
 from runtime.core.errors import CodecError
 from runtime.core.msgpack_arrays import pack, unpack
-from runtime.core.types import Float32, Float64, UInt8
+from runtime.core.types import ControlSource, Float32, Float64, UInt8
 
 # Kinds of control's events about subscribers of commands.
 NO_SUBSCRIBER, ALL_SUBSCRIBED = "commands_unheard", "commands_heard"
@@ -110,22 +110,22 @@ class NodeRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class TickDone:
-    """Record of one tick of control; times on our monotonic clock."""
+class ExecutedTick:
+    """One control tick: the smoothed action, the action after safety, and its send time (our monotonic clock)."""
 
     step: int
     run: int
     planned: float
     sent: float
     sequence: int
-    source: str
-    qpos: Float32
-    smoothed: Float32 | None
-    executed: Float32 | None
-    chunk_ids: list[int]
-    weights: list[float]
-    notes: list[str]
-    refused: bool
+    source: ControlSource
+    qpos: Float32  # measured joints at the tick
+    smoothed: Float32 | None  # before safety; None without a target
+    executed: Float32 | None  # sent action; None if none was sent
+    chunk_ids: list[int] = field(default_factory=list)
+    weights: list[float] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # changes by safety, or reasons of its refusal
+    refused: bool = False
     woke: float | None = None  # wake-up time; woke - planned is the lateness; None in lockstep
 
 
@@ -373,7 +373,7 @@ Message = (
     | PolicyAway
     | LockGrippers
     | NodeRequest
-    | TickDone
+    | ExecutedTick
     | ChunkMerged
     | Event
     | BeginEpisode

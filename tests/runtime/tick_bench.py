@@ -14,11 +14,11 @@ from runtime.core.types import Float64, Observation, RobotCommand
 from runtime.ipc.messages import (
     ChunkMerged,
     Event,
+    ExecutedTick,
     LockGrippers,
     Message,
     Order,
     PostedChunk,
-    TickDone,
     Tune,
     decode,
     encode,
@@ -213,9 +213,9 @@ class Bench:
             event for event in events if (event.kind not in quiet if kind is None else event.kind == kind)
         ]
 
-    def records(self) -> list[TickDone]:
+    def records(self) -> list[ExecutedTick]:
         payloads = map(decode, self.shared.rings["ticks"].drain())
-        return [message for message in payloads if isinstance(message, TickDone)]
+        return [message for message in payloads if isinstance(message, ExecutedTick)]
 
     @property
     def status(self) -> Any:

@@ -13,12 +13,11 @@ from pydantic import ValidationError
 from runtime.core.errors import ConfigurationError
 from runtime.core.plugins import variants
 from runtime.core.sentences import Pattern
-from runtime.core.types import Float64
+from runtime.core.types import ControlSource, Float64
 from runtime.ipc.messages import ChunkMerged, Mode, PostedChunk
 from runtime.motion.timeline import DimensionKinds, Timeline, difference
 from runtime.processes.control.actuator import TickSettings
 from runtime.processes.control.behaviours import Behaviour, Target
-from runtime.recording.base import ControlSource
 from runtime.strategies.base import ArrivedChunk, Merge, MergeResult, join
 
 log = logging.getLogger(__name__)

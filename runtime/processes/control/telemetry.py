@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from runtime.core.sentences import Pattern
-from runtime.core.types import Float32, Float64
-from runtime.ipc.messages import ChunkMerged, Event, Message, TickDone, encode
+from runtime.core.types import ControlSource, Float32, Float64
+from runtime.ipc.messages import ChunkMerged, Event, ExecutedTick, Message, encode
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import JOINT_PROBLEM_BYTES, SharedState
 from runtime.motion.timeline import HELD, Contributions
 from runtime.processes.control.actuator import Actuator, TickResult
 from runtime.processes.control.behaviours import Behaviour, EStopHold
-from runtime.recording.base import ControlSource
 from runtime.safety.collision import Collision
 
 _LIMITED_SUM = Pattern("control.limited_sum", "{count} actions were limited, worst: {worst}")
@@ -141,7 +140,7 @@ class Telemetry:
         self._emit_contributions(makers, sent)
         if self._shared_state.unrecorded:
             return
-        done = TickDone(
+        done = ExecutedTick(
             step=self._step,
             run=self.run,
             planned=self.planned,

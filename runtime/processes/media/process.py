@@ -24,12 +24,12 @@ from runtime.ipc.messages import (
     EpisodeClosed,
     EpisodeOpened,
     Event,
+    ExecutedTick,
     MediaReport,
     Message,
     Observed,
     PolicyAnswer,
     RunBegun,
-    TickDone,
     decode,
     encode,
     event_row,
@@ -189,7 +189,7 @@ class Media:
         recorder = self._recorder
         if isinstance(message, Observed):
             self._observe(message)
-        elif isinstance(message, TickDone):
+        elif isinstance(message, ExecutedTick):
             if message.sequence > self._newest:  # observations reach the ring before the tick that used them
                 self._drain("observations")
             recorder.add_tick(message)

@@ -19,6 +19,7 @@ from runtime.ipc.messages import (
     EpisodeClosed,
     EpisodeOpened,
     Event,
+    ExecutedTick,
     LockGrippers,
     MediaReport,
     Message,
@@ -30,7 +31,6 @@ from runtime.ipc.messages import (
     PostedChunk,
     ReceptionReport,
     RunBegun,
-    TickDone,
     Tune,
     decode,
     encode,
@@ -55,8 +55,9 @@ MESSAGES = [
     Tune({"kind": "sync", "execution_horizon": None, "blend_window": "all"}),
     LockGrippers(np.array([np.nan, 0.05])),
     PolicyAway(3, 12.5),
-    TickDone(5, 7, 1.25, 1.5, 9, "policy", Q, Q + 1, Q + 2, [1, 2], [0.25, 0.75], ["speed"], False),
-    TickDone(5, 0, 1.25, 1.5, 9, "none", Q, None, None, [], [], [], True),
+    ExecutedTick(5, 7, 1.25, 1.5, 9, "policy", Q, Q + 1, Q + 2, [1, 2], [0.25, 0.75], ["speed"], False),
+    ExecutedTick(5, 0, 1.25, 1.5, 9, "none", Q, None, None, [], [], [], True),
+    ExecutedTick(5, 0, 1.25, 1.5, 9, "unknown", Q, None, Q, woke=1.3),
     ChunkMerged(1, 7, 42, 2, TARGETS, 0, ""),
     Event("refused", "too old", 2.5, 17, {"joint": "left", "ages": [0.5]}),
     BeginEpisode(7, {"uuid": "u", "robot": {"dim": 3}}),
@@ -131,6 +132,10 @@ def test_the_sentence_says_what_was_given_and_what_was_expected():
     ("content", "field"),
     [
         ({"type": "Order", "number": 1, "kind": "jump"}, "kind = 'jump'; expected silent or hold or"),
+        (
+            {"type": "ExecutedTick", "step": 1, "source": "magic"},
+            "source = 'magic'; expected none or hold or",
+        ),
         ({"type": "Ack", "uuid": "u", "status": "maybe"}, "status = 'maybe'; expected accepted or refused"),
     ],
 )

@@ -362,7 +362,7 @@ def test_the_record_of_a_tick_is_on_its_way_before_main_can_see_the_tick(bench):
     )
     following(bench)
     bench.run()
-    assert seen == [("TickDone", 0), ("ChunkMerged", 0), ("TickDone", 0)]
+    assert seen == [("ExecutedTick", 0), ("ChunkMerged", 0), ("ExecutedTick", 0)]
 
 
 def test_an_e_stop_pressed_within_a_tick_repeats_the_last_command(bench):

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from runtime.core.errors import RecordingError
 from runtime.core.types import Observation
-from runtime.ipc.messages import ChunkMerged, PolicyAnswer, TickDone
+from runtime.ipc.messages import ChunkMerged, ExecutedTick, PolicyAnswer
 from runtime.processes.media.recorder import DatasetGrid, Recorder
-from runtime.recording.base import ExecutedTick, Journal, LostCamera, Outcome, RawChunk, Record, Row
+from runtime.recording.base import Journal, LostCamera, Outcome, RawChunk, Record, Row
 from runtime.recording.settings import RecordingSettings
 from tests.examples import some
 
@@ -108,7 +108,7 @@ class Desk:
             "notes": [],
             "refused": False,
         }
-        self.recorder.add_tick(TickDone(**(fields | changes)))
+        self.recorder.add_tick(ExecutedTick(**(fields | changes)))
 
     def answer(self, chunk: int, rows: int = 3, source: list[int] | None = None, run: int = 1) -> None:
         actions = np.full((rows, 2), chunk, np.float32)
