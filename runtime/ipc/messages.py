@@ -130,18 +130,25 @@ class ExecutedTick:
 
 
 @dataclass(frozen=True, slots=True)
-class ChunkMerged:
-    """Placement of a chunk by control; fields as in strategies.base.MergeResult."""
+class MergeResult:
+    """Result of a merge: which rows of a chunk are planned for which steps.
+
+    `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is
+    the step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
+    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for.
+    `dropped` is the reason why no row is used, "" if any is. `contributions` [N, 3] are step, chunk id and weight for
+    all steps that the chunk does not make alone; None if `Merge.uses_rtc` is false or if there are too many.
+    """
 
     chunk_id: int
-    run: int
     arrival_step: int
     delay: int
     targets: NDArray[np.int64]
-    mistimed: int
-    dropped: str
-    strategy: str = ""  # the kind that merged it
-    overlap: int = 0  # steps from the arrival on that were blended with an earlier plan
+    mistimed: int = 0
+    dropped: str = ""
+    run: int = 0  # set by control, like the next
+    strategy: str = ""  # the kind that merged it; "" for a chunk that was dropped before
+    overlap: int = 0  # steps from arrival_step on made by several chunks, or by a chunk and a held target
     contributions: Float64 | None = None
 
 
@@ -374,7 +381,7 @@ Message = (
     | LockGrippers
     | NodeRequest
     | ExecutedTick
-    | ChunkMerged
+    | MergeResult
     | Event
     | BeginEpisode
     | PolicyAnswer

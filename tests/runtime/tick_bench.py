@@ -12,10 +12,10 @@ from runtime.config.schema import FaultResponse
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, Observation, RobotCommand
 from runtime.ipc.messages import (
-    ChunkMerged,
     Event,
     ExecutedTick,
     LockGrippers,
+    MergeResult,
     Message,
     Order,
     PostedChunk,
@@ -201,10 +201,10 @@ class Bench:
 
     # --- what control tells --------------------------------------------------------------------------------
 
-    def told(self) -> list[Event | ChunkMerged]:
+    def told(self) -> list[Event | MergeResult]:
         """Everything that the coordinator was told since the last call."""
         messages = [decode(payload) for payload in self.shared.rings["control_events"].drain()]
-        return [message for message in messages if isinstance(message, Event | ChunkMerged)]
+        return [message for message in messages if isinstance(message, Event | MergeResult)]
 
     def said(self, kind: str | None = None, quiet: Sequence[str] = ("limited", "limited_sum")) -> list[Event]:
         """The events since the last call: of `kind`, or all but the `quiet` ones."""

@@ -9,11 +9,11 @@ from runtime.core.sentences import Pattern
 from runtime.ipc.messages import (
     ALL_SUBSCRIBED,
     NO_SUBSCRIBER,
-    ChunkMerged,
     EpisodeClosed,
     EpisodeOpened,
     Event,
     MediaReport,
+    MergeResult,
     Message,
     ReceptionReport,
     decode,
@@ -65,7 +65,7 @@ class Inbox:
         to = self._to
         if isinstance(message, Event):
             self._on_event(message)
-        elif isinstance(message, ChunkMerged):
+        elif isinstance(message, MergeResult):
             to.inference.on_merged(message)
             if message.dropped:
                 text = _CHUNK_DROPPED(chunk=message.chunk_id, why=message.dropped)

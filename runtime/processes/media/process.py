@@ -18,7 +18,6 @@ from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import (
     BeginEpisode,
     BeginRun,
-    ChunkMerged,
     EndEpisode,
     EndRun,
     EpisodeClosed,
@@ -26,6 +25,7 @@ from runtime.ipc.messages import (
     Event,
     ExecutedTick,
     MediaReport,
+    MergeResult,
     Message,
     Observed,
     PolicyAnswer,
@@ -193,7 +193,7 @@ class Media:
             if message.sequence > self._newest:  # observations reach the ring before the tick that used them
                 self._drain("observations")
             recorder.add_tick(message)
-        elif isinstance(message, ChunkMerged):
+        elif isinstance(message, MergeResult):
             recorder.add_merge(message)
         elif isinstance(message, PolicyAnswer):
             recorder.add_answer(message)

@@ -17,7 +17,7 @@ import numpy as np
 from runtime.core.errors import RecordingError
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float32, Observation
-from runtime.ipc.messages import ChunkMerged, Event, ExecutedTick, PolicyAnswer, event_row
+from runtime.ipc.messages import Event, ExecutedTick, MergeResult, PolicyAnswer, event_row
 from runtime.processes.media.camera_rows import CameraRows
 from runtime.processes.media.chunk_log import ChunkLog
 from runtime.recording.base import VIDEO_LOST, Journal, Outcome, Row, Status
@@ -200,7 +200,7 @@ class Recorder:
         if self._uuid and answer.run == self._run:
             self._chunks.add_answer(answer)
 
-    def add_merge(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: MergeResult) -> None:
         """Add the placement of a chunk by control, which may come before the chunk itself."""
         if self._uuid and merged.run == self._run:
             self._chunks.add_merge(merged)

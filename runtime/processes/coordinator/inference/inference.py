@@ -14,7 +14,7 @@ from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Conditioning, Float64, Observation
-from runtime.ipc.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
+from runtime.ipc.messages import Event, MergeResult, Mode, PolicyAnswer, PostedChunk
 from runtime.ipc.shared_state import SharedState
 from runtime.policies.base import Policy
 from runtime.processes.coordinator.control_queue import ControlQueue
@@ -67,7 +67,7 @@ class PendingChunk:
 
 @dataclass(frozen=True, slots=True)
 class DisplayedChunk:
-    """The newest chunk for pages: `state` is "proposed", "merged" or "dropped"; targets as in ChunkMerged."""
+    """The newest chunk for pages: `state` is "proposed", "merged" or "dropped"; targets as in MergeResult."""
 
     number: int
     run: int
@@ -239,7 +239,7 @@ class Inference:
 
     # --- merged chunks ---------------------------------------------------------------------------------------
 
-    def on_merged(self, merged: ChunkMerged) -> None:
+    def on_merged(self, merged: MergeResult) -> None:
         """Record that control has merged or dropped a chunk."""
         made = self._unmerged.pop(merged.chunk_id, None)
         if merged.run != self._run:

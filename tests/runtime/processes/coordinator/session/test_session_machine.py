@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
 from runtime.core.errors import PolicyError, PolicyLostError
 from runtime.core.types import Float64
-from runtime.ipc.messages import ChunkMerged, ExecutedTick, decode
+from runtime.ipc.messages import ExecutedTick, MergeResult, decode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.control.process import make_tick
@@ -343,7 +343,7 @@ class Machine(RuleBasedStateMachine):
             if isinstance(record, ExecutedTick) and record.chunk_ids:
                 assert sum(record.weights) == pytest.approx(1.0)
                 assert min(record.weights) > 0
-            if isinstance(record, ChunkMerged) and not record.dropped:
+            if isinstance(record, MergeResult) and not record.dropped:
                 assert (record.strategy, record.chunk_id) not in self.merged  # executed once
                 self.merged.add((record.strategy, record.chunk_id))
                 assert record.targets.max() >= record.arrival_step
