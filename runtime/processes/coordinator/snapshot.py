@@ -124,11 +124,7 @@ def _phase(of: Coordinator) -> str:
 def _proposal(of: Coordinator, now: float) -> dict[str, Any]:
     """Return the status of the chunk that waits to be committed, {} if there is none."""
     made = of.inference.proposal
-    return (
-        {}
-        if made is None
-        else {**made.status(now), **of.setup.distance_of(made.answered.commands.intended_start)}
-    )
+    return {} if made is None else {**made.status(now), **of.setup.distance_of(made.commands.intended_start)}
 
 
 def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
