@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from runtime.core.sentences import Pattern
 from runtime.ipc.messages import (
@@ -19,10 +18,8 @@ from runtime.ipc.messages import (
     decode,
 )
 from runtime.ipc.session_state import SessionState
+from runtime.processes.coordinator.components import Components
 from runtime.processes.coordinator.session.transitions import SessionEvent
-
-if TYPE_CHECKING:
-    from runtime.processes.coordinator.coordinator import Coordinator
 
 _CHUNK_DROPPED = Pattern("inbox.chunk_dropped", "chunk {chunk} dropped: {why}")
 _STARVED_BECAUSE = Pattern("inbox.starved_because", "{why}: {trouble}")
@@ -36,7 +33,7 @@ _HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_fa
 class Inbox:
     """Dispatcher of the other processes' messages to the coordinator's components; stores their latest reports."""
 
-    def __init__(self, coordinator: Coordinator) -> None:
+    def __init__(self, coordinator: Components) -> None:
         self._to = coordinator
         self.media_report = MediaReport(0.0, 0, "", 0)
         self.reception_report = ReceptionReport(0.0)
