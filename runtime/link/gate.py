@@ -53,7 +53,7 @@ _POLL_MS = 50
 _LOOK_S = 0.05
 _TRY_S = 2.0  # between two tries to lock the folder of a station
 _MOST_PENDING = 64  # pending commands per station
-_PENDING_S = 30.0
+_PENDING_S = 30.0  # [s] after which the sender of a pending command is answered in the station's place
 _HOPE_S = 0.8  # [s] that a press waits for a link just lost before its sender is answered
 _HELD_S = 5.0  # [s] after which a press that could not be sent is dropped
 _MOST_HELD = 64
@@ -338,8 +338,11 @@ class Gate:
                 self._try(remote)
             self._adjust(remote)
             self._hold_on(remote, now)
-            for number in [one for one, pending in remote.pending.items() if now >= pending.until]:
-                del remote.pending[number]
+            for number, pending in list(remote.pending.items()):
+                if now >= pending.until:
+                    del remote.pending[number]
+                    late = f"sent and not answered within {_PENDING_S:g} s"
+                    pending.server.answer(pending.call, _failed(remote, pending.command, late))
             if remote.mirror is not None:
                 remote.mirror.poll()
                 if (streams := self._streams.places.get(remote.name)) is not None:

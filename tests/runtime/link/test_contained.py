@@ -1,5 +1,6 @@
 """What one computer does at a lab's ports, and no other station may notice."""
 
+import contextlib
 import socket
 
 import pytest
@@ -8,11 +9,11 @@ import zmq
 from runtime.core.errors import CodecError
 from runtime.ipc.bus import CommandClient, Endpoints, Key
 from runtime.ipc.messages import Ack, Command, decode, encode
-from runtime.link import door, key_files, wire
+from runtime.link import door, gate, key_files, wire
 from runtime.link.admission import Admission, AllowList
 from runtime.link.line import dialled
 from runtime.link.wire import COMMANDS, RELEASE, STOPS, Ask, Beat, Bye, Hello, Welcome, read, write
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.link.linked import STATION, allowed
 
 OTHER = "bench-8"
@@ -102,6 +103,27 @@ def test_a_program_of_another_release_unlinks_no_station_that_is_linked(lab, dia
     finally:
         client.close()
     assert lab.gate.linked() == {STATION, OTHER}
+
+
+@pytest.mark.parametrize(
+    ("kind", "role", "status"), [("status", COMMANDS, "refused"), ("stop", STOPS, "failed")]
+)
+def test_a_command_that_the_station_never_answers_is_answered_by_the_gate(
+    lab, dial, monkeypatch, kind, role, status
+):
+    monkeypatch.setattr(gate, "_PENDING_S", 0.0)
+    lines = other_linked(lab, dial)
+    folder = lab.folder(OTHER)
+    endpoint = str(Endpoints(folder).read("coordinator")["commands"])
+    with contextlib.closing(CommandClient(zmq.Context.instance(), endpoint, Key(folder))) as client:
+        client.send(Command("u1", kind, user="ann", holder="ann", role="operator"))
+        asked = said(lines[role], Ask)
+        ack = decode(eventually(client.packed_answer, "the answer"))
+        assert (ack.uuid, ack.status) == ("u1", status)
+        assert "sent and not answered within" in ack.reason
+        lines[role].send_multipart(write(wire.Answer(asked.number), b"too late"))
+        monkeypatch.setattr(gate, "_PENDING_S", PATIENCE_S)
+        assert lab.press().status == "done"
 
 
 def test_a_message_of_nothing_but_parts_keeps_no_press_and_its_key_is_refused_for_a_while(
