@@ -215,3 +215,25 @@ def test_of_one_key_so_many_handshakes_are_answered_and_no_more_of_unknown_keys_
     assert let_in(KEY.public, b"10.0.0.9", 300) == 20
     list_of.now = allowed((KEY, OTHER))
     assert admission.answer([b"1.0", b"1", b"stations", b"10.0.0.1", b"", b"CURVE", b"u" * 32])[2] == b"400"
+
+
+def test_of_presses_that_were_lost_with_the_link_only_the_newest_are_held(lab, dial, monkeypatch):
+    """The bound held for presses without a link alone, not for those that a lost link gave back."""
+    monkeypatch.setattr(gate, "_MOST_HELD", 2)
+    monkeypatch.setattr(gate, "_HOPE_S", PATIENCE_S)
+    lines = other_linked(lab, dial)
+    folder = lab.folder(OTHER)
+    endpoint = str(Endpoints(folder).read("guard")["estop"])
+    with contextlib.closing(CommandClient(zmq.Context.instance(), endpoint, Key(folder))) as client:
+        for number in range(4):
+            client.send(Command(f"p{number}", "estop", user="ann", holder="ann", role="operator"))
+            assert said(lines[STOPS], Ask).process == "guard"
+        stops = dial()  # of another program, so that both connections are lost at once
+        stops.send_multipart(write(Hello(RELEASE, "0", OTHER, STOPS, b"another")))
+        assert said(stops, Welcome)
+        acks = [decode(eventually(client.packed_answer, "an answer")) for _ in range(2)]
+        assert [(ack.uuid, ack.status) for ack in acks] == [("p0", "failed"), ("p1", "failed")]
+        assert all("USE THE HARDWARE STOP" in ack.reason for ack in acks)
+        assert [press.command.uuid for press in lab.gate._remotes[OTHER].held] == ["p2", "p3"]
+        stops.send_multipart(write(Beat(CHALLENGE, ["guard"])))
+        assert [said(stops, Ask).process for _ in range(2)] == ["guard", "guard"]
