@@ -11,7 +11,8 @@ from typing import Any
 
 from benchmarks.recording_pace import CAMERAS, FPS, HEIGHT, JOINTS, WIDTH, Frames, feed_frames, finish, joints
 from runtime.datasets.publishing import publish
-from runtime.recording.base import ExecutedTick, Outcome, Row
+from runtime.ipc.messages import ExecutedTick
+from runtime.recording.base import Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.settings import RecordingSettings
 
@@ -50,7 +51,7 @@ def append(journal: EpisodeJournal, index: int, pictures: dict[str, Any]) -> Non
     captured = dict.fromkeys(("joints", *CAMERAS), now)
     journal.append(Row(index, index * _TICKS, now, index, here, here, captured, pictures, "policy"))
     for step in range(index * _TICKS, (index + 1) * _TICKS):
-        journal.append(ExecutedTick(step, now, now, index, "policy", here, here, here))
+        journal.append(ExecutedTick(step, 1, now, now, index, "policy", here, here, here))
 
 
 def main(path: str, count: str, folder: str) -> None:

@@ -25,10 +25,10 @@ from benchmarks.labs import ROOT
 from benchmarks.recording_alone import append, manifest
 from benchmarks.recording_pace import FPS, Frames
 from runtime.core.errors import RecordingError
+from runtime.core.restart_window import MOST_RESTARTS, RESTART_WINDOW_S
 from runtime.datasets.consistency import check
 from runtime.datasets.layout import INFO
 from runtime.datasets.reader import open_dataset
-from runtime.processes.supervisor.supervisor import MOST_RESTARTS, RESTART_WINDOW_S
 from runtime.recording.base import Outcome
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.reader import Episode, open_episode

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from runtime.core.types import ActionChunk, Conditioning, Float64
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 from runtime.motion.timeline import Contributions, DimensionKinds, Timeline
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
-from runtime.strategies.base import ArrivedChunk, MergeResult, Progress, StrategyParameters, join
+from runtime.strategies.base import ArrivedChunk, Progress, StrategyParameters, join
 
 Policy = Callable[[int, Conditioning | None], Float64]  # observation step, conditioning -> rows [H, D]
 FAR = 0.05  # [rad] deviation of a run's first action that is not blended in, as in control
@@ -152,7 +152,7 @@ class StepLoop:
         self._joining = self._joining and bool(merged.dropped)
         chunk = ActionChunk(request.rows.astype(np.float32))
         self._commitment.add_chunk(request.number, chunk, request.step, request.waited)
-        self._commitment.on_merged(_to_message(merged))
+        self._commitment.on_merged(merged)
 
     def _execute(self) -> None:
         planned = self.timeline.at(self.step)
@@ -161,18 +161,3 @@ class StepLoop:
             self.commanded = planned.action
         makers = () if planned is None else planned.contributions
         self.log.executed.append(Executed(self.step, self.commanded, makers, self._starved))
-
-
-def _to_message(merged: MergeResult) -> ChunkMerged:
-    """Return control's message to the coordinator about a merge."""
-    return ChunkMerged(
-        merged.chunk_id,
-        1,
-        merged.arrival_step,
-        merged.delay,
-        merged.targets,
-        merged.mistimed,
-        merged.dropped,
-        overlap=merged.overlap,
-        contributions=merged.contributions,
-    )

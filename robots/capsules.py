@@ -144,8 +144,7 @@ def _corners(shape: Shape) -> tuple[Float64, float]:
         ring = np.column_stack([np.cos(turn), np.sin(turn)]) * radius / np.cos(np.pi / _ROUND)
         ends = np.repeat([-length / 2, length / 2], _ROUND)
         return np.column_stack([np.tile(ring, (2, 1)), ends]), 0.0
-    ends = np.array(shape.bounds())  # [2, 3]
-    return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)]), 0.0
+    return shape.box_corners(), 0.0
 
 
 def _smallest_circle(points: Float64, sizes: Float64, start: Float64, steps: int) -> Float64:

@@ -34,5 +34,5 @@ def check_movers(key: str, tree: Urdf, names: Iterable[str]) -> None:
     for name in names:
         with error_context(key):
             joint = tree.joint(name)
-        if joint.kind == "fixed" or joint.mimic is not None:
+        if not joint.is_independent:
             raise RobotError(f"{key}: {name} is fixed or a mimic; allowed: joints that move by themselves")

@@ -128,7 +128,7 @@ def _between_fingers(tree: Urdf, link: str) -> Float64:
     y is the direction in which the first of them slides; the identity if none slides across z.
     """
     tip = np.eye(4)
-    fingers = [joint for joint in tree.joints.values() if joint.parent == link and joint.kind == "prismatic"]
+    fingers = [joint for joint in tree.children(link) if joint.kind == "prismatic"]
     if not fingers:
         return tip
     tip[:3, 3] = np.mean([finger.origin[:3, 3] for finger in fingers], axis=0)

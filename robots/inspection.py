@@ -13,6 +13,7 @@ from robots import description, urdf
 from robots.body import Body
 from robots.clearance import collision_problems
 from robots.description import GroupTable, OverrideTable, RobotTable, RosGroupTable
+from robots.limits import FASTEST
 from robots.loading import load_robot, load_robot_with_optional_groups
 from robots.robot import Group, Robot, urdf_copies
 from robots.rotations import Float64
@@ -20,7 +21,6 @@ from robots.urdf import Urdf
 from robots.visuals import scene_of
 
 GUESS = "GUESS"  # mark of unverified values in a drafted robot.toml
-_FASTEST = 10.0  # [rad/s] arm joints with a higher limit probably have a placeholder
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def _heading(robot: Robot, table: RobotTable, whole: Robot) -> Iterator[str]:
 def _standing(robot: Robot, tree: Urdf) -> Iterator[str]:
     """Yield lines on the URDF, its copies and their poses."""
     members = urdf_copies(robot.groups)
-    moving = [joint.name for joint in tree.joints.values() if joint.kind != "fixed" and joint.mimic is None]
+    moving = [joint.name for joint in tree.joints.values() if joint.is_independent]
     yield f"{tree.path.name}: {len(tree.links)} links from {tree.root}, {len(moving)} joints that move by themselves"
     commanded = {name for group in robot.groups for name in _driven(group)}
     if still := [name for name in moving if name not in commanded]:
@@ -226,9 +226,9 @@ def _group_warnings(robot: Robot, group: Group, table: GroupTable) -> Iterator[s
     ]
     if endless:
         yield f"{key}: {', '.join(endless)}: no position limit; cables may want one, as an override"
-    fast = [robot.joint_names[dim] for dim in group.joint_dims if robot.velocity[dim] > _FASTEST]
+    fast = [robot.joint_names[dim] for dim in group.joint_dims if robot.velocity[dim] > FASTEST]
     if fast and group.kind == "arm":
-        yield f"{key}: {', '.join(fast)}: faster than {_FASTEST:g} rad/s; is that the robot's or a placeholder?"
+        yield f"{key}: {', '.join(fast)}: faster than {FASTEST:g} rad/s; is that the robot's or a placeholder?"
     if group.chain is not None and group.gripper is not None and group.gripper.apart is None:
         yield f"{key}.gripper.apart: not given; the simulated bench does not know how far its jaws open"
 

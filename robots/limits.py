@@ -9,6 +9,8 @@ from robots.description import GroupTable, OverrideTable
 from robots.errors import RobotError, reject_duplicates
 from robots.urdf import Urdf
 
+FASTEST = 10.0  # [rad/s], [m/s] arm joints with a higher limit probably have a placeholder
+
 
 @dataclass(frozen=True, slots=True)
 class Limits:

@@ -38,6 +38,11 @@ class Shape:
         """Return the lower and upper corner [3] of the shape's box in its own frame [m], before `origin`."""
         return shape_bounds(self.kind, self.size, self.file)
 
+    def box_corners(self) -> Float64:
+        """Return the corners [8, 3] of the shape's box in its own frame [m], before `origin`."""
+        ends = np.array(self.bounds())  # [2, 3]
+        return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
+
 
 def shape_bounds(kind: str, size: tuple[float, ...], file: Path | None) -> tuple[Float64, Float64]:
     """Return the corners [3] of the box around a shape in its own frame [m].
@@ -78,7 +83,7 @@ def displayed_shapes(path: Path) -> tuple[Shape, ...]:
 def _read(path: Path, *, everywhere: bool) -> tuple[Shape, ...]:
     robot = document(path)
     materials = {
-        text_of(path, element, "name"): _colour(path, f"material {element.get('name')!r}", colour)
+        text_of(path, element, "name"): colour_of(path, f"material {element.get('name')!r}", colour)
         for element in robot.iter("material")  # a material declared in a visual can be used by name elsewhere
         if element.get("name") and (colour := element.find("color")) is not None
     }
@@ -147,7 +152,7 @@ def _material(path: Path, owner: str, visual: ET.Element, materials: Mapping[str
         return PLAIN
     colour = material.find("color")
     if colour is not None:
-        return _colour(path, owner, colour)
+        return colour_of(path, owner, colour)
     name = text_of(path, material, "name")
     if name not in materials:
         allowed = ", ".join(materials) or "none is declared"
@@ -155,7 +160,12 @@ def _material(path: Path, owner: str, visual: ET.Element, materials: Mapping[str
     return materials[name]
 
 
-def _colour(path: Path, owner: str, element: ET.Element) -> Colour:
+def colour_of(path: Path, owner: str, element: ET.Element) -> Colour:
+    """Return the colour of a <color>.
+
+    Raises:
+        RobotError: If it is not four numbers from 0 to 1.
+    """
     red, green, blue, opacity = numbers(path, owner, "color rgba", text_of(path, element, "rgba"), 4)
     colour = (red, green, blue, opacity)
     if not all(0 <= part <= 1 for part in colour):

@@ -52,6 +52,11 @@ class Joint:
     velocity: float | None
     mimic: Mimic | None
 
+    @property
+    def is_independent(self) -> bool:
+        """Whether it moves by itself: neither fixed nor a mimic."""
+        return self.kind != "fixed" and self.mimic is None
+
 
 @dataclass(frozen=True, slots=True)
 class Urdf:
@@ -76,6 +81,14 @@ class Urdf:
             raise RobotError(f"{self.path}: no joint {name!r}; it has {', '.join(self.joints)}")
         return self.joints[name]
 
+    def above(self, link: str) -> Joint | None:
+        """Return the joint that carries a link; None for the root."""
+        return next((joint for joint in self.joints.values() if joint.child == link), None)
+
+    def children(self, link: str) -> tuple[Joint, ...]:
+        """Return the joints that a link carries, in the file's order."""
+        return tuple(joint for joint in self.joints.values() if joint.parent == link)
+
     def between(self, frame: str, tip: str) -> tuple[Joint, ...]:
         """Return the joints from link `frame` out to link `tip`.
 
@@ -85,14 +98,14 @@ class Urdf:
         for link in (frame, tip):
             if link not in self.links:
                 raise RobotError(f"{self.path}: no link {link!r}; it has {', '.join(sorted(self.links))}")
-        above = {joint.child: joint for joint in self.joints.values()}
         chain: list[Joint] = []
         link = tip
         while link != frame:
-            if link not in above:
+            joint = self.above(link)
+            if joint is None:
                 raise RobotError(f"{self.path}: link {tip!r} does not hang on link {frame!r}")
-            chain.append(above[link])
-            link = above[link].parent
+            chain.append(joint)
+            link = joint.parent
         return tuple(reversed(chain))
 
     def outwards(self) -> tuple[Joint, ...]:
@@ -100,7 +113,7 @@ class Urdf:
         order: list[Joint] = []
         links = [self.root]
         for link in links:  # the list grows during the loop
-            below = [joint for joint in self.joints.values() if joint.parent == link]
+            below = self.children(link)
             order += below
             links += [joint.child for joint in below]
         return tuple(order)
@@ -118,6 +131,10 @@ class Urdf:
                 raise RobotError(f"{self.path}: joints {', '.join(seen)} mimic each other in a circle")
             seen.append(joint.name)
         return joint, factor, offset
+
+    def masters(self) -> set[str]:
+        """Return the names of the joints that mimics follow."""
+        return {self.master(joint)[0].name for joint in self.joints.values() if joint.mimic is not None}
 
 
 def read(path: Path) -> Urdf:

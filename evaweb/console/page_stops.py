@@ -6,7 +6,6 @@ Nothing here waits for the database, and the number of presses is not limited.
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from datetime import datetime
@@ -31,7 +30,6 @@ from evaweb.core.errors import reasoned
 from evaweb.stations import commands, stops
 from evaweb.stations.models import CommandStatus, Station
 
-log = logging.getLogger(__name__)
 _MOST_UNANSWERED = 200  # per page; stops beyond it are executed, but not acknowledged individually
 SendCallback = Callable[[dict[str, Any]], None]
 BackgroundCallback = Callable[

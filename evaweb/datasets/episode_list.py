@@ -14,7 +14,6 @@ from runtime.datasets import layout
 from runtime.datasets.reader import Dataset
 from runtime.recording.files import RecordingError
 
-SUCCESSES = ("yes", "no", "unknown")
 RESULTS = ("success", "partial", "fail", "unknown")
 VERDICTS = ("pass", "fail", "unreviewed")
 
@@ -46,8 +45,8 @@ def list_rows(
 ) -> list[DatasetRow]:
     """Return the episodes of a dataset whose task, uuid or station contain all `words`, filtered further.
 
-    `success` is one of SUCCESSES, `result` one of RESULTS, `verdict` one of VERDICTS; other values have no effect.
-    Raises: RecordingError; EvaError for too many words.
+    `success` is "yes", "no" or "unknown", `result` one of RESULTS, `verdict` one of VERDICTS; other values have no
+    effect. Raises: RecordingError; EvaError for too many words.
     """
     wanted = words_of(words.lower())
     dataset = open_cached(name)

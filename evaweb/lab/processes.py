@@ -15,7 +15,6 @@ import selectors
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,9 +22,9 @@ from typing import IO, Any
 
 from evaweb.core.errors import EvaError
 from runtime.core.environment import without_web_secrets
+from runtime.core.restart_window import MOST_RESTARTS, RestartWindow
 
 log = logging.getLogger(__name__)
-_MOST_RESTARTS, _RESTART_WINDOW_S = 5, 60.0
 _REST_S = 30.0
 _MOST_PROCESSOR_S = 300.0  # processor time for getting ready
 _LONGEST_LOG = 20_000_000  # [bytes] size at which a log is rotated; one old log is kept
@@ -62,7 +61,7 @@ class _Child:
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     addresses: Mapping[str, Any] = field(default_factory=dict)
-    restarts: deque[float] = field(default_factory=deque)
+    restarts: RestartWindow = field(default_factory=RestartWindow)
     rests_until: float = 0.0
     coming: bool = False  # getting ready, not announced yet
     killed_at: float = 0.0  # time at which a dropped process is killed if it has not ended
@@ -243,21 +242,18 @@ class ChildProcesses:
     def _restart(self, child: _Child, code: int, now: float) -> None:
         """Restart it with the same addresses; its announcement is known and goes to its log."""
         program = child.program
-        while child.restarts and child.restarts[0] < now - _RESTART_WINDOW_S:
-            child.restarts.popleft()
-        if len(child.restarts) >= _MOST_RESTARTS:
+        if not child.restarts.admit(now):
             child.rests_until = now + _REST_S
             child.restarts.clear()
             log.error(
                 "%s ended with %d, %d times within a minute: next try in %d s; %s",
                 program.name,
                 code,
-                _MOST_RESTARTS + 1,
+                MOST_RESTARTS + 1,
                 _REST_S,
                 self._why(child),
             )
             return
-        child.restarts.append(now)
         log.error("%s ended with %d: restarting it", program.name, code)
         child.log.close()
         arguments = program.again(child.addresses) if program.again else program.arguments

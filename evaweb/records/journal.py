@@ -7,7 +7,6 @@ values of a row. A `Journal` is a folder with one file of lines per episode, tri
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +35,6 @@ from runtime.core.durable_files import AppendError, append_durably
 from runtime.core.sentences import Pattern
 from runtime.recording.files import RecordingError
 
-log = logging.getLogger(__name__)
 _CONTAINS_CHARACTER_U_0000_WHICH = Pattern(
     "web.journal.contains_character_u_0000_which",
     "{name} contains the character U+0000, which no database keeps: remove it",

@@ -8,7 +8,7 @@ from django.db.models import QuerySet
 
 from evaweb.core.errors import NotFound
 from evaweb.serving.error_pages import is_text
-from evaweb.stations.models import NOT_CARRIED_OUT, Command, Lease, LeaseRequest, Station
+from evaweb.stations.models import NOT_CARRIED_OUT, Lease, LeaseRequest, Station
 from runtime.core.sentences import Pattern
 
 _NO_SUCH_STATION = Pattern(
@@ -44,11 +44,6 @@ def leases_open() -> dict[int, Lease]:
 def request_list(*, station: Station) -> QuerySet[LeaseRequest]:
     """Return the open requests for the station, oldest first."""
     return station.lease_requests.filter(answer=LeaseRequest.Answer.OPEN).select_related("user")
-
-
-def command_list(*, station: Station, limit: int = 100) -> QuerySet[Command]:
-    """Return the newest commands first."""
-    return station.commands.select_related("user")[:limit]
 
 
 def last_set_up(*, station: Station) -> UUID | None:

@@ -5,7 +5,7 @@ Formulae: Holm (1979); compact letters by insertion and absorption (Piepho 2004)
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from itertools import combinations
 
 from evaweb.statistics.base import StatisticsError, check_share
@@ -59,10 +59,3 @@ def _absorbed(columns: list[frozenset[str]]) -> list[frozenset[str]]:
 def _letter(i: int) -> str:
     """Return letter `i`: a to z, then a1 to z1, a2 and so on, so that many groups stay readable."""
     return chr(ord("a") + i % 26) + (str(i // 26) if i >= 26 else "")
-
-
-def separated_pairs(probabilities: Mapping[frozenset[str], float], alpha: float) -> set[frozenset[str]]:
-    """Return the pairs with a Holm-corrected probability of at most `alpha`."""
-    pairs = list(probabilities)
-    corrected = holm([probabilities[pair] for pair in pairs])
-    return {pair for pair, p in zip(pairs, corrected, strict=True) if p <= alpha}

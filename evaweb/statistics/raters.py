@@ -1,6 +1,6 @@
 """Agreement of two raters of the same trials beyond chance.
 
-Formulae: Cohen (1960; weighted 1968); Gwet's AC1 (2008), because kappa collapses if nearly all trials end alike;
+Formulae: Cohen (1960); Gwet's AC1 (2008), because kappa collapses if nearly all trials end alike;
 Krippendorff's alpha (2004) for missing ratings.
 """
 
@@ -13,7 +13,6 @@ from typing import Literal
 
 from evaweb.statistics.base import StatisticsError
 
-Weights = Literal["none", "linear", "quadratic"]
 Metric = Literal["nominal", "interval"]
 
 
@@ -30,29 +29,6 @@ def cohen_kappa(pairs: Sequence[tuple[Hashable, Hashable]]) -> float:
     chance = sum(first[name] * second[name] for name in first) / (n * n)
     _varied({*first, *second})
     return _chance_corrected(observed, chance)
-
-
-def weighted_kappa(pairs: Sequence[tuple[int, int]], levels: int, weights: Weights = "linear") -> float:
-    """Return the agreement on levels 0 to `levels` - 1; with `weights` near levels count as a smaller disagreement."""
-    _require_pairs(pairs)
-    if levels < 2:
-        raise StatisticsError(f"{levels} levels; allowed: 2 or more")
-    for pair in pairs:
-        for level in pair:
-            if not 0 <= level < levels:
-                raise StatisticsError(f"level {level}; allowed: 0 to {levels - 1}")
-    n = len(pairs)
-    first, second = Counter(one for one, _ in pairs), Counter(other for _, other in pairs)
-    apart = {(i, j): _distance(i, j, levels, weights) for i in range(levels) for j in range(levels) if i != j}
-    observed = sum(apart.get(pair, 0.0) for pair in pairs) / n
-    expected = sum(apart[i, j] * first[i] * second[j] for i, j in apart) / (n * n)
-    _varied({*first, *second})
-    return 1.0 if observed == 0 else 1 - observed / expected
-
-
-def _distance(i: int, j: int, levels: int, weights: Weights) -> float:
-    share = abs(i - j) / (levels - 1)
-    return {"none": 1.0, "linear": share, "quadratic": share * share}[weights]
 
 
 def gwet_ac1(pairs: Sequence[tuple[Hashable, Hashable]], categories: int = 2) -> float:

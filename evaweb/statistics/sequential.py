@@ -116,8 +116,3 @@ def _anytime(path: Sequence[float]) -> list[float]:
         lowest = min(lowest, math.exp(-log_e) if log_e > 0 else 1.0)
         found.append(lowest)
     return found
-
-
-def pair_by_order(first: Sequence[bool], second: Sequence[bool]) -> list[tuple[bool, bool]]:
-    """Pair the k-th trials of both arms; surplus trials of one arm are not used until the other arm has caught up."""
-    return list(zip(first, second, strict=False))

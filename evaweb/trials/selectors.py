@@ -288,11 +288,6 @@ class _Known:
 _known: FingerprintCache[_Known] = FingerprintCache()
 
 
-def forget() -> None:
-    """Clear the cache, as after an exchange of the database."""
-    _known.clear()
-
-
 def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
     """Return the summaries of the scored trials among `trials`, whose query uses only their own columns.
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from robots import shapes
-from robots.description import Kind
+from robots.description import Kind, OverrideTable
 from robots.draft.geometry import corners, places
 from robots.draft.gripper import GripperDraft, end_link, guess_gripper
 from robots.draft.group_guessing import GroupGuess, guess_groups
-from robots.draft.limits import Placeholder, placeholder_limits
+from robots.draft.limits import placeholder_limits
 from robots.draft.postures import rest_posture
 from robots.errors import RobotError
 from robots.rotations import Float64
@@ -30,7 +30,7 @@ _QUARTER = (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)  # the robot's x p
 
 @dataclass(frozen=True, slots=True)
 class PoseDraft:
-    """Pose: x, y, z [m] and unit quaternion w, x, y, z."""
+    """Pose: x, y, z [m] and unit quaternion w, x, y, z; checked when the written sheet is loaded."""
 
     xyz: tuple[float, float, float]
     wxyz: tuple[float, float, float, float]
@@ -50,7 +50,7 @@ class GroupDraft:
     gripper: GripperDraft | None
     pinned: Mapping[str, float]
     mount: PoseDraft | None
-    overrides: tuple[Placeholder, ...]
+    overrides: tuple[OverrideTable, ...]
     rest: tuple[float, ...]
 
 
@@ -86,7 +86,6 @@ def build_draft(tree: Urdf, shown: Path, drawn: Collection[str], title: str, cop
     if copies > 1:
         groups = [_copy(group, index, copies) for index in range(copies) for group in groups]
         groups.sort(key=lambda group: (group.kind != "arm", group.optional))
-    names = {joint.name for joint in tree.joints.values() if joint.kind != "fixed" and joint.mimic is None}
     moved = set(chain.from_iterable(limb.joints + limb.fingers for limb in limbs))
     return RobotDraft(
         title=title,
@@ -94,7 +93,9 @@ def build_draft(tree: Urdf, shown: Path, drawn: Collection[str], title: str, cop
         groups=tuple(groups),
         cameras=_cameras([group.name for group in groups if group.kind == "arm"]),
         stand=None if copies > 1 else _root_pose(tree, limbs),
-        unassigned_joints=tuple(name for name in tree.joints if name in names - moved),
+        unassigned_joints=tuple(
+            name for name, joint in tree.joints.items() if joint.is_independent and name not in moved
+        ),
         held=tree.held,
     )
 
@@ -163,8 +164,12 @@ def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[s
 def _speeds(limb: GroupGuess) -> GroupDraft:
     """Return a base on wheels: numbers that move no joint of the URDF."""
     overrides = tuple(
-        Placeholder(
-            name, -fastest, fastest, 2 * fastest, f"{fastest:g} {unit} is a placeholder, and so is its change"
+        OverrideTable(
+            joint=name,
+            lower=-fastest,
+            upper=fastest,
+            velocity=2 * fastest,
+            reason=f"{fastest:g} {unit} is a placeholder, and so is its change",
         )
         for name, fastest, unit in _SPEEDS
     )
@@ -190,8 +195,7 @@ def _copy(group: GroupDraft, index: int, copies: int) -> GroupDraft:
     side = ("left", "right")[index] if copies == 2 else ""
     name = f"{side}_{group.name}" if side else f"{group.name}{index + 1}"
     x = round((index - (copies - 1) / 2) * _SPACING, 4)
-    values = {key: getattr(group, key) for key in GroupDraft.__slots__}
-    return GroupDraft(**values | {"name": name, "mount": PoseDraft((x, 0.0, 0.0), _QUARTER)})
+    return replace(group, name=name, mount=PoseDraft((x, 0.0, 0.0), _QUARTER))
 
 
 def _cameras(arms: Sequence[str]) -> dict[str, str]:

@@ -29,7 +29,7 @@ def corners(shapes: Iterable[Shape]) -> dict[str, Float64]:
     """Return the corners [n, 3] of the bounding boxes of each link's shapes, in the link."""
     found: dict[str, list[Float64]] = {}
     for shape in shapes:
-        ends = np.array(shape.bounds())  # [2, 3]
-        box = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i, j, k in np.ndindex(2, 2, 2)])
-        found.setdefault(shape.link, []).append(box @ shape.origin[:3, :3].T + shape.origin[:3, 3])
+        found.setdefault(shape.link, []).append(
+            shape.box_corners() @ shape.origin[:3, :3].T + shape.origin[:3, 3]
+        )
     return {link: np.concatenate(boxes) for link, boxes in found.items()}

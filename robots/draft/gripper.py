@@ -10,7 +10,7 @@ import numpy as np
 
 from robots.draft.geometry import places
 from robots.draft.group_guessing import GroupGuess
-from robots.draft.limits import FASTEST
+from robots.limits import FASTEST
 from robots.rotations import Float64, quaternion_of_matrix
 from robots.urdf import Joint, Urdf
 
@@ -50,33 +50,22 @@ def end_link(tree: Urdf, limb: GroupGuess) -> str:
     last = tree.joint(limb.joints[-1]).child
     if limb.fingers:
         return _hand(tree, limb, last)
-    rigid = _rigid(tree, last)
-    leaves = [link for link in rigid if not any(joint.parent == link for joint in tree.joints.values())]
+    leaves = [link for link in _behind(tree, last, rigid=True) if not tree.children(link)]
     return next((link for word in _PREFERRED for link in leaves if word in link.lower()), last)
 
 
 def _hand(tree: Urdf, limb: GroupGuess, last: str) -> str:
     """Return a frame for grasping after the last joint, else the link that carries the fingers."""
-    rigid = _rigid(tree, last)
+    rigid = _behind(tree, last, rigid=True)
     named = (link for word in _GRASPS for link in rigid if word in link.lower())
     return next(named, tree.joint(limb.fingers[0]).parent)
-
-
-def _rigid(tree: Urdf, link: str) -> list[str]:
-    """Return the link and all links fixed to it, outwards."""
-    found = [link]
-    for here in found:  # the list grows during the loop
-        found += [
-            joint.child for joint in tree.joints.values() if joint.parent == here and joint.kind == "fixed"
-        ]
-    return found
 
 
 def guess_gripper(
     tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]
 ) -> GripperDraft:
     """Return the gripper of an arm with fingers; `corners` [n, 3] are those of links with real shapes."""
-    followed = {tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None}
+    followed = tree.masters()
     driver = tree.joint(
         max(limb.fingers, key=lambda name: (name in followed, tree.joint(name).kind == "prismatic"))
     )
@@ -257,11 +246,11 @@ class _Jaws:
         return max((float((self._points_in_eef(link, at) @ self._z).max()) for link in shown), default=None)
 
 
-def _behind(tree: Urdf, link: str) -> list[str]:
-    """Return the link and all its descendants, outwards."""
+def _behind(tree: Urdf, link: str, *, rigid: bool = False) -> list[str]:
+    """Return the link and all its descendants, outwards; with `rigid` only those that are fixed to it."""
     found = [link]
     for here in found:  # the list grows during the loop
-        found += [joint.child for joint in tree.joints.values() if joint.parent == here]
+        found += [joint.child for joint in tree.children(here) if not rigid or joint.kind == "fixed"]
     return found
 
 

@@ -64,7 +64,7 @@ def guess_groups(tree: Urdf) -> tuple[GroupGuess, ...]:
     Raises:
         RobotError: If nothing moves.
     """
-    moving = [joint for joint in tree.outwards() if joint.kind != "fixed" and joint.mimic is None]
+    moving = [joint for joint in tree.outwards() if joint.is_independent]
     if not moving:
         raise RobotError(f"{tree.path}: no joint moves by itself; needed: at least one")
     skeleton = _Skeleton(tree, moving)
@@ -85,11 +85,8 @@ class _Skeleton:
     def __init__(self, tree: Urdf, moving: Sequence[Joint]) -> None:
         self.tree = tree
         self.names = [joint.name for joint in moving]
-        self._above = {joint.child: joint for joint in tree.joints.values()}
         self.parent = {name: self._next_above(tree.joint(name).parent) for name in self.names}
-        self.masters = {
-            tree.master(joint)[0].name for joint in tree.joints.values() if joint.mimic is not None
-        }
+        self.masters = tree.masters()
 
     def children(self, name: str | None, without: Iterable[str] = ()) -> list[str]:
         """Return the joints directly after `name`, without `without`; None for those on the root."""
@@ -132,8 +129,7 @@ class _Skeleton:
         return found
 
     def _next_above(self, link: str) -> str | None:
-        while link in self._above:
-            joint = self._above[link]
+        while (joint := self.tree.above(link)) is not None:
             if joint.name in self.names:
                 return joint.name
             link = joint.parent
@@ -197,7 +193,7 @@ def _limb(skeleton: _Skeleton, kind: Kind, joints: tuple[str, ...]) -> GroupGues
 
 def _base(tree: Urdf) -> str:
     """Return the base link: the root, or the link fixed to a root that only represents the world."""
-    behind = [joint for joint in tree.joints.values() if joint.parent == tree.root]
+    behind = tree.children(tree.root)
     if tree.root in ("world", "map", "odom", "ground") and len(behind) == 1 and behind[0].kind == "fixed":
         return behind[0].child
     return tree.root

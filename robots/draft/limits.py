@@ -3,42 +3,30 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
+from robots.description import OverrideTable
+from robots.limits import FASTEST
 from robots.urdf import Joint
 
 _TURN, _SLIDE = 3.1416, 0.5  # [rad] to both sides, [m]
 _SPEED, _SLIDING = 1.0, 0.1  # [rad/s], [m/s]
 _WIDEST = 4 * math.pi + 0.01  # [rad] arm joints have at most two turns
-FASTEST = 10.0  # [rad/s], [m/s]
 
 
-@dataclass(frozen=True, slots=True)
-class Placeholder:
-    """Limits of one number in place of the URDF's, with the reason."""
-
-    joint: str
-    lower: float | None
-    upper: float | None
-    velocity: float | None
-    reason: str
-
-
-def placeholder_limits(joint: Joint) -> Placeholder | None:
+def placeholder_limits(joint: Joint) -> OverrideTable | None:
     """Return the placeholder for unusable limits of a joint; None if the URDF's are usable."""
-    reasons = [*_positions(joint), *_speeds(joint)]
-    if not reasons:
+    bad_range, bad_speed = _positions(joint), _speeds(joint)
+    if not (bad_range or bad_speed):
         return None
     slides = joint.kind == "prismatic"
     way = _SLIDE if slides else _TURN
     speed = _SLIDING if slides else _SPEED
-    bad_range, bad_speed = bool(_positions(joint)), bool(_speeds(joint))
-    return Placeholder(
-        joint.name,
-        -way if bad_range else None,
-        way if bad_range else None,
-        speed if bad_speed else None,
-        f"{' and '.join(reasons)}: a placeholder, verify it on the robot",
+    return OverrideTable(
+        joint=joint.name,
+        lower=-way if bad_range else None,
+        upper=way if bad_range else None,
+        velocity=speed if bad_speed else None,
+        reason=f"{' and '.join([*bad_range, *bad_speed])}: a placeholder, verify it on the robot",
     )
 
 

@@ -108,8 +108,8 @@ class _UrdfCopy:
         """Remove invalid colours: all except four numbers from 0 to 1."""
         for link in self._robot.findall("link"):
             for material in link.iter("material"):
-                if self._without_odd_colour(material) and link.get("name", "") not in self.plain:
-                    self.plain.append(link.get("name", ""))
+                if self._without_odd_colour(material):
+                    self._show_plain(link)
         for material in self._robot.findall("material"):
             self._recoloured |= self._without_odd_colour(material)
 
@@ -118,13 +118,16 @@ class _UrdfCopy:
         if colour is None:
             return False
         try:
-            parts = [float(part) for part in colour.get("rgba", "").split()]
-        except ValueError:
-            parts = []
-        if len(parts) == 4 and all(0.0 <= part <= 1.0 for part in parts):
-            return False
-        material.remove(colour)
-        return True
+            shapes.colour_of(self._tree.path, "a material", colour)
+        except RobotError:
+            material.remove(colour)
+            return True
+        return False
+
+    def _show_plain(self, link: ET.Element) -> None:
+        """Record that the link is shown in the plain colour."""
+        name = link.get("name", "")
+        self.plain += [name] if name not in self.plain else []
 
     def stand_ins(self) -> None:
         """Add cylinders to links that lost all visuals; to all links if nothing is shown at all."""
@@ -151,8 +154,7 @@ class _UrdfCopy:
                     continue
                 if not material.get("name") or material.get("name") not in declared:
                     visual.remove(material)
-                    if link.get("name", "") not in self.plain:
-                        self.plain.append(link.get("name", ""))
+                    self._show_plain(link)
 
     def _copied(self, mesh: ET.Element) -> bool:
         named = mesh.get("filename", "")
@@ -170,13 +172,8 @@ class _UrdfCopy:
 
     def _sticks(self, link: str) -> Iterator[ET.Element]:
         """Yield visuals from the link's origin to each of its joints; a sphere at the end of a chain."""
-        behind = [
-            joint
-            for joint in self._tree.joints.values()
-            if joint.parent == link and not self._is_frame(joint)
-        ]
-        above = next((joint for joint in self._tree.joints.values() if joint.child == link), None)
-        ways = [joint.origin[:3, 3] for joint in behind]
+        above = self._tree.above(link)
+        ways = [joint.origin[:3, 3] for joint in self._tree.children(link) if not self._is_frame(joint)]
         long = [way for way in ways if np.linalg.norm(way) >= _SHORTEST]
         if not long and above is not None and above.kind != "fixed":
             yield _visual(np.zeros(3), "0 0 0", ET.Element("sphere", radius=f"{_KNOB:g}"))
@@ -190,8 +187,7 @@ class _UrdfCopy:
     def _is_frame(self, joint: Joint) -> bool:
         """Return True if the joint leads to a mere frame, such as that between fingertips."""
         link = next(link for link in self._robot.findall("link") if link.get("name") == joint.child)
-        leads_on = any(other.parent == joint.child for other in self._tree.joints.values())
-        return joint.kind == "fixed" and not leads_on and link.find("visual") is None
+        return joint.kind == "fixed" and not self._tree.children(joint.child) and link.find("visual") is None
 
 
 def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:

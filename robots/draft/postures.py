@@ -30,8 +30,12 @@ _NEAR, _ALIKE = 0.02, 1e-3  # [m], cosine: tolerances for two arms that mirror e
 
 def rest_posture(lower: Float64, upper: Float64) -> Float64:
     """Return zero, or the nearest value with a margin of a twentieth of the range to both limits."""
+    return np.clip(np.zeros_like(lower), *_inner_range(lower, upper))
+
+
+def _inner_range(lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
     inside = _INSIDE * (upper - lower)
-    return np.clip(np.zeros_like(lower), lower + inside, upper - inside)
+    return lower + inside, upper - inside
 
 
 class PostureSearch:
@@ -46,8 +50,7 @@ class PostureSearch:
         self._arms = robot.arms
         pairs = ((arm.name, self._mirroring(self._arms[0], arm)) for arm in self._arms[1:])
         self._signs = {name: signs for name, signs in pairs if signs is not None}
-        inside = _INSIDE * (robot.upper - robot.lower)
-        self._low, self._high = robot.lower + inside, robot.upper - inside
+        self._low, self._high = _inner_range(robot.lower, robot.upper)
         self._draw = np.random.default_rng(0)  # fixed seed: the same URDF gives the same draft
 
     def home(self) -> Float64:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,12 +17,11 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 Space = Literal["joint", "eef"]
+ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim", "unknown"]
 ActionMode = Literal["absolute", "relative", "delta"]
 RelativeFrame = Literal["base", "tool"]
 Result = Literal["success", "partial", "fail"]  # of an episode, as its operator judged it
 EEF_WIDTH = 8  # x, y, z [m], quaternion w, x, y, z, gripper: end-effector vector of an arm
-
-_EMPTY: Mapping[str, object] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,8 @@ from runtime.datasets.extra_streams import ExtraStreams, dimension_names, read_e
 from runtime.datasets.mapping import ColumnMapping, video_key
 from runtime.datasets.reader import Dataset, RecordedEpisode
 from runtime.datasets.video_frames import ImageSequence
-from runtime.recording.base import IMPORTED, ExecutedTick, Outcome, Row
+from runtime.ipc.messages import ExecutedTick
+from runtime.recording.base import IMPORTED, Outcome, Row
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.files import disk_error
 from runtime.recording.scrub import require_intact
@@ -199,7 +200,7 @@ def _row(episode: RecordedEpisode, row: int, pictures: Mapping[str, Any], beside
 
 def _tick(episode: RecordedEpisode, row: int) -> ExecutedTick:
     at = row / episode.fps
-    return ExecutedTick(row, at, at, row + 1, "unknown", episode.qpos[row], None, _action(episode, row))
+    return ExecutedTick(row, 0, at, at, row + 1, "unknown", episode.qpos[row], None, _action(episode, row))
 
 
 def _action(episode: RecordedEpisode, row: int) -> Float32:

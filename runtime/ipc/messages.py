@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from runtime.core import sentences
 from runtime.core.errors import CodecError
 from runtime.core.msgpack_arrays import pack, unpack
-from runtime.core.types import Float32, Float64, UInt8
+from runtime.core.types import ControlSource, Float32, Float64, UInt8
 
 # Kinds of control's events about subscribers of commands.
 NO_SUBSCRIBER, ALL_SUBSCRIBED = "commands_unheard", "commands_heard"
@@ -110,38 +110,45 @@ class NodeRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class TickDone:
-    """Record of one tick of control; times on our monotonic clock."""
+class ExecutedTick:
+    """One control tick: the smoothed action, the action after safety, and its send time (our monotonic clock)."""
 
     step: int
     run: int
     planned: float
     sent: float
     sequence: int
-    source: str
-    qpos: Float32
-    smoothed: Float32 | None
-    executed: Float32 | None
-    chunk_ids: list[int]
-    weights: list[float]
-    notes: list[str]
-    refused: bool
+    source: ControlSource
+    qpos: Float32  # measured joints at the tick
+    smoothed: Float32 | None  # before safety; None without a target
+    executed: Float32 | None  # sent action; None if none was sent
+    chunk_ids: list[int] = field(default_factory=list)
+    weights: list[float] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # changes by safety, or reasons of its refusal
+    refused: bool = False
     woke: float | None = None  # wake-up time; woke - planned is the lateness; None in lockstep
 
 
 @dataclass(frozen=True, slots=True)
-class ChunkMerged:
-    """Placement of a chunk by control; fields as in strategies.base.MergeResult."""
+class MergeResult:
+    """Result of a merge: which rows of a chunk are planned for which steps.
+
+    `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is
+    the step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
+    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for.
+    `dropped` is the reason why no row is used, "" if any is. `contributions` [N, 3] are step, chunk id and weight for
+    all steps that the chunk does not make alone; None if `Merge.uses_rtc` is false or if there are too many.
+    """
 
     chunk_id: int
-    run: int
     arrival_step: int
     delay: int
     targets: NDArray[np.int64]
-    mistimed: int
-    dropped: str
-    strategy: str = ""  # the kind that merged it
-    overlap: int = 0  # steps from the arrival on that were blended with an earlier plan
+    mistimed: int = 0
+    dropped: str = ""
+    run: int = 0  # set by control, like the next
+    strategy: str = ""  # the kind that merged it; "" for a chunk that was dropped before
+    overlap: int = 0  # steps from arrival_step on made by several chunks, or by a chunk and a held target
     contributions: Float64 | None = None
 
 
@@ -373,8 +380,8 @@ Message = (
     | PolicyAway
     | LockGrippers
     | NodeRequest
-    | TickDone
-    | ChunkMerged
+    | ExecutedTick
+    | MergeResult
     | Event
     | BeginEpisode
     | PolicyAnswer

@@ -53,10 +53,10 @@ _POLL_MS = 50
 _LOOK_S = 0.05
 _TRY_S = 2.0  # between two tries to lock the folder of a station
 _MOST_PENDING = 64  # pending commands per station
-_PENDING_S = 30.0
+_PENDING_S = 30.0  # [s] after which the sender of a pending command is answered in the station's place
 _HOPE_S = 0.8  # [s] that a press waits for a link just lost before its sender is answered
 _HELD_S = 5.0  # [s] after which a press that could not be sent is dropped
-_MOST_HELD = 64
+_MOST_HELD = 64  # held presses per station
 _LOST = "the link to its computer is lost: it continues by its own rules"
 _NOT_RUNNING = "its computer is linked, and the station does not run there: start it"
 
@@ -167,9 +167,7 @@ class Gate:
             payload, verified = _payload(mirror, call, command)
             held = PendingPress(call, command, payload, verified, self._clock())
             if not self._pass_press(remote, held):
-                remote.held.append(held)
-                if len(remote.held) > _MOST_HELD:
-                    self._give_up(remote, remote.held.pop(0))
+                self._hold_press(remote, held)
         for call, command in others:
             self._pass_command(remote, (call, command), (GUARD, "estop"), mirror.estops)
 
@@ -338,8 +336,11 @@ class Gate:
                 self._try(remote)
             self._adjust(remote)
             self._hold_on(remote, now)
-            for number in [one for one, pending in remote.pending.items() if now >= pending.until]:
-                del remote.pending[number]
+            for number, pending in list(remote.pending.items()):
+                if now >= pending.until:
+                    del remote.pending[number]
+                    late = f"sent and not answered within {_PENDING_S:g} s"
+                    pending.server.answer(pending.call, _failed(remote, pending.command, late))
             if remote.mirror is not None:
                 remote.mirror.poll()
                 if (streams := self._streams.places.get(remote.name)) is not None:
@@ -411,8 +412,14 @@ class Gate:
         for pending in remote.pending.values():
             if pending.press is not None:
                 pending.press.sent = True
-                remote.held.append(pending.press)
+                self._hold_press(remote, pending.press)
         remote.pending.clear()
+
+    def _hold_press(self, remote: Remote, press: PendingPress) -> None:
+        """Hold a press until the link returns; if too many are held, the oldest is dropped and its sender answered."""
+        remote.held.append(press)
+        if len(remote.held) > _MOST_HELD:
+            self._give_up(remote, remote.held.pop(0))
 
     def _lower(self, remote: Remote, why: str) -> None:
         """Publish why the station cannot be commanded."""
@@ -424,14 +431,15 @@ class Gate:
         """Answer senders of held presses when the link stays lost; drop presses older than `_HELD_S`."""
         for held in list(remote.held):
             known = now - remote.lost_at > _HOPE_S  # lost before the press
-            if not held.told and (known or now - held.at > _HOPE_S):
+            if known or now - held.at > _HOPE_S:
                 self._give_up(remote, held)
             if now - held.at > _HELD_S:
                 remote.held.remove(held)
 
     def _give_up(self, remote: Remote, held: PendingPress) -> None:
-        held.told = True
-        if remote.mirror is not None:
+        """Answer the sender of a held press, unless it has an answer already."""
+        told, held.told = held.told, True
+        if not told and remote.mirror is not None:
             remote.mirror.estops.answer(held.call, _not_sent(remote, held.command, held.sent))
 
     def _lose(self, routes: list[bytes]) -> None:
@@ -463,8 +471,7 @@ class Gate:
     def _close(self, remote: Remote, why: str) -> None:
         self._hold(remote)
         for held in remote.held:
-            if not held.told:
-                self._give_up(remote, held)
+            self._give_up(remote, held)
         if remote.mirror is not None:
             remote.mirror.close(why)
 

@@ -6,7 +6,6 @@ While it is down, clients find the reason and the time of the loss instead.
 
 from __future__ import annotations
 
-import logging
 import time
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +19,6 @@ from runtime.ipc.fair_queue import LONGEST_STOP, FairQueue
 from runtime.ipc.station_lock import StationLockedError, acquire
 from runtime.link.wire import COORDINATOR, GUARD, MEDIA
 
-log = logging.getLogger(__name__)
 LINK = "link"  # file in `endpoints/`: reason and time of a lost link, for people
 STOPPING = ("stop", "halt", "estop")
 _LAST_WORDS_MS = 200  # for answers that are still being sent when the socket closes

@@ -31,7 +31,7 @@ from runtime.policies.action_rows import parse_action_rows
 from runtime.policies.base import PolicyInfo
 from runtime.policies.normalization import Statistics
 from runtime.policies.request_layout import PIXELS, RequestLayout, Size
-from runtime.policies.websocket import Positive, ServerSettings, WebsocketPolicy
+from runtime.policies.websocket import ServerSettings, WebsocketPolicy
 from runtime.policies.websocket_link import error_headline
 
 if TYPE_CHECKING:
@@ -62,8 +62,8 @@ class Config(ServerSettings, ActionLayoutSettings):
     default."""
     statistics: Statistics | None = None
     """The same statistics, for servers that return only `normalized_actions`, whose responses are otherwise refused."""
-    ping_every: Positive | None = 60.0
-    """Longest silence before a ping is sent [s], because a server without requests ends by itself. None: no pings."""
+    ping_every: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 60.0
+    """Longest silence before a ping is sent [s], because a server without requests ends by itself. 0: no pings."""
 
 
 def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> StarvlaPolicy:
@@ -100,7 +100,7 @@ class StarvlaPolicy(WebsocketPolicy):
     def connect(self) -> PolicyInfo:
         """Connect, read the metadata, and ping, which only StarVLA's server answers."""
         info = super().connect()
-        if self._config.ping_every is not None and self._silent.is_set():
+        if self._config.ping_every and self._silent.is_set():
             self._silent = threading.Event()
             threading.Thread(
                 target=self._ping_while_idle,

@@ -11,7 +11,8 @@ import numpy as np
 
 from runtime.core.errors import RecordingError
 from runtime.core.types import Float32, UInt8
-from runtime.recording.base import ExecutedTick, RawChunk, Row
+from runtime.ipc.messages import ExecutedTick
+from runtime.recording.base import RawChunk, Row
 from runtime.recording.layout import Layout
 
 _NONE: Mapping[str, UInt8 | None] = MappingProxyType({})

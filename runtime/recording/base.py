@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.core.sentences import Pattern
-from runtime.core.types import Float32, Space, UInt8
+from runtime.core.types import ControlSource, Float32, Space, UInt8
+from runtime.ipc.messages import ExecutedTick
 
 _VIDEO_ENDS = Pattern(
     "recording.video_ends",
@@ -19,7 +20,6 @@ _VIDEO_ENDS = Pattern(
 )
 
 
-ControlSource = Literal["none", "hold", "motion", "policy", "teleop", "estop", "sim", "unknown"]
 Status = Literal["finished", "interrupted", "failed"]
 
 
@@ -53,25 +53,6 @@ class Row:
     bench: str | None = (
         None  # state of a simulated bench, see bench_truth; None: unchanged since the previous row
     )
-
-
-@dataclass(frozen=True, slots=True)
-class ExecutedTick:
-    """One control tick at full rate: the smoothed action, the action after safety, and its send time."""
-
-    step: int
-    planned: float
-    sent: float
-    sequence: int
-    control_source: ControlSource
-    qpos: Float32  # measured joints at the tick
-    smoothed: Float32 | None  # before safety; None without a target
-    executed: Float32 | None  # sent action; None if none was sent
-    chunk_ids: tuple[int, ...] = ()
-    weights: tuple[float, ...] = ()
-    changes: tuple[str, ...] = ()  # changes by safety, or reasons of its refusal
-    refused: bool = False
-    woke: float | None = None  # wake-up time of the loop; None in lockstep
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from runtime.core.types import Float32
-from runtime.recording.base import ExecutedTick, RawChunk, Row
+from runtime.ipc.messages import ExecutedTick
+from runtime.recording.base import RawChunk, Row
 from runtime.recording.layout import Layout
 
 
@@ -77,10 +78,10 @@ def ticks_columns(layout: Layout, ticks: Sequence[ExecutedTick]) -> dict[str, An
         "planned": [tick.planned - layout.started for tick in ticks],
         "sent": [tick.sent - layout.started for tick in ticks],
         "sequence": [tick.sequence for tick in ticks],
-        "control_source": [tick.control_source for tick in ticks],
+        "control_source": [tick.source for tick in ticks],
         "qpos": _vectors([tick.qpos for tick in ticks], layout.dim),
         "executed": _vectors([tick.executed for tick in ticks], layout.dim),
-        "changes": [tick.changes for tick in ticks],
+        "changes": [tick.notes for tick in ticks],
         "refused": [tick.refused for tick in ticks],
         "chunk_id": [_leading(tick) for tick in ticks],
         "woke": [None if tick.woke is None else tick.woke - layout.started for tick in ticks],

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from runtime.core.durable_files import sync_folder
 from runtime.core.errors import RecordingError
+from runtime.ipc.messages import ExecutedTick
 from runtime.recording.admission import admit_chunk, admit_row, admit_tick
 from runtime.recording.base import (
     VIDEO_LOST,
-    ExecutedTick,
     Journal,
     LostCamera,
     Outcome,

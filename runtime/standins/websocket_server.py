@@ -110,14 +110,11 @@ class WebsocketServer(ABC):
                     return
             answer = self.begin()
             while True:
-                request = connection.recv(timeout=self._idle)
-                started = time.monotonic()
-                if not self._answer(connection, answer, request):
+                if not self._answer(connection, answer, connection.recv(timeout=self._idle)):
                     return
-                self.on_answered(answer, time.monotonic() - started)
 
     def on_answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
-        """Handle the end of a request, `seconds` after it was received; the default does nothing."""
+        """Handle an answer that was sent `seconds` after its request was received; the default does nothing."""
 
     def refusal(self) -> Frames:
         """Return the frame that is sent if nothing is served."""
@@ -125,6 +122,7 @@ class WebsocketServer(ABC):
 
     def _answer(self, connection: ServerConnection, answer: Answering, request: str | bytes) -> bool:
         """Answer one request, correctly or as the fault demands; return False if the connection is over."""
+        started = time.monotonic()
         with self._device:
             number, self._asked = self._asked, self._asked + 1
             try:
@@ -133,7 +131,12 @@ class WebsocketServer(ABC):
                 reply = answer(request)
             except Exception as error:  # any error of a policy is reported to the client
                 return self.failed(connection, error, request)
-        return self._send(connection, reply, number)
+        if self._fault.name == "mute_on_infer" and number >= self._fault.number(0):
+            return True
+        if not self._send(connection, reply, number):
+            return False
+        self.on_answered(answer, time.monotonic() - started)
+        return True
 
     def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
         """Report an error to the client; return False if the connection is then closed."""
@@ -150,8 +153,6 @@ class WebsocketServer(ABC):
         due = number >= fault.number(0) if fault.name != "action_mode" else False
         if fault.name == "die" and due:
             os._exit(1)
-        if fault.name == "mute_on_infer" and due:
-            return True
         if fault.name == "close_mid_reply" and due:
             _send_half(connection, reply)
             return False

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from runtime.core.settings import Settings
 from runtime.core.types import Float64
+from runtime.ipc.messages import MergeResult
 from runtime.motion.timeline import (
     HELD,
     Contributions,
@@ -73,27 +73,6 @@ class ArrivedChunk:
     observation_step: int
     rows: Float64
     requested_while_stopped: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class MergeResult:
-    """Result of a merge: which rows of a chunk are planned for which steps.
-
-    `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is
-    the step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
-    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for.
-    `dropped` is the reason why no row is used, "" if any is. `contributions` [N, 3] are step, chunk id and weight for
-    all steps that the chunk does not make alone; None if `Merge.uses_rtc` is false or if there are too many.
-    """
-
-    chunk_id: int
-    arrival_step: int
-    delay: int
-    targets: NDArray[np.int64]
-    mistimed: int = 0
-    dropped: str = ""
-    overlap: int = 0  # steps from arrival_step on made by several chunks, or by a chunk and a held target
-    contributions: Float64 | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.strategies.base import ArrivedChunk, MergeResult, Placement
+from runtime.ipc.messages import MergeResult
+from runtime.strategies.base import ArrivedChunk, Placement
 
 
 def place(

@@ -105,7 +105,7 @@ WEBSOCKETS = {
         "starvla",
         "ws",
         lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, size=SIZE)),
-        settings={"cameras": [camera.key for camera in FRANKA.cameras], "ping_every": None},
+        settings={"cameras": [camera.key for camera in FRANKA.cameras], "ping_every": 0},
         first=1,  # a ping
     ),
     "starvla-old": Served(
@@ -114,7 +114,7 @@ WEBSOCKETS = {
         lambda fault: StarvlaServer(FRANKA, StarvlaBehaviour(fault=fault, old=True)),
         settings={
             "cameras": [camera.key for camera in FRANKA.cameras],
-            "ping_every": None,
+            "ping_every": 0,
             "statistics": {"low": list(FRANKA.lower), "high": list(FRANKA.upper)},
         },
         first=1,

@@ -12,8 +12,8 @@ from typing import Any
 
 from runtime.clients.client import StationClient
 from runtime.core.errors import RuntimeFault
+from runtime.core.restart_window import MOST_RESTARTS
 from runtime.ipc.bus import Endpoints
-from runtime.processes.supervisor.supervisor import MOST_RESTARTS
 from tests.processes import PATIENCE_S, eventually
 
 ROOT = Path(__file__).parents[2]

@@ -61,7 +61,7 @@ def _computing_has_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def _no_summaries_of_another_test() -> None:
     """Its rows were rolled back, which no lab's are."""
-    trial_selectors.forget()
+    trial_selectors._known.clear()
 
 
 def _written(row: Command) -> None:

@@ -12,13 +12,13 @@ from runtime.config.schema import FaultResponse
 from runtime.core.clock import VirtualClock
 from runtime.core.types import Float64, Observation, RobotCommand
 from runtime.ipc.messages import (
-    ChunkMerged,
     Event,
+    ExecutedTick,
     LockGrippers,
+    MergeResult,
     Message,
     Order,
     PostedChunk,
-    TickDone,
     Tune,
     decode,
     encode,
@@ -201,10 +201,10 @@ class Bench:
 
     # --- what control tells --------------------------------------------------------------------------------
 
-    def told(self) -> list[Event | ChunkMerged]:
+    def told(self) -> list[Event | MergeResult]:
         """Everything that the coordinator was told since the last call."""
         messages = [decode(payload) for payload in self.shared.rings["control_events"].drain()]
-        return [message for message in messages if isinstance(message, Event | ChunkMerged)]
+        return [message for message in messages if isinstance(message, Event | MergeResult)]
 
     def said(self, kind: str | None = None, quiet: Sequence[str] = ("limited", "limited_sum")) -> list[Event]:
         """The events since the last call: of `kind`, or all but the `quiet` ones."""
@@ -213,9 +213,9 @@ class Bench:
             event for event in events if (event.kind not in quiet if kind is None else event.kind == kind)
         ]
 
-    def records(self) -> list[TickDone]:
+    def records(self) -> list[ExecutedTick]:
         payloads = map(decode, self.shared.rings["ticks"].drain())
-        return [message for message in payloads if isinstance(message, TickDone)]
+        return [message for message in payloads if isinstance(message, ExecutedTick)]
 
     @property
     def status(self) -> Any:

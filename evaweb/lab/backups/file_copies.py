@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -224,10 +223,3 @@ def _signature(seen: os.stat_result) -> tuple[int, int, int]:
 def _unless_gone(error: OSError) -> None:
     if not isinstance(error, FileNotFoundError):
         raise BackupError(f"{error.filename}: {error.strerror}; nothing was kept of this backup") from error
-
-
-def room_for(folder: Path, wanted: int) -> None:
-    """Raise BackupError if the disk of `folder` has fewer than `wanted` bytes free."""
-    free = shutil.disk_usage(folder).free
-    if free < wanted:
-        raise BackupError(f"{folder}: {free:,} bytes free, {wanted:,} wanted")

@@ -18,8 +18,6 @@ from evaweb.statistics.proportions import proportion
 from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
 from evaweb.trials.models import Score, TrialStatus
 
-OUTCOMES = {"first", "second", "tie"}
-
 
 def rater_agreement(plan: Plan) -> dict[str, Any] | None:
     """Return the agreement of first and second raters on success and on each milestone; None without second ratings.

@@ -52,16 +52,8 @@ def load_plan_interruptions(plan: Plan) -> list[Interruption]:
     return [Interruption(**dict(zip(_RUN, row, strict=True))) for row in rows]
 
 
-def load_outcomes(trials: QuerySet[Trial]) -> list[Outcome]:
-    """Return the outcomes of any trials that count, in the order of their start.
-
-    Trials with the same number at the same position are assumed to have had the same conditions.
-    """
-    return _outcomes(trials, {}, {})
-
-
 def _outcomes(
-    trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int], until: datetime | None = None
+    trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int], until: datetime | None
 ) -> list[Outcome]:
     """Return the outcomes; with `until` by the newest scores given by then, without trials that had none."""
     scored = trials.filter(status=TrialStatus.SCORED).order_by("started_at", "pk")

@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runtime.core.types import Float64
+from runtime.core.types import ControlSource, Float64
 from runtime.motion.timeline import Contributions
 from runtime.motion.trajectories import Brake, Motion
-from runtime.recording.base import ControlSource
 from runtime.safety.filter import Path
 
 

@@ -13,13 +13,12 @@ from pydantic import ValidationError
 from runtime.core.errors import ConfigurationError
 from runtime.core.plugins import variants
 from runtime.core.sentences import Pattern
-from runtime.core.types import Float64
-from runtime.ipc.messages import ChunkMerged, Mode, PostedChunk
+from runtime.core.types import ControlSource, Float64
+from runtime.ipc.messages import MergeResult, Mode, PostedChunk
 from runtime.motion.timeline import DimensionKinds, Timeline, difference
 from runtime.processes.control.actuator import TickSettings
 from runtime.processes.control.behaviours import Behaviour, Target
-from runtime.recording.base import ControlSource
-from runtime.strategies.base import ArrivedChunk, Merge, MergeResult, join
+from runtime.strategies.base import ArrivedChunk, Merge, join
 
 log = logging.getLogger(__name__)
 _CHUNK_UNUSABLE = Pattern("control.chunk_unusable", "control cannot use it: {kind}: {error}")
@@ -76,7 +75,7 @@ class JoinResult(NamedTuple):
     `too_far`: the chunk was dropped for that reason.
     """
 
-    merged: ChunkMerged
+    merged: MergeResult
     distance_note: str = ""
     too_far: bool = False
 
@@ -185,9 +184,11 @@ class ExecuteChunks(Behaviour):
             joining=switched,
             commanded=commanded,
         )
-        merged = replace(merged, mistimed=merged.delay) if late else merged
         self._switched = switched and bool(merged.dropped)
-        return JoinResult(self._to_message(chunk, merged), far)
+        mistimed = merged.delay if late else merged.mistimed
+        return JoinResult(
+            replace(merged, mistimed=mistimed, run=chunk.run, strategy=self._strategy.kind), far
+        )
 
     def _first_used_distance(self, arrival: ArrivedChunk, step: int, commanded: Float64) -> tuple[float, str]:
         """Return distance and description of the first row that is not stale, as `_first_action_distance`."""
@@ -205,20 +206,6 @@ class ExecuteChunks(Behaviour):
         away = np.where(settings.limits.position_mask, np.abs(apart), 0.0)
         worst, name = float(away.max()), settings.limits.names[int(away.argmax())]
         return worst, _FIRST_ACTION_FAR(joint=name, distance=worst)
-
-    def _to_message(self, chunk: PostedChunk, merged: MergeResult) -> ChunkMerged:
-        return ChunkMerged(
-            chunk_id=merged.chunk_id,
-            run=chunk.run,
-            arrival_step=merged.arrival_step,
-            delay=merged.delay,
-            targets=merged.targets,
-            mistimed=merged.mistimed,
-            dropped=merged.dropped,
-            strategy=self._strategy.kind,
-            overlap=merged.overlap,
-            contributions=merged.contributions,
-        )
 
     def bear(self, until: float) -> None:
         """Tolerate an empty plan until `until`, because a lost policy is retried.
@@ -259,7 +246,7 @@ class ExecuteChunks(Behaviour):
         return None if since is None else now - since
 
 
-def dropped_chunk(chunk: PostedChunk, step: int, why: str) -> ChunkMerged:
+def dropped_chunk(chunk: PostedChunk, step: int, why: str) -> MergeResult:
     """Return the report of a chunk that control does not use."""
     nowhere = np.full(len(np.atleast_1d(chunk.rows)), -1, np.int64)
-    return ChunkMerged(chunk.chunk_id, chunk.run, step, step - chunk.observation_step, nowhere, 0, why)
+    return MergeResult(chunk.chunk_id, step, step - chunk.observation_step, nowhere, 0, why, chunk.run)

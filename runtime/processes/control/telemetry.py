@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from runtime.core.sentences import Pattern
-from runtime.core.types import Float32, Float64
-from runtime.ipc.messages import ChunkMerged, Event, Message, TickDone, encode
+from runtime.core.types import ControlSource, Float32, Float64
+from runtime.ipc.messages import Event, ExecutedTick, MergeResult, Message, encode
 from runtime.ipc.observation_reader import LatestObservation
 from runtime.ipc.shared_state import JOINT_PROBLEM_BYTES, SharedState
 from runtime.motion.timeline import HELD, Contributions
 from runtime.processes.control.actuator import Actuator, TickResult
 from runtime.processes.control.behaviours import Behaviour, EStopHold
-from runtime.recording.base import ControlSource
 from runtime.safety.collision import Collision
 
 _LIMITED_SUM = Pattern("control.limited_sum", "{count} actions were limited, worst: {worst}")
@@ -104,7 +103,7 @@ class Telemetry:
 
     def __init__(self, shared: SharedState) -> None:
         self._shared_state = shared
-        self._outbox: list[ChunkMerged | Event] = []
+        self._outbox: list[MergeResult | Event] = []
         self._records_lost = 0
         self._step, self.planned = -1, 0.0
         self._woke: float | None = None
@@ -125,7 +124,7 @@ class Telemetry:
         """Queue an event for the end of the tick, with the number of the order in force."""
         self._outbox.append(Event(kind, text, self.planned, self._step, {"order": self.order, **data}))
 
-    def add_merge(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: MergeResult) -> None:
         """Queue the placement of a chunk for the end of the tick."""
         self._outbox.append(merged)
 
@@ -141,7 +140,7 @@ class Telemetry:
         self._emit_contributions(makers, sent)
         if self._shared_state.unrecorded:
             return
-        done = TickDone(
+        done = ExecutedTick(
             step=self._step,
             run=self.run,
             planned=self.planned,

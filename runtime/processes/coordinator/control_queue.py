@@ -56,10 +56,6 @@ class ControlQueue:
             log.error("order %s is lost: %s", kind, error)  # the health monitor detects a control that hangs
         return self._number
 
-    def is_obeyed(self, number: int) -> bool:
-        """Return True if control has obeyed order `number`."""
-        return int(self._shared_state.control.read()["order"]) >= number
-
     def next_chunk(self) -> int:
         """Return a new chunk number."""
         self._chunk += 1

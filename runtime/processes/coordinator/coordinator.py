@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from runtime.config.loader import Resolved
-from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.core.sentences import Pattern, fixed
-from runtime.ipc.bus import EventLog
 from runtime.ipc.estop_requests import reason_of
 from runtime.ipc.identity import display_name
 from runtime.ipc.messages import (
@@ -20,27 +16,15 @@ from runtime.ipc.messages import (
     Event,
     encode,
 )
-from runtime.ipc.shared_state import EStop, SharedState
-from runtime.processes.coordinator.control_queue import ControlQueue
-from runtime.processes.coordinator.demonstrations import Demonstrations
-from runtime.processes.coordinator.health_monitor import HealthMonitor
+from runtime.ipc.shared_state import EStop
+from runtime.processes.coordinator.components import Components
 from runtime.processes.coordinator.inbox import Inbox
-from runtime.processes.coordinator.inference.inference import Inference
-from runtime.processes.coordinator.lease import Lease
-from runtime.processes.coordinator.manual.manual_control import ManualControl
-from runtime.processes.coordinator.operations import SessionActions
-from runtime.processes.coordinator.preflight_service import PreflightService
 from runtime.processes.coordinator.queries import QUERIES, Queries
-from runtime.processes.coordinator.runs import Runs
-from runtime.processes.coordinator.session.machine import LEASE_COMMANDS, SessionMachine
+from runtime.processes.coordinator.session.machine import LEASE_COMMANDS
 from runtime.processes.coordinator.session.transitions import SessionEvent
-from runtime.processes.coordinator.setup.sequence import SetUp
 from runtime.processes.coordinator.snapshot import build_snapshot
-from runtime.processes.coordinator.timing_report import TimingReport
-from runtime.spaces.conversion import ActionSpaces
 from runtime.station import permissions as rights
 from runtime.station.run import Run
-from runtime.station.spec import StationSpec
 
 log = logging.getLogger(__name__)
 _CHANGED = Pattern("session.changed", "{before} -> {after}: {reason}")
@@ -55,41 +39,15 @@ _ESTOP_FLAG_RAISED = fixed(
 
 
 @dataclass(eq=False)
-class Coordinator:
+class Coordinator(Components):
     """Owner of the session and its components; `poll` does everything that is due.
 
     Lockstep calls `poll` tick by tick. `assembly.assemble` builds a coordinator.
     """
 
-    boot: str
-    shared: SharedState
-    clock: Clock
-    client_clock: Clock  # of leases and of command validity; lockstep has another
-    deployment_spec: Resolved  # as at the station's start
-    facts: Mapping[str, Any]  # constants of the station for snapshots
-    events: EventLog
-    lease: Lease
-    orders: ControlQueue
-    spaces: ActionSpaces
-    inference: Inference
-    setup: SetUp
-    runs: Runs
-    manual: ManualControl
-    collecting: Demonstrations
-    health: HealthMonitor
-    timing: TimingReport
-    operations: SessionActions
-    preflights: PreflightService
-    session: SessionMachine
-
     def __post_init__(self) -> None:
         self.inbox = Inbox(self)
         self.queries = Queries(self.boot, self.events, self.manual, self.preflights)
-
-    @property
-    def spec(self) -> StationSpec:
-        """Specification of the last set-up or tuning."""
-        return self.operations.spec
 
     @property
     def run(self) -> Run | None:
@@ -125,24 +83,21 @@ class Coordinator:
 
     def snapshot(self) -> dict[str, Any]:
         """Return the current snapshot of the station."""
-        return build_snapshot(self)
+        return build_snapshot(self, self.inbox)
 
     def end_source_run(self, reason: str) -> None:
         """End the run on request of its simulator."""
         self.handle_event(SessionEvent.RUN_ENDED, reason)
 
     def emit(self, event: Event) -> None:
-        """Emit an event of the coordinator: to log, clients and episode."""
         self.record_event(event)
         self.runs.record_event(event)
 
     def record_event(self, event: Event) -> None:
-        """Record an event of another process, which writes it to the episode itself."""
         self.events.append(event)
         log.info("%s: %s", event.kind, event.text)
 
     def handle_event(self, happening: SessionEvent, reason: str, process: str = "") -> None:
-        """Pass an event to the session and its components; `process` is the one that was restarted."""
         if happening is SessionEvent.FAMILY_DIED:
             self.emit(Event("family_died", reason, self.clock.now()))
             self.inbox.reset_subscribers()

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from runtime.core.sentences import Pattern
 from runtime.ipc.messages import (
     ALL_SUBSCRIBED,
     NO_SUBSCRIBER,
-    ChunkMerged,
     EpisodeClosed,
     EpisodeOpened,
     Event,
     MediaReport,
+    MergeResult,
     Message,
     ReceptionReport,
     decode,
 )
 from runtime.ipc.session_state import SessionState
+from runtime.processes.coordinator.components import Components
 from runtime.processes.coordinator.session.transitions import SessionEvent
-
-if TYPE_CHECKING:
-    from runtime.processes.coordinator.coordinator import Coordinator
 
 _CHUNK_DROPPED = Pattern("inbox.chunk_dropped", "chunk {chunk} dropped: {why}")
 _STARVED_BECAUSE = Pattern("inbox.starved_because", "{why}: {trouble}")
@@ -36,7 +33,7 @@ _HOLDS = ("refusals", "implausible", "unmeasured", "family", "orphaned", "too_fa
 class Inbox:
     """Dispatcher of the other processes' messages to the coordinator's components; stores their latest reports."""
 
-    def __init__(self, coordinator: Coordinator) -> None:
+    def __init__(self, coordinator: Components) -> None:
         self._to = coordinator
         self.media_report = MediaReport(0.0, 0, "", 0)
         self.reception_report = ReceptionReport(0.0)
@@ -65,7 +62,7 @@ class Inbox:
         to = self._to
         if isinstance(message, Event):
             self._on_event(message)
-        elif isinstance(message, ChunkMerged):
+        elif isinstance(message, MergeResult):
             to.inference.on_merged(message)
             if message.dropped:
                 text = _CHUNK_DROPPED(chunk=message.chunk_id, why=message.dropped)

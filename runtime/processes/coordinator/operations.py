@@ -309,7 +309,7 @@ class SessionActions:
         """Move to the policy's first action on a limited path: that of the set-up, or of the shown chunk."""
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and made is not None:
-            self.runs.approach(self.manual.check_motion("approach", made.answered.commands.intended_start))
+            self.runs.approach(self.manual.check_motion("approach", made.commands.intended_start))
         elif first is not None:
             self.setup.begin_approach(self.manual.check_motion("approach", first))
 

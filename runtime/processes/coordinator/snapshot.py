@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 from robots.units import units_of
 from runtime.core.plugins import variants
@@ -11,27 +11,26 @@ from runtime.core.sentences import within
 from runtime.ipc.messages import PolicyMode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import SharedState
+from runtime.processes.coordinator.components import Components
+from runtime.processes.coordinator.inbox import Inbox
 from runtime.station.spec import StationSpec
 
-if TYPE_CHECKING:
-    from runtime.processes.coordinator.coordinator import Coordinator
 
-
-def build_snapshot(of: Coordinator) -> dict[str, Any]:
+def build_snapshot(of: Components, inbox: Inbox) -> dict[str, Any]:
     """Return the station's state; times in seconds on the runtime's clock, ages in seconds.
 
     "clock" is the clock of command validity; in lockstep it continues while the runtime's clock is stopped.
     "sentences" has id and arguments of texts that have them, by path: "reason", "guarded.run".
     """
-    told = _snapshot(of)
+    told = _snapshot(of, inbox)
     changing = {key: value for key, value in told.items() if key != "facts"}
     return told | {"sentences": within(changing)}
 
 
-def _snapshot(of: Coordinator) -> dict[str, Any]:
+def _snapshot(of: Components, inbox: Inbox) -> dict[str, Any]:
     spec, settings = of.spec, of.spec.deployment
     now, people = of.clock.now(), of.client_clock.now()
-    media, reception = of.inbox.media_report, of.inbox.reception_report
+    media, reception = inbox.media_report, inbox.reception_report
     return {
         "boot": of.boot,
         "clock": people,
@@ -67,7 +66,7 @@ def _snapshot(of: Coordinator) -> dict[str, Any]:
             "unclosed": dict(media.unclosed),
         },
         "control": control_figures(of.shared, spec.rate),
-        "link": _link(of, now),
+        "link": _link(of, inbox, now),
         "newest_event": of.events.newest,
         "facts": dict(of.facts),
     }
@@ -104,7 +103,7 @@ def station_facts(spec: StationSpec) -> dict[str, Any]:
     }
 
 
-def _phase(of: Coordinator) -> str:
+def _phase(of: Components) -> str:
     """Return the phase of a running run in one word; "" if there is none, or it has not begun."""
     run, control = of.runs.open, of.shared.control.read()
     if run is None or run.begun_at is None or of.session.state is not SessionState.RUNNING:
@@ -121,14 +120,10 @@ def _phase(of: Coordinator) -> str:
     return next((word for word, holds in states if holds), "waiting")
 
 
-def _proposal(of: Coordinator, now: float) -> dict[str, Any]:
+def _proposal(of: Components, now: float) -> dict[str, Any]:
     """Return the status of the chunk that waits to be committed, {} if there is none."""
     made = of.inference.proposal
-    return (
-        {}
-        if made is None
-        else {**made.status(now), **of.setup.distance_of(made.answered.commands.intended_start)}
-    )
+    return {} if made is None else {**made.status(now), **of.setup.distance_of(made.commands.intended_start)}
 
 
 def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
@@ -151,8 +146,8 @@ def control_figures(shared: SharedState, rate: float) -> dict[str, Any]:
     }
 
 
-def _link(of: Coordinator, now: float) -> dict[str, Any]:
-    record, reception = of.shared.observation.read(), of.inbox.reception_report
+def _link(of: Components, inbox: Inbox, now: float) -> dict[str, Any]:
+    record, reception = of.shared.observation.read(), inbox.reception_report
     never = int(record["sequence"]) == 0
     ages = {"joints": math.inf if never else now - float(record["joints_captured"])}
     for index, camera in enumerate(of.shared.layout.cameras):
@@ -163,7 +158,7 @@ def _link(of: Coordinator, now: float) -> dict[str, Any]:
         "rates": dict(reception.rates),
         "faults": dict(reception.faults),
         "cameras": {key: dict(told) for key, told in reception.cameras.items()},
-        "unheard": dict(of.inbox.unheard),
+        "unheard": dict(inbox.unheard),
         "age_ms": dict(reception.age_ms),
         "scheduling": reception.scheduling,
     }

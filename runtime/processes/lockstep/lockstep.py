@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import mmap
 import uuid
 from collections.abc import Callable, Mapping
@@ -33,7 +32,6 @@ from runtime.processes.reception.process import Reception, make_source
 from runtime.station.spec import StationSpec
 from runtime.transports.base import Sink, Source
 
-log = logging.getLogger(__name__)
 _HOLDER = "lockstep"
 
 

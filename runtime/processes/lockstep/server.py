@@ -8,7 +8,6 @@ while an episode is being closed. Leases and the validity of commands use real t
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +34,6 @@ from runtime.processes.media.unclosed_episodes import in_background
 from runtime.station.lock import acquire_station_lock
 from runtime.station.spec import StationSpec
 
-log = logging.getLogger(__name__)
 _POLL_S = 0.002  # polling period for commands while time is paused [s]
 _AGAIN_S = 0.2  # period for showing the same pictures again [s]
 _LAST_S, _EXPORT_S = 8.0, 3.0  # time at the end for the last episode and for exports [s]

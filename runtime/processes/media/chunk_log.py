@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from runtime.core.types import Float32, UInt8
-from runtime.ipc.messages import ChunkMerged, PolicyAnswer
+from runtime.ipc.messages import MergeResult, PolicyAnswer
 from runtime.recording.base import Journal, RawChunk
 
 _KEPT = 256  # most entries of either half that wait for the other
@@ -17,7 +17,7 @@ class ChunkLog:
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
         self._answers: dict[int, PolicyAnswer] = {}
-        self._merged: dict[int, ChunkMerged] = {}
+        self._merged: dict[int, MergeResult] = {}
 
     def add_answer(self, answer: PolicyAnswer) -> None:
         """Add a chunk as the policy returned it."""
@@ -29,7 +29,7 @@ class ChunkLog:
         if len(self._answers) > _KEPT:  # the oldest never reached control
             self._write(self._answers.pop(next(iter(self._answers))), None)
 
-    def add_merge(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: MergeResult) -> None:
         """Add the placement of a chunk by control."""
         answer = self._answers.pop(merged.chunk_id, None)
         if answer is not None:
@@ -42,7 +42,7 @@ class ChunkLog:
         for answer in list(self._answers.values()):
             self._write(answer, None)
 
-    def _write(self, answer: PolicyAnswer, merged: ChunkMerged | None) -> None:
+    def _write(self, answer: PolicyAnswer, merged: MergeResult | None) -> None:
         targets = np.full(len(answer.actions), -1, np.int64)
         if merged is not None:
             # A row of the policy belongs to the first step that was made from it.

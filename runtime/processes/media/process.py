@@ -18,18 +18,18 @@ from runtime.ipc.membership import rest_s
 from runtime.ipc.messages import (
     BeginEpisode,
     BeginRun,
-    ChunkMerged,
     EndEpisode,
     EndRun,
     EpisodeClosed,
     EpisodeOpened,
     Event,
+    ExecutedTick,
     MediaReport,
+    MergeResult,
     Message,
     Observed,
     PolicyAnswer,
     RunBegun,
-    TickDone,
     decode,
     encode,
     event_row,
@@ -189,11 +189,11 @@ class Media:
         recorder = self._recorder
         if isinstance(message, Observed):
             self._observe(message)
-        elif isinstance(message, TickDone):
+        elif isinstance(message, ExecutedTick):
             if message.sequence > self._newest:  # observations reach the ring before the tick that used them
                 self._drain("observations")
             recorder.add_tick(message)
-        elif isinstance(message, ChunkMerged):
+        elif isinstance(message, MergeResult):
             recorder.add_merge(message)
         elif isinstance(message, PolicyAnswer):
             recorder.add_answer(message)

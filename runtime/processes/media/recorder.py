@@ -17,10 +17,10 @@ import numpy as np
 from runtime.core.errors import RecordingError
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Float32, Observation
-from runtime.ipc.messages import ChunkMerged, Event, PolicyAnswer, TickDone, event_row
+from runtime.ipc.messages import Event, ExecutedTick, MergeResult, PolicyAnswer, event_row
 from runtime.processes.media.camera_rows import CameraRows
 from runtime.processes.media.chunk_log import ChunkLog
-from runtime.recording.base import VIDEO_LOST, ExecutedTick, Journal, Outcome, Row, Status
+from runtime.recording.base import VIDEO_LOST, Journal, Outcome, Row, Status
 from runtime.recording.bench_truth import truth_text
 from runtime.recording.files import UnclosedError
 from runtime.recording.schema import Schema
@@ -105,7 +105,7 @@ class Recorder:
         self._journal.begin(self._manifest(dict(manifest), identity, newest))
         self._uuid, self._run, self.rows, self.repeated = identity, run, 0, 0
         self._first_step: int | None = None
-        self._before: tuple[TickDone, Observation | None] | None = None
+        self._before: tuple[ExecutedTick, Observation | None] | None = None
         self._complete = False
         self._news: list[Event] = []
         self._applied: Float32 | None = None  # newest action that the robot reported
@@ -200,12 +200,12 @@ class Recorder:
         if self._uuid and answer.run == self._run:
             self._chunks.add_answer(answer)
 
-    def add_merge(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: MergeResult) -> None:
         """Add the placement of a chunk by control, which may come before the chunk itself."""
         if self._uuid and merged.run == self._run:
             self._chunks.add_merge(merged)
 
-    def add_tick(self, tick: TickDone) -> None:
+    def add_tick(self, tick: ExecutedTick) -> None:
         """Record one control tick: the full-rate stream, and every grid row that is now known."""
         if not self._uuid or self._complete or (self._run and tick.run != self._run):
             return
@@ -216,7 +216,7 @@ class Recorder:
             tick = applied
         if self._first_step is None:
             self._first_step = tick.step
-        self._journal.append(_executed(tick))
+        self._journal.append(tick)
         here = (tick, self._observation(tick.sequence))
         # After a gap of missed ticks several rows may be complete; those within the gap repeat the tick before it.
         while (target := self._target(self.rows)) <= tick.step:
@@ -225,7 +225,7 @@ class Recorder:
         self._before = here
         self._complete = here[1] is not None and here[1].last
 
-    def _reported_tick(self, tick: TickDone) -> TickDone | None:
+    def _reported_tick(self, tick: ExecutedTick) -> ExecutedTick | None:
         """Return the tick with the action that a node-driven robot reported; None before its first report.
 
         If the node reported none for this frame, the last action is repeated with source "none".
@@ -250,7 +250,7 @@ class Recorder:
                 return observation
         return None
 
-    def _write_row(self, tick: TickDone, seen: Observation | None) -> None:
+    def _write_row(self, tick: ExecutedTick, seen: Observation | None) -> None:
         """Write one row; `seen` is the tick's observation, None if it is no longer available.
 
         Joints come from the tick.
@@ -273,7 +273,7 @@ class Recorder:
             action=action,
             captured={} if seen is None else seen.captured,
             pictures=pictures,
-            control_source=tick.source,  # type: ignore[arg-type]  # control sends only these sources
+            control_source=tick.source,
             qvel=None if seen is None else seen.qvel,
             effort=None if seen is None else seen.effort,
             eef=self._eef(measured, tick.qpos) if with_eef else None,
@@ -306,21 +306,3 @@ def _reported_eef(seen: Observation, action: Float32) -> Float32 | None:
     if seen.reported_action is None or not np.array_equal(seen.reported_action, action):
         return None
     return seen.reported_action_eef
-
-
-def _executed(tick: TickDone) -> ExecutedTick:
-    return ExecutedTick(
-        step=tick.step,
-        planned=tick.planned,
-        sent=tick.sent,
-        sequence=tick.sequence,
-        control_source=tick.source,  # type: ignore[arg-type]
-        qpos=tick.qpos,
-        smoothed=tick.smoothed,
-        executed=tick.executed,
-        chunk_ids=tuple(tick.chunk_ids),
-        weights=tuple(tick.weights),
-        changes=tuple(tick.notes),
-        refused=tick.refused,
-        woke=tick.woke,
-    )

@@ -11,13 +11,13 @@ import subprocess
 import sys
 import time
 import uuid
-from collections import deque
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import FrameType
 
 from runtime.core.environment import program_environment
+from runtime.core.restart_window import MOST_RESTARTS, RestartWindow
 from runtime.ipc.bells import Bell
 from runtime.ipc.bus import Endpoints, Key
 from runtime.ipc.lifeline import Lifeline
@@ -40,7 +40,6 @@ _MODULES = {
 _START_ORDER = ("guard", "reception", "media", "control", "coordinator")
 # Optional companions.
 _CHANNEL, _LINK, _PANEL = "runtime.clients.channel", "runtime.link", "runtime.clients.panel"
-MOST_RESTARTS, RESTART_WINDOW_S = 5, 60.0
 _PATIENCE_S = 9.0  # time for children after the lifeline is cut [s]; then they are killed
 _DRIVER_PATIENCE_S = 2.0  # time for the driver of a headless run after its termination [s]
 _LOOK_S = 0.2  # period of checks for companions [s]
@@ -58,7 +57,7 @@ class Supervisor:
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._driver: subprocess.Popen[bytes] | None = None
         self._companions: dict[str, OptionalChild] = {}
-        self._restarts: deque[float] = deque()
+        self._restarts = RestartWindow()
         self._ending = False
         self.boot = str(uuid.uuid4())
 
@@ -184,16 +183,9 @@ class Supervisor:
                 os.close(end)
 
     def _restart(self, process: str, code: int) -> bool:
-        now = time.monotonic()
-        self._restarts.append(now)
-        while self._restarts[0] < now - RESTART_WINDOW_S:
-            self._restarts.popleft()
-        if len(self._restarts) > MOST_RESTARTS:
+        if not self._restarts.admit(time.monotonic()):
             log.error(
-                "%s ended with %d; %d restarts within a minute: giving up",
-                process,
-                code,
-                len(self._restarts) - 1,
+                "%s ended with %d; %d restarts within a minute: giving up", process, code, MOST_RESTARTS
             )
             return False
         log.error("%s ended with %d: restarting it", process, code)

@@ -61,12 +61,6 @@ class PoseStamped:
 
 
 Message: TypeAlias = JointState | Image | CompressedImage | PoseStamped
-MESSAGES: dict[MessageName, type[Message]] = {
-    "JointState": JointState,
-    "Image": Image,
-    "CompressedImage": CompressedImage,
-    "PoseStamped": PoseStamped,
-}
 PACKAGES: dict[MessageName, str] = {
     "JointState": "sensor_msgs",
     "Image": "sensor_msgs",

@@ -158,11 +158,6 @@ class RosSource(Source):
         told, self._news = self._news, []
         return told
 
-    @property
-    def last_fault(self) -> str:
-        """Sentence about the newest fault; "" if there was none."""
-        return self._last_fault
-
     def stalled(self) -> dict[str, float]:
         """Return streams without a usable message for too long: age of the newest, or of the connection [s]."""
         now, began = self._clock.now(), self._began
@@ -185,7 +180,6 @@ class RosSource(Source):
         self._readers = MessageReaders(self._robot, self._parts, self._terms.names)
         self._assembly = Assembly(self._robot, self._parts, self._terms.detect_frozen)
         self._faults: Counter[str] = Counter()
-        self._last_fault = ""
         self._sentences: dict[str, str] = {}  # newest sentence by fault
         self._refusals: dict[
             str, tuple[str, str]
@@ -259,7 +253,7 @@ class RosSource(Source):
         for name in now.keys() - self._stalled:
             fault = f"stalled_{name.replace(' ', '_')}"
             self._faults[fault] += 1
-            self._last_fault = self._sentences[fault] = self._silence(name, now[name], Match(1))
+            self._sentences[fault] = self._silence(name, now[name], Match(1))
         self._stalled = set(now)
 
     def _report_no_frame(self) -> None:
@@ -295,7 +289,6 @@ class RosSource(Source):
             self._emit(series([self._silence(name, stalled[name], match) for name, match in fresh.items()]))
 
     def _emit(self, sentence: str) -> None:
-        self._last_fault = sentence
         self._news.append(Event("source_waiting", sentence, self._clock.now()))
 
     def _waited(self) -> float:
@@ -327,7 +320,7 @@ class RosSource(Source):
     def _count_fault(self, fault: str, text: str, *streams: str) -> None:
         with self._changed:
             self._faults[fault] += 1
-            self._last_fault = self._sentences[fault] = text
+            self._sentences[fault] = text
             for stream in streams:
                 self._refusals[stream] = (fault, text)
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.multiple_comparisons import holm, letters, separated_pairs
+from evaweb.statistics.multiple_comparisons import holm, letters
 
 
 def pairs(*names):
@@ -54,8 +54,3 @@ def test_letters_refuse_names_they_do_not_know():
         letters("AB", pairs("AC"))
     with pytest.raises(StatisticsError, match="stands twice"):
         letters("AA", set())
-
-
-def test_separated_are_those_that_stay_so_after_correction():
-    found = separated_pairs({frozenset("AB"): 0.01, frozenset("AC"): 0.04, frozenset("BC"): 0.03}, alpha=0.05)
-    assert found == pairs("AB")

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
 from evaweb.statistics.milestone_funnel import funnel
-from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha, weighted_kappa
+from evaweb.statistics.raters import cohen_kappa, gwet_ac1, krippendorff_alpha
 
 RATED = st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=1, max_size=40)
 
@@ -31,33 +31,22 @@ def test_krippendorff_of_his_own_example():
 
 
 @given(RATED)
-def test_unweighted_is_cohens_kappa_and_agreement_is_1(pairs):
-    if len({level for pair in pairs for level in pair}) > 1:
-        assert weighted_kappa(pairs, 4, "none") == pytest.approx(cohen_kappa(pairs), abs=1e-9)
+def test_agreement_is_1(pairs):
     same = [*((one, one) for one, _ in pairs), (0, 0), (1, 1)]
-    assert cohen_kappa(same) == gwet_ac1(same, 4) == weighted_kappa(same, 4) == 1.0
+    assert cohen_kappa(same) == gwet_ac1(same, 4) == 1.0
     assert krippendorff_alpha(same) == 1.0
 
 
-@pytest.mark.parametrize(
-    "statistic", [cohen_kappa, lambda pairs: weighted_kappa(pairs, 2), krippendorff_alpha]
-)
+@pytest.mark.parametrize("statistic", [cohen_kappa, krippendorff_alpha])
 def test_ratings_that_all_say_the_same_word_tell_nothing_of_chance(statistic):
     with pytest.raises(StatisticsError, match="all ratings say 1: how often chance agrees is not defined"):
         statistic([(1, 1)] * 30)
     assert gwet_ac1([(1, 1)] * 30) == 1.0
 
 
-def test_being_one_level_apart_is_less_wrong():
-    near, far = [(0, 1), (1, 2), (2, 2), (0, 0)], [(0, 2), (2, 0), (2, 2), (0, 0)]
-    assert weighted_kappa(near, 3) > weighted_kappa(far, 3)
-
-
 def test_ratings_that_cannot_be_are_refused():
     with pytest.raises(StatisticsError, match="no trial"):
         cohen_kappa([])
-    with pytest.raises(StatisticsError, match="level 4; allowed: 0 to 3"):
-        weighted_kappa([(0, 4)], 4)
     with pytest.raises(StatisticsError, match="rated by two people"):
         krippendorff_alpha([[1, None], [None, 2]])
     with pytest.raises(StatisticsError, match="3 categories were used, 2 are declared"):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evaweb.statistics.base import StatisticsError
-from evaweb.statistics.sequential import pair_by_order, score_evidence, success_evidence
+from evaweb.statistics.sequential import score_evidence, success_evidence
 
 PAIRS = st.lists(st.tuples(st.booleans(), st.booleans()), max_size=60)
 
@@ -135,7 +135,3 @@ def test_a_score_beyond_its_range_is_refused():
         score_evidence([(1.2, 0.0)])
     with pytest.raises(StatisticsError, match="alpha = 0"):
         success_evidence([], alpha=0)
-
-
-def test_pairs_are_made_in_order_and_the_rest_waits():
-    assert pair_by_order([True, False, True], [False, False]) == [(True, False), (False, False)]

@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 
 from robots import urdf
-from robots.draft.limits import Placeholder, placeholder_limits
+from robots.description import OverrideTable
+from robots.draft.limits import placeholder_limits
 from tests.robots.draft.urdfs import LIMIT, base, joint, link, write
 
 
-def of(folder: Path, more: str, kind: str = "revolute") -> Placeholder | None:
+def of(folder: Path, more: str, kind: str = "revolute") -> OverrideTable | None:
     body = base() + link("a") + joint("j", "base_link", "a", kind=kind, more=more)
     return placeholder_limits(urdf.read(write(folder, body)).joint("j"))
 

@@ -1,5 +1,6 @@
 """What one computer does at a lab's ports, and no other station may notice."""
 
+import contextlib
 import socket
 
 import pytest
@@ -8,11 +9,11 @@ import zmq
 from runtime.core.errors import CodecError
 from runtime.ipc.bus import CommandClient, Endpoints, Key
 from runtime.ipc.messages import Ack, Command, decode, encode
-from runtime.link import door, key_files, wire
+from runtime.link import door, gate, key_files, wire
 from runtime.link.admission import Admission, AllowList
 from runtime.link.line import dialled
 from runtime.link.wire import COMMANDS, RELEASE, STOPS, Ask, Beat, Bye, Hello, Welcome, read, write
-from tests.processes import eventually
+from tests.processes import PATIENCE_S, eventually
 from tests.runtime.link.linked import STATION, allowed
 
 OTHER = "bench-8"
@@ -104,6 +105,27 @@ def test_a_program_of_another_release_unlinks_no_station_that_is_linked(lab, dia
     assert lab.gate.linked() == {STATION, OTHER}
 
 
+@pytest.mark.parametrize(
+    ("kind", "role", "status"), [("status", COMMANDS, "refused"), ("stop", STOPS, "failed")]
+)
+def test_a_command_that_the_station_never_answers_is_answered_by_the_gate(
+    lab, dial, monkeypatch, kind, role, status
+):
+    monkeypatch.setattr(gate, "_PENDING_S", 0.0)
+    lines = other_linked(lab, dial)
+    folder = lab.folder(OTHER)
+    endpoint = str(Endpoints(folder).read("coordinator")["commands"])
+    with contextlib.closing(CommandClient(zmq.Context.instance(), endpoint, Key(folder))) as client:
+        client.send(Command("u1", kind, user="ann", holder="ann", role="operator"))
+        asked = said(lines[role], Ask)
+        ack = decode(eventually(client.packed_answer, "the answer"))
+        assert (ack.uuid, ack.status) == ("u1", status)
+        assert "sent and not answered within" in ack.reason
+        lines[role].send_multipart(write(wire.Answer(asked.number), b"too late"))
+        monkeypatch.setattr(gate, "_PENDING_S", PATIENCE_S)
+        assert lab.press().status == "done"
+
+
 def test_a_message_of_nothing_but_parts_keeps_no_press_and_its_key_is_refused_for_a_while(
     lab, dial, monkeypatch
 ):
@@ -193,3 +215,25 @@ def test_of_one_key_so_many_handshakes_are_answered_and_no_more_of_unknown_keys_
     assert let_in(KEY.public, b"10.0.0.9", 300) == 20
     list_of.now = allowed((KEY, OTHER))
     assert admission.answer([b"1.0", b"1", b"stations", b"10.0.0.1", b"", b"CURVE", b"u" * 32])[2] == b"400"
+
+
+def test_of_presses_that_were_lost_with_the_link_only_the_newest_are_held(lab, dial, monkeypatch):
+    """The bound held for presses without a link alone, not for those that a lost link gave back."""
+    monkeypatch.setattr(gate, "_MOST_HELD", 2)
+    monkeypatch.setattr(gate, "_HOPE_S", PATIENCE_S)
+    lines = other_linked(lab, dial)
+    folder = lab.folder(OTHER)
+    endpoint = str(Endpoints(folder).read("guard")["estop"])
+    with contextlib.closing(CommandClient(zmq.Context.instance(), endpoint, Key(folder))) as client:
+        for number in range(4):
+            client.send(Command(f"p{number}", "estop", user="ann", holder="ann", role="operator"))
+            assert said(lines[STOPS], Ask).process == "guard"
+        stops = dial()  # of another program, so that both connections are lost at once
+        stops.send_multipart(write(Hello(RELEASE, "0", OTHER, STOPS, b"another")))
+        assert said(stops, Welcome)
+        acks = [decode(eventually(client.packed_answer, "an answer")) for _ in range(2)]
+        assert [(ack.uuid, ack.status) for ack in acks] == [("p0", "failed"), ("p1", "failed")]
+        assert all("USE THE HARDWARE STOP" in ack.reason for ack in acks)
+        assert [press.command.uuid for press in lab.gate._remotes[OTHER].held] == ["p2", "p3"]
+        stops.send_multipart(write(Beat(CHALLENGE, ["guard"])))
+        assert [said(stops, Ask).process for _ in range(2)] == ["guard", "guard"]

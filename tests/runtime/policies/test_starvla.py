@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from websockets.sync.server import ServerConnection
 
 from runtime.core import msgpack_arrays
@@ -29,7 +31,7 @@ ROWS = np.arange(16, dtype=np.float64).reshape(2, 8) / 8
 
 
 def built(robot: Any = FRANKA, **settings: Any) -> StarvlaPolicy:
-    config = Config(**{"connect_deadline": 10.0, "cameras": VIEWS, "ping_every": None, **settings})
+    config = Config(**{"connect_deadline": 10.0, "cameras": VIEWS, "ping_every": 0, **settings})
     return starvla.build(config, robot, MonotonicClock(), 30.0)
 
 
@@ -387,6 +389,16 @@ def test_pings_go_out_while_nobody_asks_until_it_is_closed() -> None:
         joined(thread)
     assert {message["type"] for message in pings} == {"ping"}
     assert len({message["request_id"] for message in pings}) == len(pings)
+
+
+def test_no_ping_goes_out_where_a_deployment_says_0() -> None:
+    assert Config().ping_every == 60.0
+    asked = Config(**tomllib.loads("ping_every = 0"))
+    with served() as (_, url), policy_at(url, ping_every=asked.ping_every) as policy:
+        policy.connect()
+        assert policy._silent.is_set(), "no thread sends pings"
+    with pytest.raises(ValidationError, match="ping_every"):
+        Config(ping_every=-1.0)
 
 
 def test_a_ping_that_is_not_answered_drops_the_connection_and_the_next_request_opens_another(

@@ -71,7 +71,7 @@ ARENA = {
     "cameras": {"cam_high": "first", "cam_left_wrist": "wrist"},
     "reset_deadline": 5.0,
 }
-STARVLA = {"kind": "starvla", "cameras": CAMERAS, "ping_every": None}
+STARVLA = {"kind": "starvla", "cameras": CAMERAS, "ping_every": 0}
 STATISTICS = {"low": list(FRANKA.lower), "high": list(FRANKA.upper)}
 GROOT = {"kind": "gr00t", "video": VIEWS, "state": PARTS, "actions": PARTS}
 LEROBOT = {

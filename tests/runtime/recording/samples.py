@@ -11,7 +11,8 @@ from typing import Any
 import av
 import numpy as np
 
-from runtime.recording.base import ExecutedTick, RawChunk, Row
+from runtime.ipc.messages import ExecutedTick
+from runtime.recording.base import RawChunk, Row
 from runtime.recording.layout import Layout
 from runtime.recording.outcome_seal import (
     OUTCOME,
@@ -118,16 +119,17 @@ def tick(step: int, **changes: Any) -> ExecutedTick:
     planned = STARTED + step / 100.0
     fields: dict[str, Any] = {
         "step": step,
+        "run": 1,
         "planned": planned,
         "sent": planned + 0.001,
         "sequence": step // 3,
-        "control_source": "policy",
+        "source": "policy",
         "qpos": np.full(DIM, step, np.float32),
         "smoothed": np.full(DIM, step + 0.25, np.float32),
         "executed": np.full(DIM, step + 0.5, np.float32),
-        "chunk_ids": (4, 5),
-        "weights": (0.25, 0.75),
-        "changes": ("speed",),
+        "chunk_ids": [4, 5],
+        "weights": [0.25, 0.75],
+        "notes": ["speed"],
     }
     return ExecutedTick(**{**fields, **changes})
 

@@ -67,7 +67,7 @@ def test_a_tick_is_copied() -> None:
     [
         ({"executed": np.zeros(2, np.float32)}, "tick 3: executed has shape"),
         ({"smoothed": np.zeros(5, np.float32)}, "tick 3: smoothed has shape"),
-        ({"weights": (1.0,)}, "2 chunk_ids and 1 weights"),
+        ({"weights": [1.0]}, "2 chunk_ids and 1 weights"),
     ],
 )
 def test_a_tick_that_does_not_fit_is_refused_by_name(changes: dict[str, Any], words: str) -> None:

@@ -1,4 +1,5 @@
 import math
+import mmap
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,9 @@ import pyarrow as pa
 import pytest
 
 from runtime.core.errors import RecordingError
+from runtime.ipc.messages import decode, encode
+from runtime.ipc.shared_memory import Ring
+from runtime.recording.admission import admit_tick
 from runtime.recording.base import RawChunk
 from runtime.recording.bench_truth import truth_changes, truth_text
 from runtime.recording.columns import RecordedRow
@@ -108,7 +112,7 @@ def test_an_unknown_capture_time_is_not_a_number(tmp_path: Path) -> None:
 
 
 def test_a_tick_is_split_into_what_was_asked_for_and_what_was_done(tmp_path: Path) -> None:
-    quiet = tick(2, smoothed=None, executed=None, chunk_ids=(), weights=(), changes=("stale",), refused=True)
+    quiet = tick(2, smoothed=None, executed=None, chunk_ids=[], weights=[], notes=["stale"], refused=True)
     executed = written(tmp_path, "ticks", tick(1), quiet).to_pylist()
     assert executed[0]["executed"] == [1.5, 1.5, 1.5]
     assert executed[0]["chunk_id"] == 5
@@ -123,6 +127,19 @@ def test_a_tick_is_split_into_what_was_asked_for_and_what_was_done(tmp_path: Pat
     assert smoothed == [
         {"step": 1, "smoothed": [1.25, 1.25, 1.25], "chunk_ids": [4, 5], "weights": [0.25, 0.75]}
     ]
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"smoothed": None, "executed": None, "chunk_ids": [], "weights": []}]
+)
+def test_a_tick_that_came_over_the_ring_of_control_is_written_as_it_was_sent(changes, tmp_path: Path) -> None:
+    sent = tick(1, woke=STARTED + 0.0125, **changes)
+    ring = Ring(mmap.mmap(-1, Ring.size(4096)), 0, 4096)
+    assert ring.push(encode(sent))
+    [payload] = ring.drain()
+    received = admit_tick(LAYOUT, decode(payload))
+    for name in ["ticks"] if sent.smoothed is None else ["ticks", "smoothed"]:
+        assert written(tmp_path, name, received).equals(written(tmp_path, name, sent))
 
 
 def test_how_late_a_tick_was_is_in_its_row_and_null_in_episodes_from_before(tmp_path: Path) -> None:

@@ -27,9 +27,10 @@ from runtime.datasets.__main__ import main as datasets
 from runtime.datasets.importing import SourceRobot, import_episode
 from runtime.datasets.publishing import publish
 from runtime.datasets.reader import Dataset, open_dataset
+from runtime.ipc.messages import ExecutedTick
 from runtime.policies.replay import Config, ReplayPolicy
 from runtime.recording.__main__ import main
-from runtime.recording.base import ExecutedTick, Outcome, RawChunk
+from runtime.recording.base import Outcome, RawChunk
 from runtime.recording.episode import EpisodeJournal
 from runtime.recording.integrity import UNSEALED, DamagedError
 from runtime.recording.layout import Layout
@@ -56,7 +57,7 @@ SETTINGS = RecordingSettings(min_free_bytes=0, flush_period_s=0.02, drain_timeou
 
 def tick(step: int) -> ExecutedTick:
     joints = np.full(DIM, step, np.float32)
-    return ExecutedTick(step, step / 30, step / 30, step, "policy", joints, joints, joints, (1,), (1.0,))
+    return ExecutedTick(step, 1, step / 30, step / 30, step, "policy", joints, joints, joints, [1], [1.0])
 
 
 def chunk(number: int) -> RawChunk:

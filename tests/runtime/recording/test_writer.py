@@ -114,7 +114,7 @@ def test_a_table_that_fails_does_not_keep_the_others_from_being_closed(
 def test_a_record_that_no_column_takes_is_a_fault(tmp_path: Path) -> None:
     faults = ErrorLatch()
     writer = DiskWriter(tmp_path, LAYOUT, NEVER, [], faults)
-    writer.add("ticks", tick(0, control_source=object()))
+    writer.add("ticks", tick(0, source=object()))
     assert writer.finish(soon())
     assert str(tmp_path) in str(faults.first)
 

@@ -13,7 +13,7 @@ import pytest
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import RuntimeFault
 from runtime.core.types import Float64, Observation
-from runtime.ipc.messages import Order, TickDone, decode, encode
+from runtime.ipc.messages import ExecutedTick, Order, decode, encode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop, SharedState
 from runtime.processes.control.process import make_tick
@@ -133,7 +133,7 @@ def test_control_itself_stops_a_motion_that_nobody_has_checked(tmp_path: Path) -
         )
         tick(step, now)
         position = sink.sent[-1].astype(float) if sink.sent else start
-        records += [m for m in map(decode, shared.rings["ticks"].drain()) if isinstance(m, TickDone)]
+        records += [m for m in map(decode, shared.rings["ticks"].drain()) if isinstance(m, ExecutedTick)]
         clock.advance(1 / 30)
     assert any(record.refused for record in records)
     assert any("right_arm/" in note for record in records for note in record.notes)

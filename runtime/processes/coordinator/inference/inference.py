@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from runtime.core.clock import Clock
 from runtime.core.errors import PolicyLostError, RuntimeFault
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import Conditioning, Float64, Observation
-from runtime.ipc.messages import ChunkMerged, Event, Mode, PolicyAnswer, PostedChunk
+from runtime.ipc.messages import Event, MergeResult, Mode, PolicyAnswer, PostedChunk
 from runtime.ipc.shared_state import SharedState
 from runtime.policies.base import Policy
 from runtime.processes.coordinator.control_queue import ControlQueue
@@ -52,22 +52,8 @@ class Strategy:
 
 
 @dataclass(frozen=True, slots=True)
-class PendingChunk:
-    """A response in command space, with its chunk number."""
-
-    number: int
-    rows: Float64
-    answered: PolicyResponse
-
-    def status(self, now: float) -> dict[str, Any]:
-        """Return number, row count, and age of the joints in the policy's observation [s]."""
-        age = now - self.answered.observation.captured.get("joints", now)
-        return {"chunk": self.number, "rows": len(self.rows), "age_s": age}
-
-
-@dataclass(frozen=True, slots=True)
 class DisplayedChunk:
-    """The newest chunk for pages: `state` is "proposed", "merged" or "dropped"; targets as in ChunkMerged."""
+    """The newest chunk for pages: `state` is "proposed", "merged" or "dropped"; targets as in MergeResult."""
 
     number: int
     run: int
@@ -95,7 +81,7 @@ class Inference:
         self.requests = requests
         self.runner = requests.runner
         self.metrics = PolicyMetrics()
-        self.proposal: PendingChunk | None = None  # shown, and neither committed nor cancelled
+        self.proposal: PolicyResponse | None = None  # shown, and neither committed nor cancelled
         self.shown: DisplayedChunk | None = None
         self._planned: DisplayedChunk | None = None  # newest chunk that control has merged
         self.rtc_warning = ""
@@ -111,7 +97,7 @@ class Inference:
         self._mode: Mode = "continuous"
         self._wanted = False  # a chunk was requested, in a mode on demand
         self._flight: Future[PolicyResponse] | None = None
-        self._unmerged: dict[int, PendingChunk] = {}  # sent to control
+        self._unmerged: dict[int, PolicyResponse] = {}  # sent to control
         self._stale_since: float | None = None
         self._asked_at = float("-inf")
         self._generation = 0  # of the RTC prefix at the newest request
@@ -219,8 +205,8 @@ class Inference:
     def commit(self) -> None:
         """Send the proposal to control; the robot was at rest during the review, so no row is stale."""
         if self.proposal is not None:
-            made, self.proposal = self.proposal, None
-            self._post(made)
+            answered, self.proposal = self.proposal, None
+            self._post(answered)
 
     def cancel(self) -> None:
         """Discard the requested, shown or sent chunk, and clear failures."""
@@ -239,25 +225,25 @@ class Inference:
 
     # --- merged chunks ---------------------------------------------------------------------------------------
 
-    def on_merged(self, merged: ChunkMerged) -> None:
+    def on_merged(self, merged: MergeResult) -> None:
         """Record that control has merged or dropped a chunk."""
-        made = self._unmerged.pop(merged.chunk_id, None)
+        answered = self._unmerged.pop(merged.chunk_id, None)
         if merged.run != self._run:
             return
         self.metrics.add_merge(merged)
         self._commitment.on_merged(merged)
-        if made is not None:
+        if answered is not None:
             state = "dropped" if merged.dropped else "merged"
-            step = made.answered.observation.step
+            step = answered.observation.step
             self.shown = DisplayedChunk(
                 merged.chunk_id,
                 merged.run,
                 state,
                 step,
                 merged.targets,
-                made.rows,
+                answered.commands.rows,
                 merged.overlap,
-                made.answered.ik,
+                answered.ik,
             )
             if not merged.dropped:
                 self._planned = self.shown
@@ -350,29 +336,28 @@ class Inference:
         return found
 
     def _on_response(self, answered: PolicyResponse) -> PolicyAnswer:
-        step, chunk = answered.observation.step, answered.chunk
+        answered = replace(answered, number=self._orders.next_chunk())
+        step, rows, ik = answered.observation.step, answered.commands.rows, answered.ik
         self.requests.log_ik_problems(answered)
-        made = PendingChunk(self._orders.next_chunk(), answered.commands.rows, answered)
         self._wanted = False
-        self.metrics.add_response(answered.seconds, answered.age, answered.ik)
+        self.metrics.add_response(answered.seconds, answered.age, ik)
         self._commitment.add_chunk(
-            made.number, chunk, step, answered.requested_while_stopped, self._generation, made.rows
+            answered.number, answered.chunk, step, answered.requested_while_stopped, self._generation, rows
         )
         if self._mode == "preview":
-            self.proposal = made
-            nowhere = np.full(len(made.rows), -1, np.int64)
-            ik = answered.ik
-            self.shown = DisplayedChunk(made.number, self._run, "proposed", step, nowhere, made.rows, ik=ik)
+            self.proposal = answered
+            nowhere = np.full(len(rows), -1, np.int64)
+            self.shown = DisplayedChunk(answered.number, self._run, "proposed", step, nowhere, rows, ik=ik)
         else:
-            self._post(made)
-        recorded = self._record(made)
+            self._post(answered)
+        recorded = self._record(answered)
         self.retry.record_success()  # only now: a policy with unusable responses has not recovered
         return recorded
 
-    def _record(self, made: PendingChunk) -> PolicyAnswer:
-        answered, solved = made.answered, made.answered.commands.ik_result
+    def _record(self, answered: PolicyResponse) -> PolicyAnswer:
+        solved = answered.commands.ik_result
         return PolicyAnswer(
-            made.number,
+            answered.number,
             self._run,
             answered.observation.step,
             answered.chunk.actions,
@@ -385,13 +370,14 @@ class Inference:
             eef=answered.eef if self.policy.uses_poses else "",
         )
 
-    def _post(self, made: PendingChunk) -> None:
-        answered, step = made.answered, made.answered.observation.step
-        first = answered.commands.first
+    def _post(self, answered: PolicyResponse) -> None:
+        made, step = answered.commands, answered.observation.step
         self._orders.send_chunk(
-            PostedChunk(made.number, self._run, step, made.rows, answered.requested_while_stopped, first)
+            PostedChunk(
+                answered.number, self._run, step, made.rows, answered.requested_while_stopped, made.first
+            )
         )
-        self._unmerged[made.number] = made
+        self._unmerged[answered.number] = answered
 
     def _note(self, kind: str, text: str) -> None:
         self.pending_notes.append(Event(kind, text, self._clock.now()))

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 
 _KEPT = 20_000  # responses; half an hour back to back at 10 Hz
 _SHOWN = 60
@@ -72,7 +72,7 @@ class PolicyMetrics:
         """Count a loss of the policy."""
         self.lost += 1
 
-    def add_merge(self, merged: ChunkMerged) -> None:
+    def add_merge(self, merged: MergeResult) -> None:
         """Add a merged or dropped chunk."""
         self.delays.append(merged.delay)
         self.mistimed += merged.mistimed > 0

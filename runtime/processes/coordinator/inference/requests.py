@@ -82,6 +82,12 @@ class PolicyResponse:
     eef: Literal["measured", "fk"] = "fk"
     ik: Mapping[str, Any] = field(default_factory=dict)  # from `ik_figures`; {} for joints
     refused: str = ""
+    number: int = 0  # of its chunk, set on arrival
+
+    def status(self, now: float) -> dict[str, Any]:
+        """Return chunk number, row count, and age of the joints in the policy's observation [s]."""
+        age = now - self.observation.captured.get("joints", now)
+        return {"chunk": self.number, "rows": len(self.commands.rows), "age_s": age}
 
 
 class PolicyRequests:

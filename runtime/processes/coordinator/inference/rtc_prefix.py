@@ -10,7 +10,7 @@ import numpy as np
 
 from runtime.core.sentences import Pattern, fixed
 from runtime.core.types import ActionChunk, Conditioning, Float32, Float64, Observation
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 from runtime.motion.timeline import HELD
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture, MixtureParts
 
@@ -118,7 +118,7 @@ class RtcPrefix:
             made = len(rows) if commands is None else _source_row_count(len(commands), pace)
             self._on_the_way[chunk_id] = _PendingChunk(chunk, observation_step, waited, rows, made)
 
-    def on_merged(self, merged: ChunkMerged) -> None:
+    def on_merged(self, merged: MergeResult) -> None:
         """Commit a chunk that control has merged; a dropped chunk is removed."""
         answer = self._on_the_way.pop(merged.chunk_id, None)
         if answer is None or merged.dropped or merged.chunk_id < max(self._merged, default=-1):
@@ -329,7 +329,7 @@ def _expected(delays: Sequence[int], quantile: float) -> float:
     return float(np.quantile(np.asarray(delays, np.float64), quantile, method="higher"))
 
 
-def _shares(merged: ChunkMerged) -> dict[int, Shares] | None:
+def _shares(merged: MergeResult) -> dict[int, Shares] | None:
     """Return weights by step for steps that other chunks contribute to; None if unknown."""
     if merged.contributions is None:
         return None

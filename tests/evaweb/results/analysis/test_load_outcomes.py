@@ -4,9 +4,9 @@ from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Plan
 from evaweb.plans.services import freeze_plan
 from evaweb.results.analysis.analysis import analyse
-from evaweb.results.analysis.load_outcomes import load_outcomes, load_plan_outcomes
+from evaweb.results.analysis.load_outcomes import load_plan_outcomes
 from evaweb.trials import services, voids
-from evaweb.trials.models import Checkpoint, Trial
+from evaweb.trials.models import Checkpoint
 from tests.evaweb.trials import builders
 
 
@@ -74,11 +74,3 @@ def test_the_number_of_queries_does_not_grow(bench, plan, django_assert_num_quer
     carry_out(bench, plan, 6, lambda trial: False)
     with django_assert_num_queries(4):
         load_plan_outcomes(plan)
-
-
-def test_trials_outside_any_plan_are_told_too(bench):
-    bench.scored()
-    bench.scored(success=False, position=2)
-    found = load_outcomes(Trial.objects.all())
-    assert [outcome.success for outcome in found] == [True, False]
-    assert [outcome.block for outcome in found] == ["block-on-plate/1/1", "block-on-plate/2/1"]

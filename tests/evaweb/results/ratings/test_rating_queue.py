@@ -206,7 +206,9 @@ def test_who_judges_once_more_because_the_answer_was_lost_gets_the_first_answer(
     assert (Rating.objects.count(), Preference.objects.count()) == (1, 1)
     with pytest.raises(Conflict, match=f"you have rated trial {code} already, with another answer"):
         rating_queue.save_rating(**rated, note="not so clean")
-    with pytest.raises(Conflict, match=r"you have compared .* already, with another answer: the first one counts"):
+    with pytest.raises(
+        Conflict, match=r"you have compared .* already, with another answer: the first one counts"
+    ):
         rating_queue.save_preference(**preferred, outcome="first", why="alike")
 
 

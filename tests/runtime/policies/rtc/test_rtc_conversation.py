@@ -16,7 +16,7 @@ from runtime.core import msgpack_arrays
 from runtime.core.clock import MonotonicClock
 from runtime.core.errors import PolicyError, PolicyLostError, PolicyTimeout
 from runtime.core.types import ActionChunk, Conditioning, Observation
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 from runtime.policies import openpi
 from runtime.policies.openpi import OpenpiPolicy
 from runtime.processes.coordinator.inference.rtc_prefix import RtcPrefix
@@ -46,9 +46,9 @@ def talking(
             yield policy
 
 
-def placed(number: int, step: int, delay: int, count: int) -> ChunkMerged:
-    return ChunkMerged(
-        number, 1, step + delay, delay, step + np.arange(count), 0, "", contributions=np.zeros((0, 3))
+def placed(number: int, step: int, delay: int, count: int) -> MergeResult:
+    return MergeResult(
+        number, step + delay, delay, step + np.arange(count), run=1, contributions=np.zeros((0, 3))
     )
 
 

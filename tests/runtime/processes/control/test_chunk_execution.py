@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from runtime.core.errors import ConfigurationError
-from runtime.ipc.messages import ChunkMerged, Event
+from runtime.ipc.messages import Event, MergeResult
 from runtime.motion.timeline import HELD, DimensionKinds
 from runtime.processes.control.chunk_execution import build_strategy
 from tests.runtime.tick_bench import Bench, following, wave
 
 
 def merged(bench):
-    return [message for message in bench.told() if isinstance(message, ChunkMerged)]
+    return [message for message in bench.told() if isinstance(message, MergeResult)]
 
 
 def speeds(bench):
@@ -263,7 +263,7 @@ def test_a_section_that_is_no_strategy_is_said_and_changes_nothing():
     told = bench.told()
     kinds = [message.kind for message in told if isinstance(message, Event)]
     assert kinds == ["tune_refused"]
-    assert [m.strategy for m in told if isinstance(m, ChunkMerged)] == ["async", "async"]
+    assert [m.strategy for m in told if isinstance(m, MergeResult)] == ["async", "async"]
 
 
 def test_a_strategy_that_was_chosen_between_runs_is_that_of_the_next_run():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from runtime.ipc.messages import TickDone, decode
+from runtime.ipc.messages import ExecutedTick, decode
 from runtime.ipc.shared_state import EStop
 from tests.runtime.tick_bench import PERIOD, Bench, following, wave
 
@@ -315,7 +315,7 @@ def test_everything_is_said_with_its_step(bench):
 
 
 def test_a_full_ring_is_counted_and_never_waited_for(bench):
-    bench.shared.rings["ticks"].push = lambda payload: not isinstance(decode(payload), TickDone)
+    bench.shared.rings["ticks"].push = lambda payload: not isinstance(decode(payload), ExecutedTick)
     following(bench)
     bench.run(3)
     assert bench.status["records_lost"] == 4

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runtime.core.clock import VirtualClock
-from runtime.ipc.messages import Order, PostedChunk, TickDone, decode, encode
+from runtime.ipc.messages import ExecutedTick, Order, PostedChunk, decode, encode
 from runtime.ipc.shared_state import EStop, SharedState, SharedStateLayout
 from runtime.processes.control.process import Lateness, Loop, make_tick
 from tests.runtime import lockstep_station as station
@@ -132,7 +132,7 @@ def test_the_tick_of_a_deployment_keeps_its_arms_in_their_boxes(
         shared.publish_observation(source.receive(0.0), dict.fromkeys(spec.cameras, 1))
         tick(step, clock.now())
         clock.advance(1 / 30)
-    *_, record = (m for m in map(decode, shared.rings["ticks"].drain()) if isinstance(m, TickDone))
+    *_, record = (m for m in map(decode, shared.rings["ticks"].drain()) if isinstance(m, ExecutedTick))
     assert record.refused is refused
     assert [note for note in record.notes if "box" in note] == (
         ["left_arm would leave the workspace box"] if refused else []

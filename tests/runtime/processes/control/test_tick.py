@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from runtime.ipc.messages import ChunkMerged, NodeRequest, Order, decode, encode
+from runtime.ipc.messages import MergeResult, NodeRequest, Order, decode, encode
 from runtime.ipc.shared_state import EStop
 from tests.runtime.tick_bench import PERIOD, WITH_GRIPPER, Bench, following, wave
 
@@ -253,7 +253,7 @@ def test_chunks_of_a_run_that_is_over_are_ignored(bench):
     bench.chunk(9, wave(30, start=1.0))
     bench.run(3)
     merged = [decode(m) for m in bench.shared.rings["control_events"].drain()]
-    assert [m.dropped for m in merged if isinstance(m, ChunkMerged)] == [
+    assert [m.dropped for m in merged if isinstance(m, MergeResult)] == [
         "",
         "control is not following that run any more",
     ]
@@ -362,7 +362,7 @@ def test_the_record_of_a_tick_is_on_its_way_before_main_can_see_the_tick(bench):
     )
     following(bench)
     bench.run()
-    assert seen == [("TickDone", 0), ("ChunkMerged", 0), ("TickDone", 0)]
+    assert seen == [("ExecutedTick", 0), ("MergeResult", 0), ("ExecutedTick", 0)]
 
 
 def test_an_e_stop_pressed_within_a_tick_repeats_the_last_command(bench):

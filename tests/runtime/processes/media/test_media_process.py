@@ -20,11 +20,11 @@ from runtime.ipc.messages import (
     EpisodeClosed,
     EpisodeOpened,
     Event,
+    ExecutedTick,
     MediaReport,
     Message,
     ReceptionReport,
     RunBegun,
-    TickDone,
     decode,
     encode,
 )
@@ -128,7 +128,9 @@ class Desk:
 
     def tick(self, step: int, sequence: int, run: int = 1) -> None:
         now, q = self.clock.now(), np.zeros(2, np.float32)
-        self.post(TickDone(step, run, now, now, sequence, "policy", q, None, q, [], [], [], False), "ticks")
+        self.post(
+            ExecutedTick(step, run, now, now, sequence, "policy", q, None, q, [], [], [], False), "ticks"
+        )
 
     def told(self, kind: type[Any]) -> list[Any]:
         return [message for message in self.heard() if isinstance(message, kind)]

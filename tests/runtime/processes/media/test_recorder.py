@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from runtime.core.errors import RecordingError
 from runtime.core.types import Observation
-from runtime.ipc.messages import ChunkMerged, PolicyAnswer, TickDone
+from runtime.ipc.messages import ExecutedTick, MergeResult, PolicyAnswer
 from runtime.processes.media.recorder import DatasetGrid, Recorder
-from runtime.recording.base import ExecutedTick, Journal, LostCamera, Outcome, RawChunk, Record, Row
+from runtime.recording.base import Journal, LostCamera, Outcome, RawChunk, Record, Row
 from runtime.recording.settings import RecordingSettings
 from tests.examples import some
 
@@ -108,7 +108,7 @@ class Desk:
             "notes": [],
             "refused": False,
         }
-        self.recorder.add_tick(TickDone(**(fields | changes)))
+        self.recorder.add_tick(ExecutedTick(**(fields | changes)))
 
     def answer(self, chunk: int, rows: int = 3, source: list[int] | None = None, run: int = 1) -> None:
         actions = np.full((rows, 2), chunk, np.float32)
@@ -116,7 +116,7 @@ class Desk:
         self.recorder.add_answer(PolicyAnswer(chunk, run, 10, actions, "joint", mapping, 12.0))
 
     def merge(self, chunk: int, targets: list[int], run: int = 1, dropped: str = "") -> None:
-        self.recorder.add_merge(ChunkMerged(chunk, run, 12, 2, np.array(targets, np.int64), 0, dropped))
+        self.recorder.add_merge(MergeResult(chunk, 12, 2, np.array(targets, np.int64), 0, dropped, run))
 
 
 @pytest.fixture
@@ -433,7 +433,7 @@ def test_a_journal_that_fails_in_the_middle_raises(desk: Desk) -> None:
 def test_a_chunk_is_kept_with_the_strategy_that_merged_it(desk: Desk) -> None:
     desk.answer(1)
     targets = np.array([12, 13, 14])
-    desk.recorder.add_merge(ChunkMerged(1, 1, 12, 2, targets, 0, "", strategy="ensemble", overlap=2))
+    desk.recorder.add_merge(MergeResult(1, 12, 2, targets, run=1, strategy="ensemble", overlap=2))
     desk.answer(2)
     desk.recorder.end("finished", "", {})
     merged, lost = desk.journal.of(RawChunk)

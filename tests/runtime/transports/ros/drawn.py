@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from runtime.transports.ros.messages import (
-    MESSAGES,
     PACKAGES,
     CompressedImage,
     Image,
@@ -22,6 +21,12 @@ from runtime.transports.ros.messages import (
     PoseStamped,
 )
 
+MESSAGES: dict[MessageName, type[Message]] = {
+    "JointState": JointState,
+    "Image": Image,
+    "CompressedImage": CompressedImage,
+    "PoseStamped": PoseStamped,
+}
 NAMES: list[MessageName] = list(MESSAGES)
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from runtime.core.errors import CodecError
 from runtime.transports.ros import ros1_serialization
 from runtime.transports.ros.messages import (
-    MESSAGES,
     Image,
     JointState,
     Message,
@@ -20,7 +19,7 @@ from runtime.transports.ros.messages import (
     PoseStamped,
 )
 from tests.examples import some
-from tests.runtime.transports.ros.drawn import NAMES, Rosbags, messages, name_of, same
+from tests.runtime.transports.ros.drawn import MESSAGES, NAMES, Rosbags, messages, name_of, same
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)  # as far as rosbags goes; ROS 1 goes to 2106

@@ -189,7 +189,7 @@ def test_wrong_names_are_counted_and_named_as_the_reason(bench: Bench) -> None:
     (said,) = bench.news()
     assert said.startswith("waiting for arm joints (/state): nothing usable for ")
     assert f"lack {NAMES[0]}; expected {NAMES[0]}" in said
-    assert bench.source.last_fault != ""
+    assert bench.source.describe_fault("joint_names") != ""
 
 
 def test_an_unknown_encoding_is_counted_and_named(bench: Bench) -> None:
@@ -214,7 +214,7 @@ def test_messages_without_a_stamp_are_refused_unless_arrivals_count(monkeypatch:
     bench = Bench(monkeypatch)
     bench.frame(-WALL)
     assert bench.source.faults()["unstamped"] == 3
-    assert 'transport.stamps = "arrival"' in bench.source.last_fault
+    assert 'transport.stamps = "arrival"' in bench.source.describe_fault("unstamped")
     bench = Bench(monkeypatch, stamps="arrival")
     bench.frame(-WALL)
     assert set(bench.seen().captured.values()) == {50.0}

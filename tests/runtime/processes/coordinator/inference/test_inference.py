@@ -11,7 +11,7 @@ import pytest
 from runtime.core.clock import VirtualClock
 from runtime.core.errors import PolicyError, PolicyLostError
 from runtime.core.types import ActionChunk, Conditioning, Float32, Observation
-from runtime.ipc.messages import ChunkMerged, Mode, PolicyAnswer, PostedChunk, decode
+from runtime.ipc.messages import MergeResult, Mode, PolicyAnswer, PostedChunk, decode
 from runtime.ipc.shared_state import SharedState, SharedStateLayout
 from runtime.kinematics.base import IkResult
 from runtime.policies.base import Policy, PolicyInfo
@@ -140,7 +140,7 @@ class Desk:
         return [message for message in found if isinstance(message, PostedChunk)]
 
     def merged(self, chunk: int, run: int = 1, delay: int = 3, dropped: str = "") -> None:
-        self.inference.on_merged(ChunkMerged(chunk, run, 10, delay, np.zeros(4, np.int64), 0, dropped))
+        self.inference.on_merged(MergeResult(chunk, 10, delay, np.zeros(4, np.int64), 0, dropped, run))
 
     def going(self) -> Desk:
         self.observe()
@@ -536,7 +536,7 @@ def test_what_the_newest_merged_chunk_wants_for_a_step_is_known(desk: Desk) -> N
     desk.inference.poll()
     assert desk.inference.raw_action(10) is None  # posted, not merged
     targets = np.array([-1, 10, 11, 12])
-    desk.inference.on_merged(ChunkMerged(1, 1, 10, 1, targets, 0, ""))
+    desk.inference.on_merged(MergeResult(1, 10, 1, targets, run=1))
     assert [desk.inference.raw_action(step) for step in (9, 13)] == [None, None]
     assert np.array_equal(desk.inference.raw_action(10), [2.0, 3.0])  # type: ignore[arg-type]
     assert np.array_equal(desk.inference.raw_action(12), [6.0, 7.0])  # type: ignore[arg-type]
@@ -544,9 +544,9 @@ def test_what_the_newest_merged_chunk_wants_for_a_step_is_known(desk: Desk) -> N
 
 def test_a_chunk_that_was_dropped_leaves_what_the_one_before_it_wants(desk: Desk) -> None:
     desk.inference.poll()
-    desk.inference.on_merged(ChunkMerged(1, 1, 10, 0, np.arange(10, 14), 0, ""))
+    desk.inference.on_merged(MergeResult(1, 10, 0, np.arange(10, 14), run=1))
     desk.inference.poll()
-    desk.inference.on_merged(ChunkMerged(2, 1, 12, 9, np.full(4, -1), 0, "all in the past"))
+    desk.inference.on_merged(MergeResult(2, 12, 9, np.full(4, -1), dropped="all in the past", run=1))
     assert desk.inference.raw_action(10) is not None
     desk.inference.pause()
     assert desk.inference.raw_action(10) is None
@@ -670,7 +670,7 @@ def test_rtc_tells_the_policy_what_control_has_merged_less_what_is_consumed() ->
     desk.inference.poll()
     assert desk.policy.conditionings == [None]
     alone = np.zeros((0, 3))
-    desk.inference.on_merged(ChunkMerged(1, 1, 8, 1, np.array([-1, 8, 9, 10]), 0, "", contributions=alone))
+    desk.inference.on_merged(MergeResult(1, 8, 1, np.array([-1, 8, 9, 10]), run=1, contributions=alone))
     desk.observe()
     desk.ticked(9)
     desk.inference.poll()
@@ -684,7 +684,7 @@ def test_rtc_tells_the_policy_what_control_has_merged_less_what_is_consumed() ->
 def test_a_pause_forgets_what_the_robot_was_committed_to() -> None:
     desk = Desk(strategy=RTC).going()
     desk.inference.poll()
-    desk.inference.on_merged(ChunkMerged(1, 1, 8, 1, np.array([-1, 8, 9, 10]), 0, ""))
+    desk.inference.on_merged(MergeResult(1, 8, 1, np.array([-1, 8, 9, 10]), run=1))
     desk.inference.pause()
     desk.inference.begin(1, fresh=False)
     desk.inference.poll()

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 from runtime.processes.coordinator.inference.metrics import PolicyMetrics, quantile
 
 
-def merged(delay: int, mistimed: int = 0, dropped: str = "") -> ChunkMerged:
-    return ChunkMerged(1, 1, 10, delay, np.zeros(4, np.int64), mistimed, dropped)
+def merged(delay: int, mistimed: int = 0, dropped: str = "") -> MergeResult:
+    return MergeResult(1, 10, delay, np.zeros(4, np.int64), mistimed, dropped, 1)
 
 
 def test_answers_delays_and_what_went_wrong_are_counted() -> None:

@@ -11,7 +11,7 @@ import pytest
 from robots import load_robot
 from runtime.core.pose_format import PoseFormat
 from runtime.core.types import ActionChunk, Conditioning, Observation
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 from runtime.kinematics.compiled import CompiledKinematics
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
@@ -57,9 +57,9 @@ def answer(mode: Any, rate: float | None, seed: int, **form: Any) -> ActionChunk
     return ActionChunk(rows.astype(np.float32), mode=mode, rate=rate, **form)
 
 
-def merged(number: int, step: int, delay: int, count: int, shares: Any = ()) -> ChunkMerged:
+def merged(number: int, step: int, delay: int, count: int, shares: Any = ()) -> MergeResult:
     told = np.array(shares, np.float64).reshape(-1, 3)
-    return ChunkMerged(number, 1, step + delay, delay, step + np.arange(count), 0, "", contributions=told)
+    return MergeResult(number, step + delay, delay, step + np.arange(count), run=1, contributions=told)
 
 
 def prefix() -> RtcPrefix:

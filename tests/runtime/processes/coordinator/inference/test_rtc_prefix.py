@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import robots
 from runtime.core.pose_format import OrientationName, PoseFormat
 from runtime.core.types import ActionChunk, Conditioning
-from runtime.ipc.messages import ChunkMerged
+from runtime.ipc.messages import MergeResult
 from runtime.kinematics.base import ChainForward
 from runtime.motion.timeline import DimensionKinds
 from runtime.processes.coordinator.inference.chunk_mixture import Mixture
@@ -31,11 +31,11 @@ def rows(count: int, width: int = 2, first: float = 0.0) -> np.ndarray:
 
 def merged(
     number: int, observation_step: int, delay: int, count: int = 50, mistimed: int = 0, dropped: str = ""
-) -> ChunkMerged:
+) -> MergeResult:
     """As control tells of rows from `observation_step` on; what is stale is told as what is not."""
     targets = observation_step + mistimed + np.arange(count)
-    return ChunkMerged(
-        number, 1, observation_step + delay, delay, targets, mistimed, dropped, contributions=ALONE
+    return MergeResult(
+        number, observation_step + delay, delay, targets, mistimed, dropped, 1, contributions=ALONE
     )
 
 

@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
 from runtime.core.errors import PolicyError, PolicyLostError
 from runtime.core.types import Float64
-from runtime.ipc.messages import ChunkMerged, TickDone, decode
+from runtime.ipc.messages import ExecutedTick, MergeResult, decode
 from runtime.ipc.session_state import SessionState
 from runtime.ipc.shared_state import EStop
 from runtime.processes.control.process import make_tick
@@ -263,7 +263,9 @@ class Machine(RuleBasedStateMachine):
         status = station.shared.control.read()
         new = station.robot.commands[told:]
         assert len(new) == int(status["engaged"])
-        stepped = any("stepped" in note for r in self.records if isinstance(r, TickDone) for note in r.notes)
+        stepped = any(
+            "stepped" in note for r in self.records if isinstance(r, ExecutedTick) for note in r.notes
+        )
         self.weigh()
         self.seen.append(measured)
         self.moved += 1
@@ -338,10 +340,10 @@ class Machine(RuleBasedStateMachine):
 
     def weigh(self) -> None:
         for record in self.records:
-            if isinstance(record, TickDone) and record.chunk_ids:
+            if isinstance(record, ExecutedTick) and record.chunk_ids:
                 assert sum(record.weights) == pytest.approx(1.0)
                 assert min(record.weights) > 0
-            if isinstance(record, ChunkMerged) and not record.dropped:
+            if isinstance(record, MergeResult) and not record.dropped:
                 assert (record.strategy, record.chunk_id) not in self.merged  # executed once
                 self.merged.add((record.strategy, record.chunk_id))
                 assert record.targets.max() >= record.arrival_step
