@@ -340,7 +340,7 @@ class Gate:
                 if now >= pending.until:
                     del remote.pending[number]
                     late = f"sent and not answered within {_PENDING_S:g} s"
-                    pending.server.answer(pending.call, _failed(remote, pending.command, late))
+                    pending.server.answer(pending.call, _failed(remote, pending.command, late, sent=True))
             if remote.mirror is not None:
                 remote.mirror.poll()
                 if (streams := self._streams.places.get(remote.name)) is not None:
@@ -376,15 +376,18 @@ class Gate:
     def _adjust(self, remote: Remote) -> None:
         """Publish the station as linked or lost if that has changed."""
         now = self._clock()
-        lives = remote.line(STOPS, now) is not None and remote.line(COMMANDS, now) is not None
+        alive = frozenset(role for role in (STOPS, COMMANDS) if remote.line(role, now) is not None)
+        lives = len(alive) == 2
         streams = self._streams.places.get(remote.name)
         up = lives and COORDINATOR in remote.listening and streams is not None
         if remote.mirror is None:
             return
-        if remote.lives and not lives:
+        if (
+            remote.alive - alive
+        ):  # also the second one: a press may have been sent over it since the first was lost
             remote.lost_at = now
             self._hold(remote)
-        remote.lives = lives
+        remote.alive = alive
         if up and not remote.up and streams is not None:
             try:
                 remote.mirror.raise_up(streams)
@@ -510,11 +513,15 @@ def _unsigned(command: Command) -> str:
 
 def _not_sent(remote: Remote, command: Command, sent: bool = False) -> Ack:
     what = "sent and not answered" if sent else "not sent"
-    return _failed(remote, command, f"{what}, the link to {remote.name} is lost")
+    return _failed(remote, command, f"{what}, the link to {remote.name} is lost", sent)
 
 
-def _failed(remote: Remote, command: Command, reason: str) -> Ack:
-    """Return the answer in the station's place; that of a failed press demands the hardware stop."""
+def _failed(remote: Remote, command: Command, reason: str, sent: bool = False) -> Ack:
+    """Return the answer in the station's place; that of a failed press demands the hardware stop.
+
+    A command that was sent is never "refused", because it may have been carried out.
+    """
     if command.kind == "estop":
         return Ack(command.uuid, "failed", f"USE THE HARDWARE STOP: {reason}", data={"station": remote.name})
-    return Ack(command.uuid, "failed" if command.kind in STOPPING else "refused", reason, kind=command.kind)
+    status = "failed" if sent or command.kind in STOPPING else "refused"
+    return Ack(command.uuid, status, reason, kind=command.kind)

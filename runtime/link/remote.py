@@ -56,8 +56,8 @@ class Remote:
     listening: list[str] = field(default_factory=list)
     pending: dict[int, Pending] = field(default_factory=dict)
     held: list[PendingPress] = field(default_factory=list)
-    lives: bool = False  # both connections are alive; `up`: the station can also be commanded
-    up: bool = False
+    alive: frozenset[str] = frozenset()  # roles of the connections that are alive
+    up: bool = False  # both are alive, and the station can be commanded
     told: str = ""
     lost_at: float = -float("inf")
 
