@@ -26,6 +26,7 @@ FEWER = {
     "partial_credit": {"partial_credit.RUNS": 5, "partial_credit.PAIRS": 10},
     "recording": {
         "recording._KILLED_S": [1.0, 1.0],
+        "recording._LEAST_KILLS": [4, 1],  # each process once
         "recording._BESIDE_S": 2.0,
         "recording._LISTED": 300,
     },
