@@ -24,14 +24,14 @@ RENEW_S = 1.0
 
 
 class Refused(RuntimeFault):
-    """The station refused a command; the message is its reason."""
+    """Error that the station refused a command; the message is its reason."""
 
 
 class StationClient:
     """Client that finds the station in its folder, holds a lease on request and sends commands.
 
     Each command carries the boot id and sequence number of the newest status that this client has received; the station
-    refuses it as stale if its state has changed since.
+    refuses a command as stale if its state has changed since.
     """
 
     def __init__(self, station_dir: Path, holder: str = "") -> None:
@@ -64,7 +64,7 @@ class StationClient:
         return self.query_with(kind, arguments)
 
     def query_with(self, kind: str, arguments: Mapping[str, Any]) -> Ack:
-        """Do as `query`, with arguments of any name."""
+        """Do the same as `query`, with arguments of any name."""
         return _accepted(self._send(self._send_query(kind, arguments), 2.0))
 
     def _send_query(self, kind: str, arguments: Mapping[str, Any]) -> Command:
@@ -88,7 +88,7 @@ class StationClient:
             self._renewed = time.monotonic()
 
     def release(self) -> None:
-        """End the lease before it expires."""
+        """Release the lease of this client before it expires."""
         self._command("lease_give_up", 2.0, epoch=self._epoch)
         self._epoch = 0
 
@@ -112,7 +112,7 @@ class StationClient:
     def send_command(
         self, kind: str, arguments: Mapping[str, Any], identity: str = "", timeout: float = 2.0
     ) -> Ack:
-        """Send one command under the lease that was claimed, based on the status that was received last.
+        """Send one command under the lease that was claimed, based on the newest status that was received.
 
         Raises:
             Refused: The station refuses the command.

@@ -1,4 +1,4 @@
-"""Headless driver of a station, without a person: set-up, one run, stop, publication, report."""
+"""Headless driver of a station, which works without a person: set-up, one run, stop, publication, report."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def run_headless(settings: Deployment, client: StationClient) -> dict[str, Any]:
 
 
 def check(settings: Deployment) -> None:
-    """Check that the mode needs no person. Raises: SetupError."""
+    """Raise SetupError if the mode of the run needs a person."""
     mode, station = settings.run.mode, settings.station
     if mode not in MODES:
         raise SetupError(
@@ -84,7 +84,7 @@ class LeasedStation:
         self.seconds = 0.0  # duration of the run at the last poll [s]
 
     def begin(self) -> None:
-        """Wait for the station, claim it and set it up. Raises: RuntimeFault if it does not become ready."""
+        """Wait for the station, claim its lease and set it up. Raises: RuntimeFault if it does not become ready."""
         self._wait_for_start()
         self._client.claim()
         self.wait_for(lambda s: s["state_is"]["connected"], _START_S, "the first observation")
@@ -108,7 +108,10 @@ class LeasedStation:
     def wait_for(
         self, reached: Callable[[dict[str, Any]], bool], seconds: float, what: str
     ) -> dict[str, Any]:
-        """Poll until `reached`, printing a status line at times. Raises: RuntimeFault after `seconds`."""
+        """Poll until `reached` returns True for the status, and return the status.
+
+        A status line is printed now and then. Raises: RuntimeFault, which names `what`, after `seconds` [s].
+        """
         deadline = time.monotonic() + seconds
         while not reached(status := self.poll_status()):
             if time.monotonic() > deadline:
@@ -183,7 +186,7 @@ def _episode_figures(path: Path) -> dict[str, Any]:
 
 
 def _export_and_publish(settings: Deployment, episode: Path, well: bool) -> dict[str, Any]:
-    """Export the streams of any run; publish a run that ended well and moved a robot. Raises: RuntimeFault."""
+    """Export the streams of any run; publish a run that ended well, unless it was simulated. Raises: RuntimeFault."""
     from runtime.recording.export import write_export
 
     result: dict[str, Any] = {"export_path": str(write_export(episode, settings.data))}

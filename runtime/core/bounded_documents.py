@@ -31,14 +31,14 @@ _TOML = re.compile(
 
 
 class UnreadableDocument(ValueError):
-    """Document that cannot be read; the message names it, the reason and what is allowed."""
+    """Error about a document that cannot be read; the message names it, the reason and what is allowed."""
 
 
 def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]:
     """Return the table in `text`.
 
     Raises:
-        UnreadableDocument: too large, too deep or invalid; `what` is its name in the message.
+        UnreadableDocument: the text is too large, too deep or invalid; `what` is its name in the message.
     """
     _require_small(text, what, largest)
     _require_flat(text, what, _TOML)
@@ -50,7 +50,7 @@ def load_toml(path: Path, what: str) -> dict[str, Any]:
     """Return the table in a TOML file.
 
     Raises:
-        UnreadableDocument: no regular file, or as in `parse_toml`; `what` is its name in the message.
+        UnreadableDocument: it is no regular file, or as in `parse_toml`; `what` is its name in the message.
         OSError: the file cannot be read.
     """
     found = path.stat()
@@ -68,7 +68,7 @@ def parse_json(text: str | bytes, what: str, largest: int = MAX_BYTES, most: int
     """Return the value in `text`.
 
     Raises:
-        UnreadableDocument: too large, too deep, too many values or invalid; `what` is its name in the message.
+        UnreadableDocument: the text is too large, too deep, has too many values or is invalid; `what` names it.
     """
     _require_small(text, what, largest)
     try:
@@ -92,9 +92,9 @@ def _require_small(text: str | bytes, what: str, largest: int) -> None:
 
 
 def _require_flat(text: str, what: str, marks: re.Pattern[str], most: int = MAX_ITEMS) -> None:
-    """Raise UnreadableDocument if nesting or number of values exceed their limits.
+    """Raise UnreadableDocument if the nesting or the number of values exceeds its limit.
 
-    Counts brackets, commas and the dots of keys outside strings: never fewer levels than a parser would create.
+    It counts brackets, commas and the dots of keys outside strings: never fewer levels than a parser would create.
     """
     depth = dots = values = 0
     for mark in marks.finditer(text):

@@ -73,11 +73,11 @@ class _StepCandidate(NamedTuple):
 class ClockStepDetector:
     """Detector of steps of a peer's clock, which it distinguishes from delays, for one ordered stream.
 
-    A delay leaves stamps on the stream's period and shifts arrivals; a clock step does the opposite. A stamp more
-    than `tolerance` [s] before an earlier one is a step back at once. A smaller step back, or a stamp off the period
-    whose arrival is on it, counts as a step when all messages of the next 0.15 s are equally late (in a burst they
-    are not); after a gap, when the period is unknown, of the next 1 s. A message earlier than all before it is a step
-    ahead, unless its arrival is off the period. Differences within the jitter are ignored.
+    A delay leaves stamps on the stream's period and shifts arrivals; a clock step does the opposite. A stamp more than
+    `tolerance` [s] before an earlier one is a step back at once. A smaller step back, or a stamp off the period whose
+    arrival is on the period, counts as a step when all messages of the next 0.15 s are equally late (messages in a
+    burst are not); after a gap, when the period is unknown, of the next 1 s. A message earlier than all before it is a
+    step ahead, unless its arrival is off the period. Differences within the jitter are ignored.
     """
 
     def __init__(self, tolerance: float = 0.5) -> None:
@@ -87,7 +87,7 @@ class ClockStepDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last message; the estimates of period and jitter are kept."""
+        """Discard the last message; the estimates of period and jitter are kept."""
         self._newest = -math.inf
         self._began = math.inf
         self._last: tuple[float, float] | None = None  # stamp, arrival
@@ -150,13 +150,16 @@ class ClockStepDetector:
         return max(_LEAST_S, 3.0 * sorted(self._noise)[len(self._noise) * 9 // 10])
 
     def _off_more(self, moved: float, waited: float) -> float:
-        """Return how much farther the stamp is from the stream's period than the arrival is [s]."""
+        """Return how much farther from the stream's period the stamp is than the arrival [s].
+
+        `moved` is the interval of stamps, `waited` that of arrivals [s].
+        """
         period = max(sorted(self._intervals)[len(self._intervals) // 2], _LEAST_S / 10)
         return _off(moved, period) - _off(waited, period)
 
 
 def _off(interval: float, period: float) -> float:
-    """Return the distance of an interval from the nearest multiple, at least one, of the period [s]."""
+    """Return the distance of an interval from the nearest multiple of the period, at least one period [s]."""
     return abs(interval - max(1, round(interval / period)) * period)
 
 

@@ -1,4 +1,4 @@
-"""Files that are on the disk, whole or not at all, when a function returns."""
+"""Files that are on the disk completely, or not at all, when a function returns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 
 class AppendError(OSError):
-    """Bytes could not be appended; `is_restored` says whether the file is as long as it was before."""
+    """Error that bytes could not be appended; `is_restored`: the file has its previous length again."""
 
     def __init__(self, error: OSError, is_restored: bool) -> None:
         super().__init__(*error.args)
@@ -21,7 +21,7 @@ class AppendError(OSError):
 
 
 def write_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
-    """Write a file so that, even after a power cut, either the old or the whole new one is there.
+    """Write a file so that even a power cut leaves either the old or the new content, completely.
 
     Any number of processes may do so at once; the last one wins. Raises: OSError.
     """
@@ -38,7 +38,7 @@ def write_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
 
 
 def create_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
-    """Write a file that does not exist yet; an existing one stays as it is, also one that appears meanwhile.
+    """Write a file that does not exist yet; an existing file stays as it is, even if it appears meanwhile.
 
     Raises: OSError.
     """
@@ -55,7 +55,7 @@ def create_durably(path: Path, content: bytes, mode: int = 0o666) -> None:
 
 
 def append_durably(file: FileIO, lines: bytes, sync: Callable[[int], None] | None = None) -> None:
-    """Append whole lines to a file opened with "a+b" and no buffer; a line that a crash has torn is ended first.
+    """Append whole lines to a file opened with "a+b" and no buffer; a torn last line is ended first.
 
     `sync` is os.fsync by default. A failed append is undone, because a partial line would corrupt the next one.
 
@@ -99,7 +99,7 @@ def _open_draft(draft: Path, mode: int) -> Iterator[BinaryIO]:
 
 
 def _is_at(file: BinaryIO, path: Path) -> bool:
-    """Return True if `path` still names this file: another writer may have replaced it."""
+    """Return True if `path` still names this file, because another writer may have replaced it."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Environment variables of a station: without the web's secrets; own secrets by the name of their variable."""
+"""Environment variables of a station: without the web's secrets, and with its own secrets by variable name."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def program_environment(given: Mapping[str, str]) -> dict[str, str]:
 
 
 def ssh_environment() -> dict[str, str]:
-    """Return the variables that an ssh process gets; its configuration may forward all that it has."""
+    """Return the variables for an ssh process, whose configuration may forward all variables that it has."""
     return {
         name: value for name, value in os.environ.items() if name in _OF_SSH or name.startswith("LC_")
     } | {"SSH_ASKPASS_REQUIRE": "never"}
 
 
 def restart_without_web_secrets() -> None:
-    """Re-execute this program without the web's secrets, as the same process, if it has any.
+    """Re-execute this program without the web's secrets, if it has any, as the same process.
 
     Otherwise they could be read in /proc during its whole life, and every child would inherit them.
     """
@@ -65,7 +65,7 @@ def restart_without_web_secrets() -> None:
 
 
 def read_secret(key: str, name: str) -> str:
-    """Return the value of the variable `name`, which `key` of a deployment refers to.
+    """Return the value of the variable `name`, to which `key` of a deployment refers.
 
     Raises:
         ConfigurationError: the variable is not set, or belongs to the web.

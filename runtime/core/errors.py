@@ -10,80 +10,83 @@ class ConfigurationError(RuntimeFault):
 
 
 class SetupError(RuntimeFault):
-    """A component cannot do what the deployment requires; detected before anything moves."""
+    """Error that a component cannot do what the deployment requires; detected before anything moves."""
 
 
 class PolicyError(RuntimeFault):
-    """The policy server is absent, silent or gone, or its response is unusable."""
+    """Error that the policy server is absent, silent or gone, or that its response is unusable."""
 
 
 class ContradictionError(SetupError, PolicyError):
-    """The policy server's own description contradicts the deployment; the message names both sides."""
+    """Error that the policy server's own description contradicts the deployment; the message names both."""
 
 
 class ActionSpaceError(ContradictionError):
-    """The server's actions have another space, format or width than the deployment declares."""
+    """Error that the server's actions have another space, format or width than the deployment declares."""
 
 
 class WrongProtocolError(PolicyError):
-    """The server at the policy's address does not speak the declared protocol."""
+    """Error that the server at the policy's address does not speak the declared protocol."""
 
 
 class RefusedError(PolicyError):
-    """The policy server requires a key or token that is missing or wrong."""
+    """Error that the policy server requires a key or token that is missing or wrong."""
 
 
 class TlsError(PolicyError):
-    """No encrypted connection to the policy server: it has no TLS, or its certificate is not trusted."""
+    """Error that there is no encrypted connection: the policy server has no TLS, or an untrusted certificate."""
 
 
 class ServerReportedError(PolicyError):
-    """The policy server responds and reports a failure."""
+    """Error that the policy server itself reports in its response."""
 
 
 class ShapeError(PolicyError):
-    """The rows of a response have another shape than the robot needs."""
+    """Error that the rows of a response have another shape than the robot needs."""
 
 
 class NotFiniteError(PolicyError):
-    """The rows of a response contain numbers that are not finite."""
+    """Error that the rows of a response contain numbers that are not finite."""
 
 
 class PolicyLostError(PolicyError):
-    """The policy server disappeared or did not respond in time; it may come back."""
+    """Error that the policy server disappeared or did not respond in time; it may come back."""
 
 
 class PolicyTimeout(PolicyLostError):
-    """The server did not respond within the deadline; the connection is closed."""
+    """Error that the server did not respond within the deadline; the connection is closed."""
 
 
 class PolicyDisconnected(PolicyLostError):
-    """The server closed the connection; it may have restarted."""
+    """Error that the server closed the connection; it may have restarted."""
 
 
 class UnsolicitedError(PolicyLostError):
-    """The server sent a response without a request, so responses may be off by one; the connection is closed."""
+    """Error that the server sent a response without a request; the connection is closed.
+
+    Otherwise each later response could be matched to the wrong request.
+    """
 
 
 class PortClosedError(PolicyLostError):
-    """The policy server's machine responds, but its port is closed."""
+    """Error that the policy server's machine responds, but its port is closed."""
 
 
 class UnreachableError(PolicyLostError):
-    """The policy server's machine is unreachable: unknown host name, or no route."""
+    """Error that the policy server's machine is unreachable: unknown host name, or no route."""
 
 
 class TunnelError(PolicyLostError):
-    """The SSH tunnel to the policy server is down; the message has the reason."""
+    """Error that the SSH tunnel to the policy server is down; the message has the reason."""
 
 
 class TransportError(RuntimeFault):
-    """The execution node or dataset is absent or gone, or sent something unusable."""
+    """Error that the execution node or dataset is absent or gone, or sent unusable data."""
 
 
 class CodecError(RuntimeFault):
-    """Bytes from a peer do not follow the expected wire format."""
+    """Error that bytes from a peer do not follow the expected wire format."""
 
 
 class RecordingError(RuntimeFault):
-    """An episode cannot be written, read or published; names the file and the reason."""
+    """Error that an episode cannot be written, read or published; names the file and the reason."""

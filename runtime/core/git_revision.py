@@ -17,12 +17,12 @@ _CODE = ("runtime/", "robots/", "deployments/")  # an untracked file there chang
 
 @cache  # cache: of what runs here, which is what was loaded at the start
 def revision() -> Mapping[str, object]:
-    """Return `commit` and `dirty` of our own checkout, determined once; {} outside a checkout or if git fails."""
+    """Return `commit` and `dirty` of our own checkout, determined once; {} without a checkout or if git fails."""
     return MappingProxyType(revision_of(Path(_here).resolve().parent.parent))
 
 
 def revision_of(root: Path) -> dict[str, object]:
-    """Return `commit` and `dirty` of the checkout with top folder `root`, or {}.
+    """Return `commit` and `dirty` of the checkout with top folder `root`; {} if there is none or git fails.
 
     Dirty: a tracked file differs from the commit, or runtime/, robots/ or deployments/ has an untracked file.
     """
@@ -39,7 +39,10 @@ def _counts(line: str) -> bool:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Return the output of git, None if it fails; the call writes nothing and ignores GIT_ variables of a hook."""
+    """Return the output of a git command, None if it fails.
+
+    The command writes nothing and ignores the GIT_ variables of a hook.
+    """
     plain = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
         done = subprocess.run(

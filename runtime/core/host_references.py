@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 
 class HostReference(Enum):
-    """Kinds of things that such a value refers to."""
+    """Kind of resource on this machine to which a configuration value refers."""
 
     VARIABLE = "an environment variable"
     FILE = "a file that is read"

@@ -28,9 +28,9 @@ def configure_logging(process: str) -> None:
 class NonBlockingHandler(logging.Handler):
     """Log handler with a thread that writes lines to a descriptor.
 
-    If the descriptor blocks (a stopped terminal, a pager, a pipe without a reader), lines beyond LINES_KEPT are
-    dropped and counted; callers never wait, except at most a second at the end of the process. Writes bypass Python's
-    buffers, whose locks a blocked writer would hold forever.
+    If the descriptor blocks (a stopped terminal, a pager, a pipe without a reader), lines beyond LINES_KEPT are dropped
+    and counted; callers never wait, except at most a second at the end of the process. Writes bypass Python's buffers,
+    whose locks a blocked writer would hold forever.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -43,7 +43,7 @@ class NonBlockingHandler(logging.Handler):
         threading.stack_size(before)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue the line; no I/O, and no lock that the writing thread could hold."""
+        """Queue the line, without I/O and without a lock that the writing thread could hold."""
         if self._queue.qsize() >= LINES_KEPT:
             self._dropped += 1
             return
@@ -78,7 +78,7 @@ class NonBlockingHandler(logging.Handler):
 
 
 def _log_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Log the exception that ends the process: a traceback must not wait for a terminal either."""
+    """Log the exception that ends the process, because its traceback must not wait for a terminal either."""
     if issubclass(kind, Exception):
         logging.getLogger(__name__).critical("this process ends", exc_info=(kind, error, trace))
     else:

@@ -26,8 +26,8 @@ _SCALARS = (bool, int, float, str, bytes)
 def pack(value: object) -> bytes:
     """Return `value` as one message.
 
-    Tuples become lists. float64, str_ and bytes_ scalars are packed as plain numbers and strings: to msgpack they are
-    Python's own types.
+    Tuples become lists. float64, str_ and bytes_ scalars are packed as plain numbers and strings, because for msgpack
+    they are Python's own types.
 
     Raises:
         CodecError: the dialect cannot represent the value.

@@ -1,4 +1,4 @@
-"""Limits on pixels and scans of untrusted pictures: some hundred bytes can declare gigabytes."""
+"""Limits on pixels and scans of untrusted pictures, because a few hundred bytes can declare gigabytes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ DAMAGED = (
 
 
 class TooLargeError(ValueError):
-    """A picture has more pixels or scans than that of any camera."""
+    """Error about a picture that has more pixels or scans than pictures of any camera."""
 
 
 def require_size(width: int, height: int, whose: str = "its pictures are") -> None:
-    """Raise TooLargeError for more than MOST_PIXELS; `whose` begins its message."""
+    """Raise TooLargeError if a picture has more than MOST_PIXELS; `whose` begins the message."""
     if width * height > MOST_PIXELS:
         raise TooLargeError(
             f"{whose} {width} x {height}; allowed: {MOST_PIXELS} pixels in all, such as 4096 x 4096"
@@ -34,14 +34,17 @@ def require_size(width: int, height: int, whose: str = "its pictures are") -> No
 
 
 def require_scans(coded: bytes, whose: str = "its JPEG has") -> None:
-    """Raise TooLargeError for a JPEG with so many scans that a few bytes each cost a whole decoding."""
+    """Raise TooLargeError if a JPEG has too many scans; `whose` begins the message.
+
+    Each scan takes as long to decode as a whole picture, and may consist of a few bytes only.
+    """
     scans = coded.count(b"\xff\xda") if coded.startswith(b"\xff\xd8") else 0  # coded pixels never contain it
     if scans > MOST_SCANS:
         raise TooLargeError(f"{whose} {scans} scans; allowed: {MOST_SCANS}")
 
 
 def open_video(path: Path | str) -> Any:
-    """Open a video for reading with PyAV, bounded.
+    """Open a video for reading with PyAV, with the size of its pictures limited.
 
     Raises:
         TooLargeError: the container declares larger pictures. Errors of `av.open` are passed on.
@@ -58,7 +61,7 @@ def open_video(path: Path | str) -> Any:
 
 
 def bound(container: Any) -> None:
-    """Make the decoders of an open container, which have decoded nothing yet, refuse larger pictures.
+    """Make the decoders of an open container refuse larger pictures; nothing may have been decoded yet.
 
     Raises:
         TooLargeError: the container already declares larger pictures.

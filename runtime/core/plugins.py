@@ -16,7 +16,7 @@ from runtime.core.errors import ConfigurationError
 
 
 class Variants(Mapping[str, ModuleType]):
-    """The modules of a package by `kind`, from its table KINDS; each is imported on first access.
+    """Modules of a package by `kind`, from its table KINDS; each is imported on first access.
 
     Raises:
         ConfigurationError: a module cannot be imported; names file and cause.
@@ -56,7 +56,7 @@ def variants(package: str) -> Variants:
 
 
 class UnreadSection(BaseModel):
-    """Table that this process does not use: unchanged, with its kind, and without an import."""
+    """Table of a deployment that this process does not use: kept unchanged, with its kind, and without an import."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -64,7 +64,7 @@ class UnreadSection(BaseModel):
 
 
 class KindUnion:
-    """Type of a table that is of one of a package's kinds, distinguished by `kind`.
+    """Type of a table of one of a package's kinds, which the table names under `kind`.
 
     A kind is imported when a table names it. Tables of a package that the validation context lists under `unread` are
     not checked: each becomes an UnreadSection.
@@ -74,7 +74,7 @@ class KindUnion:
 
     @classmethod
     def config(cls, kind: str) -> type[BaseModel]:
-        """Return the model of the tables of a kind."""
+        """Return the model of the tables of kind `kind`."""
         found: type[BaseModel] = variants(cls.package)[kind].Config
         return found
 

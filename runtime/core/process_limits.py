@@ -30,7 +30,7 @@ _ENOUGH = 4096
 
 
 def raise_file_limit() -> None:
-    """Raise the soft limit to the hard limit: ZMQ aborts a process that runs out of descriptors."""
+    """Raise the soft limit of open files to the hard limit: ZMQ aborts a process that runs out of descriptors."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     if hard != resource.RLIM_INFINITY and hard < _ENOUGH:

@@ -10,7 +10,10 @@ from runtime.core.types import Float64
 
 
 def quantiles(figures: Float64, fractions: Sequence[float]) -> list[float]:
-    """Return the quantiles of `figures` [N], N > 0, like `numpy.quantile` within rounding, but many times faster."""
+    """Return the quantiles of `figures` [N], N > 0, equal to those of `numpy.quantile` within rounding.
+
+    It is many times faster.
+    """
     ordered = np.sort(figures)
     found, last = [], len(ordered) - 1
     for fraction in fractions:

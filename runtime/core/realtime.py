@@ -28,10 +28,11 @@ LOCKSTEP = "lockstep"  # class of ticks without real time
 
 
 def enter_realtime(priority: int) -> str:
-    """Make this process as punctual as permitted; return the class obtained, for the status.
+    """Make this process as punctual as permitted; return the scheduling class obtained, for the status.
 
-    SCHED_FIFO at `priority`, or at the highest that the user's rtprio limit permits; else a scheduler slice of 0.1 ms
-    (Linux 6.12 and later); else the ordinary class. "unlocked" is appended if its memory may be paged out.
+    The first permitted of these is used: SCHED_FIFO at `priority`, or at the highest that the user's rtprio limit
+    permits; a scheduler slice of 0.1 ms (Linux 6.12 and later); the ordinary class. "unlocked" is appended if its
+    memory may be paged out.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     _fine_timers(libc)
@@ -43,9 +44,9 @@ def enter_realtime(priority: int) -> str:
 
 
 def enter_realtime_below(priority: int) -> str:
-    """Make this process punctual with the priority below `priority`; return the class obtained.
+    """Make this process punctual with the priority below `priority`; return the scheduling class obtained.
 
-    For a process with threads and large, sparse memory. Threads started later inherit the class, unless they call
+    It is for a process with threads and large, sparse memory. Threads started later inherit the class, unless they call
     `leave_realtime`. Memory mapped so far is locked page by page on first use; later mappings are not locked, because
     that could be refused in the middle of the work.
     """
@@ -58,7 +59,10 @@ def enter_realtime_below(priority: int) -> str:
 
 
 def leave_realtime(thread: int = 0) -> None:
-    """Remove thread `thread` (0: the calling one) from a real-time class; its later threads are in none either."""
+    """Remove the thread with id `thread` (0: the calling one) from a real-time class.
+
+    Threads that it starts later are in no real-time class either.
+    """
     with contextlib.suppress(ProcessLookupError):  # the thread has ended
         if os.sched_getscheduler(thread) in (os.SCHED_FIFO, os.SCHED_RR):
             os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
@@ -71,14 +75,17 @@ def leave_realtime_all() -> None:
 
 
 def advice(scheduling: str, priority: int) -> str:
-    """Return advice to make a station punctual if control got the class `scheduling`; "" if not needed."""
+    """Return advice to make a station punctual if control got the class `scheduling`; "" if none is needed."""
     if scheduling.startswith("FIFO") or scheduling == LOCKSTEP:
         return ""
     return _NOT_PERMITTED(scheduling=scheduling, priority=priority)
 
 
 def _fine_timers(libc: ctypes.CDLL) -> None:
-    """Wake up on time, not up to 50 us later together with others (a real-time class always does)."""
+    """Make this process wake up on time, as a real-time class always does.
+
+    By default timers fire up to 50 us late, several at once.
+    """
     libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
@@ -87,7 +94,7 @@ def _locked_memory(libc: ctypes.CDLL, what: int) -> bool:
 
 
 def _read_in(libc: ctypes.CDLL) -> None:
-    """Load mapped files into memory: code that has not run yet would be read from disk in the middle of a tick.
+    """Load mapped files into memory: otherwise code would be read from disk in the middle of a tick when it first runs.
 
     Large anonymous memory is locked on first use, at a microsecond per page and without disk access: of BLAS buffers
     (32 MB each) and thread stacks (8 MB) hardly any is ever used.
@@ -102,7 +109,7 @@ def _read_in(libc: ctypes.CDLL) -> None:
 
 
 def _quiet_gc() -> None:
-    """Exclude imported objects from collection and disable it; the loop collects between two ticks."""
+    """Exclude imported objects from garbage collection and disable it; the loop collects between two ticks."""
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -1,4 +1,4 @@
-"""Bound of the restarts of a process that keeps ending."""
+"""Limit on the restarts of a process that ends again and again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class RestartWindow:
         self._times: deque[float] = deque()
 
     def admit(self, now: float) -> bool:
-        """Record a restart at `now`; return False, and record nothing, if it is one too many."""
+        """Record a restart at `now`; return False, and record nothing, if it would exceed the limit."""
         while self._times and self._times[0] < now - RESTART_WINDOW_S:
             self._times.popleft()
         if len(self._times) >= MOST_RESTARTS:
@@ -26,5 +26,5 @@ class RestartWindow:
         return True
 
     def clear(self) -> None:
-        """Forget all restarts."""
+        """Remove all recorded restarts."""
         self._times.clear()

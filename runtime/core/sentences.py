@@ -1,7 +1,7 @@
-"""Sentences for people, with an id and arguments from which a translation is made.
+"""Sentences for people, each with an id and arguments, by which it can be translated.
 
-A module declares its sentences as `Pattern`s next to their use, and calls one to create a `Sentence`. That is a
-`str`, so logs, records and comparisons use the English text.
+A module declares its sentences as `Pattern`s next to their use, and calls one to create a `Sentence`. That is a `str`,
+so logs, records and comparisons use the English text.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _KNOWN: dict[str, Pattern] = {}  # state: the patterns of the modules that were 
 
 
 class Sentence(str):
-    """An English sentence with `id` and `arguments`. Concatenated or formatted it is a plain str."""
+    """English sentence with `id` and `arguments`; concatenated or formatted it is a plain str."""
 
     __slots__ = ("arguments", "depth", "id")
     id: str
@@ -53,7 +53,7 @@ class Sentence(str):
 
 
 class Pattern:
-    """A sentence with placeholders. Call it with the arguments to create a `Sentence`.
+    """Sentence with placeholders. Call it with the arguments to create a `Sentence`.
 
     A second pattern with the same id and another text is an error.
     """
@@ -111,7 +111,7 @@ def plain(text: str) -> str:
 
 
 def identity(text: str) -> dict[str, Any]:
-    """Return id and arguments of a sentence in wire form; "" and {} for another text."""
+    """Return id and arguments of a sentence in wire form; "" and {} for a text that is no sentence."""
     if not isinstance(text, Sentence):
         return {"id": "", "arguments": {}}
     return {
@@ -131,7 +131,7 @@ def rewritten(text: str, change: Callable[[str], str]) -> str:
 
 
 def shows(text: str, arguments: Mapping[str, Any]) -> bool:
-    """Return True if all arguments (wire form) appear in the text: a reader of the text may then get them."""
+    """Return True if all arguments (wire form) appear in the text, so that sending them reveals nothing more."""
     for value in arguments.values():
         if isinstance(value, Mapping):
             nested = str(value.get("text"))
@@ -148,12 +148,12 @@ def to_wire(text: str) -> dict[str, Any]:
 
 
 def within(tree: object) -> dict[str, dict[str, Any]]:
-    """Return ids and arguments of the sentences in nested maps and lists, by path."""
+    """Return ids and arguments of the sentences in nested maps and lists, by path (as in `texts`)."""
     return {path: identity(text) for path, text in texts(tree).items() if isinstance(text, Sentence)}
 
 
 def texts(tree: object) -> dict[str, str]:
-    """Return the texts in nested maps and lists by path: the keys to them, joined by dots."""
+    """Return the texts in nested maps and lists by path; a path is the keys to a text, joined by dots."""
     return dict(_texts(tree, ""))
 
 
@@ -183,14 +183,14 @@ def from_wire(text: str, id: object, arguments: object, depth: int = 0) -> str:
 
 
 def checked(said: object) -> dict[str, dict[str, Any]]:
-    """Return ids and arguments by path, as another process sent them, without invalid entries."""
+    """Return ids and arguments by path, as another process sent them in `said`, without invalid entries."""
     said = said if isinstance(said, Mapping) else {}
     found = {path: _checked(one) for path, one in said.items() if isinstance(one, Mapping)}
     return {str(path): one for path, one in found.items() if one}
 
 
 def checked_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row that another process sent, without its id and arguments if they are invalid."""
+    """Return a row that another process sent; invalid id and arguments are removed from it."""
     return {key: of for key, of in row.items() if key not in ("id", "arguments")} | _checked(row)
 
 

@@ -19,7 +19,7 @@ _NO_ORIGIN: Mapping[Key, str] = MappingProxyType({})
 
 
 class Settings(BaseModel):
-    """A frozen table of a deployment file, in which nothing is coerced.
+    """Frozen table of a deployment file, in which nothing is coerced.
 
     Unknown keys, wrong types, NaN and infinity are errors.
     """
@@ -35,9 +35,9 @@ def explain_validation_error(
     source: str,
     origin: Mapping[Key, str] = _NO_ORIGIN,
 ) -> str:
-    """Return one line per error of `tree` as a `root`: the key, the given value, what is allowed.
+    """Return one line per error in `tree`, which is to be a `root`: the key, the given value, what is allowed.
 
-    `origin` maps keys to the file that they came from, `source` is that of all others.
+    `origin` maps keys to the files that they came from; all other keys came from `source`.
     """
     return "\n".join(_sentence(error, root, tree, source, origin) for error in invalid.errors())
 
@@ -97,7 +97,7 @@ def _allowed(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[s
 
 
 def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[type[BaseModel]]:
-    """Return the models that the table at `key` may be: a single one if its kind is known, else all candidates."""
+    """Return the models that the table at `key` may have: a single one if its kind is known, else all candidates."""
     annotations: list[Any] = [root]
     at: Any = tree
     for name in key:
@@ -112,7 +112,7 @@ def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[ty
 
 
 def _under(name: str, annotation: Any) -> list[Any]:
-    """Return the annotations of the value under `name` in a value of type `annotation`."""
+    """Return the annotations that a value under the key `name` may have, in a value with this annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(name)
         return [field.annotation] if field else []
@@ -122,7 +122,10 @@ def _under(name: str, annotation: Any) -> list[Any]:
 
 
 def _chosen(annotation: Any, table: Any) -> list[Any]:
-    """Return the annotation or, for a union, that of the kind that `table` names; [] if it names none."""
+    """Return the annotation in a list; for a union return that of the kind that `table` names.
+
+    [] if the table names no kind of the union.
+    """
     if isinstance(annotation, type) and issubclass(annotation, KindUnion):
         kind = table.get("kind") if isinstance(table, Mapping) else None
         return (

@@ -17,9 +17,9 @@ _Result = TypeVar("_Result")
 def allow_two_threads(context: ssl.SSLContext) -> ssl.SSLContext:
     """Make sockets wrapped by `context` usable by one reading and one writing thread; return `context`.
 
-    The threaded connections of websockets use every socket like that, but OpenSSL forbids concurrent calls on one SSL
-    object. The symptom is "internal error", most often just after the handshake, when the reader receives session
-    tickets while the first request is written.
+    The threaded connections of websockets use every socket with two threads, but OpenSSL forbids concurrent calls on
+    one SSL object. The symptom is "internal error", most often just after the handshake, when the reader receives
+    session tickets while the first request is written.
     """
     context.sslsocket_class = _TurnTakingSocket
     return context
@@ -50,7 +50,7 @@ class _TurnTakingSocket(ssl.SSLSocket):
             self._patience = value
 
     def setblocking(self, flag: bool) -> None:
-        """Set blocking mode, as for every socket."""
+        """Set blocking mode, with the meaning that it has for every socket."""
         self.settimeout(None if flag else 0.0)
 
     def gettimeout(self) -> float | None:
@@ -58,7 +58,7 @@ class _TurnTakingSocket(ssl.SSLSocket):
         return super().gettimeout() if self._turn is None else self._patience
 
     def read(self, len: int = 1024, buffer: Any = None) -> Any:
-        """Return received bytes, or their number if read into `buffer`; empty or 0 after a shutdown."""
+        """Return received bytes, or their number if they are read into `buffer`; empty or 0 after a shutdown."""
         try:
             return self._in_turn(lambda: super(_TurnTakingSocket, self).read(len, buffer))
         except ValueError:  # ssl raises it if another thread's `shutdown` ended the read
@@ -67,7 +67,7 @@ class _TurnTakingSocket(ssl.SSLSocket):
             return b"" if buffer is None else 0
 
     def _real_close(self) -> None:
-        """Shut down first: closing a descriptor alone does not wake a thread that polls it."""
+        """Shut down and close the socket; closing alone would not wake a thread that polls the descriptor."""
         with contextlib.suppress(OSError):
             super().shutdown(socket.SHUT_RDWR)
         super()._real_close()  # type: ignore[misc]

@@ -54,18 +54,17 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class ActionChunk:
-    """A policy's answer: rows of actions, row 0 for the step of the observation.
+    """Response of a policy: rows of actions, row 0 for the step of the observation.
 
     `actions` is float32 [H, W] in `space`, unchanged from the server: "joint" rows are [D] in group order, "eef" rows
     are poses in the format `pose` (None: 8 values per arm). `rate` is the rate of the rows [Hz], None: the control
-    rate. `model_actions` are the rows in the model's normalised space, if the server returned them; `model_relative`
-    is True if they are relative to the observation whatever `mode` is, None if unknown. `timing` has the server's own
+    rate. `model_actions` are the rows in the model's normalised space, if the server returned them; `model_relative` is
+    True if they are relative to the observation whatever `mode` is, None if unknown. `timing` has the server's own
     times [ms].
 
-    `mode`: "absolute" targets; "relative" to the observation that the chunk answers; "delta": each row relative to
-    its predecessor, the first to the observation. Grippers are absolute in every mode. `frame` is that of relative
-    poses: offsets along the axes of the frame in which poses are declared ("base"), or of the observed end effector
-    ("tool").
+    `mode`: "absolute" targets; "relative" to the observation that the chunk answers; "delta": each row relative to its
+    predecessor, the first to the observation. Grippers are absolute in every mode. `frame` is that of relative poses:
+    offsets along the axes of the frame in which poses are declared ("base"), or of the observed end effector ("tool").
     """
 
     actions: Float32
@@ -84,7 +83,7 @@ class Conditioning:
     """Committed actions of the robot, for policies that continue their own last chunk (RTC).
 
     Rows are in the policy's own space and at its own rate: absolute rows as received, other rows relative to the new
-    observation, like those of the answer.
+    observation, like the rows of the response.
     """
 
     previous: Float32  # [T, W] the whole chunk that is being executed
@@ -100,7 +99,7 @@ class Conditioning:
 
 @dataclass(frozen=True, slots=True)
 class RobotCommand:
-    """An absolute target for the whole robot: float32 [D] in group order, for control tick `step`.
+    """Absolute target for the whole robot: float32 [D] in group order, for control tick `step`.
 
     `eef` are the poses of these joints in the format of the deployment's `publication`, None if it publishes joints.
     """

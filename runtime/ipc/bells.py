@@ -8,7 +8,10 @@ from contextlib import suppress
 
 
 class Bell:
-    """An eventfd that the station processes inherit: any process may ring it, a single process waits for it."""
+    """Wake-up signal between station processes, an inherited eventfd.
+
+    Any process may ring it, a single process waits for it.
+    """
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor

@@ -73,7 +73,7 @@ TOO_MANY = _TOO_MANY(most=MAX_WAITING_PER_CONNECTION)
 
 
 class Listener:
-    """A listening socket in the station's folder of sockets; `endpoint` is its address.
+    """Listening socket in the station's folder of sockets; `endpoint` is its address.
 
     Raises:
         TransportError: it cannot listen.
@@ -112,10 +112,10 @@ class Listener:
         self._identity = file_identity(path)
 
     def rebind_if_unreachable(self) -> bool:
-        """Listen at a new path if clients cannot connect, or others could; return True if it moved.
+        """Listen at a new path if clients cannot connect, or other accounts could; return True if the path has changed.
 
-        The session folder ($XDG_RUNTIME_DIR) is removed at the account's last logout, and its mode or owner may
-        change. Existing connections continue. Checks at most every `LOOK_S` seconds.
+        The session folder ($XDG_RUNTIME_DIR) is removed at the account's last logout, and its mode or owner may change.
+        Existing connections continue. The socket is checked at most every `LOOK_S` seconds.
         """
         if time.monotonic() - self._looked < _LOOK_S:
             return False
@@ -142,7 +142,7 @@ class Listener:
 
 @dataclass(frozen=True, slots=True)
 class IncomingMessage:
-    """A received message: connection, content, signature (empty: unsigned), sender's account and process.
+    """Received message: connection, content, signature (empty: unsigned), sender's account and process.
 
     `uid` and `pid` are None if the kernel does not report them.
     """
@@ -167,7 +167,10 @@ def _call(frames: list[zmq.Frame]) -> IncomingMessage:
 
 
 def _peer(frame: zmq.Frame) -> tuple[int | None, int | None]:
-    """Return account and process of the connection, as the kernel reported to ZMQ: "localhost:UID:GID:PID"."""
+    """Return account and process of the message's sender, from the kernel's report to ZMQ "localhost:UID:GID:PID".
+
+    Both are None if there is no such report.
+    """
     try:
         _, uid, _, pid = str(frame["Peer-Address"]).split(":")
         return int(uid), int(pid)
@@ -181,7 +184,7 @@ def _refusal(reason: str) -> bytes:
 
 
 class CommandServer(Listener):
-    """Server side of commands: a ROUTER that never blocks its owner."""
+    """Server side of commands, a ROUTER socket that never blocks its owner."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, name: str) -> None:
         super().__init__(context, zmq.ROUTER, station_dir, name, _QUEUED, _UNREAD)
@@ -189,7 +192,7 @@ class CommandServer(Listener):
     def receive(self) -> tuple[IncomingMessage, Command] | None:
         """Return the next command with its message, None if there is none.
 
-        Unreadable messages are answered with a refusal that has the reason; no exception is raised.
+        An unreadable message is answered with a refusal that contains the reason; no exception is raised.
         """
         while (call := self.receive_raw()) is not None:
             if (command := self.decode(call)) is not None:
@@ -206,7 +209,7 @@ class CommandServer(Listener):
             return None
 
     def decode(self, call: IncomingMessage) -> Command | None:
-        """Return the command in a message; if there is none, send a refusal and return None."""
+        """Return the command in a message; if the message contains none, send a refusal and return None."""
         try:
             message = decode(call.payload)
         except CodecError as error:
@@ -218,7 +221,7 @@ class CommandServer(Listener):
         return None
 
     def reject(self, call: IncomingMessage, reason: str) -> None:
-        """Refuse a message that was not decoded, so that the refusal has no uuid."""
+        """Refuse a message that was not decoded; so the refusal has no uuid."""
         self._send(call, _refusal(reason))
 
     def answer(self, call: IncomingMessage, ack: Ack) -> None:
@@ -226,7 +229,7 @@ class CommandServer(Listener):
         self._send(call, encode(ack))
 
     def pass_on(self, call: IncomingMessage, payload: bytes) -> None:
-        """Send an answer that another station has packed."""
+        """Send an answer that a station on another computer has already encoded."""
         self._send(call, payload)
 
     def _send(self, call: IncomingMessage, payload: bytes) -> None:
@@ -247,7 +250,10 @@ class CommandClient:
         key: Key | None = None,
         owner: int | None = None,
     ) -> None:
-        """Connect; `owner` is the station's account: only answers of that account, this one and root count."""
+        """Connect to `endpoint`.
+
+        `owner` is the station's account: answers of other accounts than that, this one and root are not trusted.
+        """
         self._context = context
         self._believed = {os.geteuid(), 0, owner}
         self.strangers = ""  # describes the sender of answers that were ignored
@@ -266,7 +272,7 @@ class CommandClient:
         With an unusable key the command is sent unsigned, and an error is logged.
 
         Raises:
-            CodecError: it exceeds LARGEST bytes.
+            CodecError: the command exceeds LARGEST bytes.
         """
         self._socket.send_multipart(self._signed(command))
 
@@ -307,7 +313,7 @@ class CommandClient:
         return self._socket
 
     def forward(self, payload: bytes, signature: bytes) -> None:
-        """Send a command that another process has packed, with its signature."""
+        """Send a command that another process has already encoded, with its signature."""
         self._socket.send_multipart([payload, signature], zmq.NOBLOCK)
 
     def packed_answer(self) -> bytes | None:
@@ -342,9 +348,9 @@ class CommandClient:
 
 
 class Publisher(Listener):
-    """Publisher of streams in which only the newest message matters; a slow reader misses some.
+    """Publisher of streams in which only the newest message matters; a slow reader misses messages.
 
-    `topics` are the subscribed prefixes.
+    `topics` are the subscribed prefixes of stream names.
     """
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, name: str, high_water: int) -> None:
@@ -352,7 +358,7 @@ class Publisher(Listener):
         self.topics: set[str] = set()  # prefixes of streams that have a subscriber
 
     def poll_subscriptions(self) -> list[str]:
-        """Process subscriptions; return the topics without a subscriber before."""
+        """Process new subscriptions and cancellations; return the topics that were subscribed since the last call."""
         begun = []
         with suppress(zmq.Again):
             while readable(self.socket):
@@ -366,7 +372,7 @@ class Publisher(Listener):
         return begun
 
     def has_subscriber(self, stream: str) -> bool:
-        """Return True if `stream` has a subscriber, as of the last `hear`."""
+        """Return True if `stream` has a subscriber, as of the last `poll_subscriptions`."""
         return any(stream.startswith(topic) for topic in self.topics)
 
     def publish(self, stream: str, payload: object) -> None:
@@ -376,7 +382,7 @@ class Publisher(Listener):
 
 
 class Subscriber:
-    """Receiver of streams by name prefix; returns the newest message of each."""
+    """Receiver of streams whose names begin with given prefixes; it returns the newest message of each."""
 
     def __init__(self, context: zmq.Context[Any], endpoint: str, *streams: str) -> None:
         self._context = context
@@ -395,7 +401,7 @@ class Subscriber:
     def receive(self, timeout: float) -> dict[str, Any]:
         """Return the newest content of every stream that has a message within `timeout` seconds.
 
-        After more than a second without a call it reconnects, which takes some milliseconds: the messages queued
+        If the last call was more than a second ago, it reconnects, which takes some milliseconds: the messages queued
         meanwhile, here and in the kernel, are old.
         """
         if time.monotonic() - self._read_at > _AWAY_S:
@@ -417,14 +423,14 @@ class Subscriber:
 
 
 class EventLog:
-    """The last events, numbered from 1 without gaps, so that a client can request those that it missed."""
+    """Newest events, numbered from 1 without gaps, so that a client can request the events that it missed."""
 
     def __init__(self) -> None:
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
         self.newest = 0
 
     def append(self, event: Event) -> dict[str, Any]:
-        """Number and store the event; return it as a map."""
+        """Number and store the event; return it as a dict for the wire."""
         self.newest += 1
         row = {
             "number": self.newest,

@@ -34,7 +34,7 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def socket_folder(station_dir: Path) -> Path:
-    """Return the folder of the station's sockets, created if missing; each data folder and station has its own.
+    """Return the folder of the station's sockets, created if missing; each station of a data folder has its own.
 
     It is below $XDG_RUNTIME_DIR, else in ~/.cache.
 
@@ -45,7 +45,10 @@ def socket_folder(station_dir: Path) -> Path:
 
 
 def _folders(station_dir: Path) -> Iterator[Path]:
-    """Yield folders for the sockets, best first; a starting station uses the first, a running one any of them."""
+    """Yield the possible folders for the sockets, best first.
+
+    A starting station uses the first; a running one uses a later one if the first has become unusable.
+    """
     name = hashlib.sha256(os.fsencode(station_dir.resolve())).hexdigest()[:16]
     given = os.environ.get("XDG_RUNTIME_DIR", "")
     if given and not _missing(Path(given)):
@@ -119,8 +122,8 @@ def account_name(uid: int) -> str:
 def new_socket_path(station_dir: Path, name: str) -> Path:
     """Return a new path for the socket `name`, and remove sockets of that name that dead processes left.
 
-    Paths are unique, so a process that ends never removes the socket of its successor. If the first folder is
-    unusable, the next is used and the log has the reason: a running station must not be lost for a folder.
+    Paths are unique, so a process that ends never removes the socket of its successor. If the first folder is unusable,
+    the next one is used and the reason is logged: a running station must not be lost because of a folder.
 
     Raises:
         TransportError: no folder is usable.
@@ -142,7 +145,10 @@ def new_socket_path(station_dir: Path, name: str) -> Path:
 
 
 def file_identity(path: Path) -> tuple[int, int]:
-    """Return device and inode of a file; (0, 0) if it is gone, unreachable, or in a folder that others can enter."""
+    """Return device and inode of a file.
+
+    (0, 0) if it is gone, unreachable, or in a folder that other accounts can enter.
+    """
     try:
         _require_owned(path.parent, _OTHERS)
         found = path.lstat()
@@ -152,7 +158,7 @@ def file_identity(path: Path) -> tuple[int, int]:
 
 
 def connection_problem(endpoint: str) -> str:
-    """Return why clients cannot connect to a socket, and what to do; "" if a process listens there."""
+    """Return the reason why clients cannot connect to a socket, and advice; "" if a process listens there."""
     path = Path(endpoint.removeprefix("ipc://"))
     mend = "where the station runs, it listens elsewhere within a second: press again; else start it again"
     probe = socket.socket(socket.AF_UNIX)
@@ -182,7 +188,7 @@ class Endpoints:
         self._looked = time.monotonic()
 
     def is_missing(self, process: str) -> bool:
-        """Return True if this process's file is gone or unreadable; checks at most every LOOK_S seconds.
+        """Return True if this process's file is gone or unreadable; it is checked at most every LOOK_S seconds.
 
         A file that a successor wrote counts as present and is not replaced.
         """
@@ -197,10 +203,10 @@ class Endpoints:
             return True
 
     def write(self, process: str, endpoints: Mapping[str, str]) -> bool:
-        """Write this process's endpoints, which atomically replaces those of its predecessor.
+        """Write this process's endpoints, which atomically replaces those of its predecessor; return True if done.
 
         If the disk refuses, an error is logged, and a thread retries every RETRY_S seconds until it succeeds: the
-        process does not depend on it. Returns whether they are on disk.
+        process does not depend on it.
         """
         with self._lock:
             retried = bool(self._wanted)
@@ -233,7 +239,7 @@ class Endpoints:
                     return
 
     def _write_now(self) -> OSError | None:
-        """Write pending files; return the error if some could not be written."""
+        """Write pending files; return the error if some could not be written, else None."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             for process in list(self._wanted):
@@ -249,7 +255,7 @@ class Endpoints:
         """Return the endpoints of `process`.
 
         Raises:
-            TransportError: the station has none; the message lists the known stations.
+            TransportError: the process has written none; the message lists the known stations.
         """
         path = self._file(process)
         try:
@@ -280,7 +286,10 @@ class Endpoints:
         return found
 
     def is_listening(self, name: str) -> bool:
-        """Return True if a process listens at a socket of that name, whatever the files contain; False if unknown."""
+        """Return True if a process listens at a socket `name`, whatever the files contain.
+
+        False also if that is unknown.
+        """
         for folder in _folders(self._station_dir):
             with suppress(OSError):  # missing or not accessible
                 if any(not connection_problem(f"ipc://{path}") for path in folder.glob(f"{name}-*")):
@@ -302,7 +311,7 @@ class Endpoints:
         """Clear the endpoints for a starting station.
 
         Raises:
-            TransportError: its folder of sockets is not its own.
+            TransportError: the folder of sockets belongs to another account, or other accounts have permissions for it.
         """
         socket_folder(self._station_dir)
         self.clear()

@@ -1,4 +1,4 @@
-"""Delivery of urgent commands: over a connection of their own, which follows the socket if it moves."""
+"""Delivery of urgent commands, each over a connection of its own that follows the socket if its path changes."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _AGAIN_S = 0.02
 
 
 class NotSent(TransportError):
-    """No process was listening during the whole timeout: the command was not executed."""
+    """Error about a command that was not executed: no process was listening during the whole timeout."""
 
 
 class NoAnswer(TransportError):
-    """No answer: it is unknown whether the command was executed. `why` is the reason, as far as known."""
+    """Error about a command without an answer: it may have been executed. `why` is the reason, as far as known."""
 
     def __init__(self, kind: str, seconds: float, why: str) -> None:
         self.why = _BECAUSE(why=why) if why else ""
@@ -45,14 +45,14 @@ def send_urgent(
 ) -> Ack:
     """Send a command until it is answered; `where` is process and socket, as in ("guard", "estop").
 
-    It is sent again whenever the socket has moved; the file with its path may be updated late.
+    It is sent again whenever the socket's path has changed; the file with the path may be updated late.
 
     Returns:
         The answer.
 
     Raises:
-        NotSent: nothing listened; says what to do.
-        NoAnswer: no answer within `timeout` [s]; says what to do.
+        NotSent: no process listened; the message advises what to do.
+        NoAnswer: no answer within `timeout` [s]; the message advises what to do.
         CodecError: the command is too large.
         TransportError: the station has no such process or socket.
     """
@@ -89,7 +89,11 @@ def send_urgent(
 
 
 def _current_endpoint(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:
-    """Return the current endpoint of a socket: `before` unless the file names another."""
+    """Return the current endpoint of a socket from its process's file; if that has none, return `before`.
+
+    Raises:
+        TransportError: there is none, and `before` is "".
+    """
     process, name = where
     try:
         return str(endpoints.read(process)[name])

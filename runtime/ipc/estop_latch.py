@@ -13,7 +13,7 @@ from runtime.core.durable_files import sync_folder
 
 @dataclass(frozen=True, slots=True)
 class Latched:
-    """A latched press: by which user, why, when (Unix time)."""
+    """Latched press of the e-stop: user, reason, and Unix time [s]."""
 
     by: str
     why: str
@@ -21,7 +21,7 @@ class Latched:
 
 
 class Latch:
-    """File whose existence means latched."""
+    """File whose existence means that the e-stop is latched."""
 
     def __init__(self, station_dir: Path) -> None:
         self._path = station_dir / "estop.json"

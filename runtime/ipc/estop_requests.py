@@ -1,6 +1,6 @@
 """Detection of e-stop presses in messages of each wire format, tolerant of errors in the rest of a message.
 
-All entry points use this module alone. A readable message is of the kind that it names; for an unreadable message, or
+All entry points use this module alone. A readable message is a press if its kind is that; in an unreadable message, or
 one without a kind, a text search decides. Nothing here raises, and each message is scanned in linear time.
 """
 
@@ -44,7 +44,7 @@ def reason_of(command: Command) -> str:
 
 
 def kind_of(payload: bytes) -> str:
-    """Return the first `kind` in a message of the bus, read without its arguments; "" if there is none."""
+    """Return the first `kind` in a message of the bus, without decoding its arguments; "" if there is none."""
     try:
         return next((_text(value) or "" for key, value in _pairs(payload) if key == "kind"), "")
     except _UNREADABLE:
@@ -52,7 +52,7 @@ def kind_of(payload: bytes) -> str:
 
 
 def parse_packed_press(payload: bytes) -> Command | None:
-    """Return the press in a message of the bus, from all readable fields; None if it is no press."""
+    """Return the press in a message of the bus, from all readable fields; None if the message is no press."""
     if b"estop" not in payload or _PACKED.search(payload) is None:
         return None
     found: dict[str, bytes] = {}
@@ -99,9 +99,9 @@ def _why(args: bytes | None, wrong: list[str]) -> str:
 
 
 def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> Iterator[tuple[str, bytes]]:
-    """Yield the wanted keys of the outermost map with their packed values; nothing else is decoded.
+    """Yield the `wanted` keys of the outermost map in `packed` with their encoded values; nothing else is decoded.
 
-    Raises an error of _UNREADABLE if it is no map, is incomplete, or is followed by further bytes.
+    Raises an error of _UNREADABLE if `packed` is no map, is incomplete, or is followed by further bytes.
     """
     reader = msgpack.Unpacker(raw=True)
     reader.feed(packed)
@@ -118,7 +118,7 @@ def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> I
 
 
 def _text(packed: bytes) -> str | None:
-    """Return packed text or bytes as a text; None for another type."""
+    """Return encoded text or bytes as a text; None for another type."""
     if len(packed) > 1 << 20 or not packed or not _is_text(packed[0]):
         return None
     value: bytes = msgpack.unpackb(packed, raw=True)
@@ -133,7 +133,7 @@ def _is_text(mark: int) -> bool:
 
 
 class _Table(list[tuple[str, Any]]):
-    """A JSON object as a list of pairs, so that duplicate keys are preserved."""
+    """JSON object as a list of pairs, so that duplicate keys are preserved."""
 
 
 _JSON = json.JSONDecoder(object_pairs_hook=_Table)
@@ -143,7 +143,7 @@ _READ_WHOLE, _WINDOW = 8192, 4096  # characters
 def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
     """Return the fields of a press in JSON, {} if they cannot be read; None if the message is no press.
 
-    `keys` are those under which such a message has its kind: {"type": "estop"}. "web:estop" and "estop:REASON" are
+    `keys` are the keys under which such a message has its kind: {"type": "estop"}. "web:estop" and "estop:REASON" are
     valid kinds too. A message much longer than a press is searched only at its beginning and its end.
     """
     text = said if isinstance(said, str) else said.decode(json.detect_encoding(said), "replace")
@@ -167,20 +167,20 @@ def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
 
 
 def _fields(parts: Sequence[str]) -> dict[str, Any]:
-    """Return uuid and reason of a long press, if they are in these parts."""
+    """Return uuid and reason of a long press, as far as they are in `parts`, its beginning and its end."""
     pattern = r'"%s"\s{0,9}:\s{0,9}"([^"\\]{1,240})'
     found = ((key, re.search(pattern % key, part)) for part in reversed(parts) for key in ("uuid", "why"))
     return {key: match[1] for key, match in found if match}
 
 
 def _loosely(text: str, keys: Sequence[str]) -> bool:
-    """Return True if the text contains a press, however malformed."""
+    """Return True if the text contains a press under one of `keys`, however malformed."""
     bare = _ESCAPED.sub(lambda code: chr(int(code[1], 16)), text).replace("\\", "")
     return re.search(_LOOSE % "|".join(keys), bare) is not None
 
 
 def json_reason(said: Mapping[str, Any], default: str = DEFAULT_REASON) -> str:
-    """Return the reason of a press in JSON, from its top level or its arguments."""
+    """Return the reason of a press in JSON, from its top level or its arguments; `default` if it has none."""
     args = [said.get(key) for key in ("args", "arguments")]
     for table in (said, *(one for one in args if isinstance(one, dict))):
         if isinstance(why := table.get("why"), str) and why:

@@ -1,4 +1,4 @@
-"""Fair queue of the messages at a socket: per turn of a loop all stops, and a bounded share of the rest.
+"""Fair queue of the messages at a socket: each turn of a loop takes all stops, and a bounded share of the rest.
 
 Flooding gives a client no advantage: the number of waiting messages per connection is limited, connections alternate,
 and messages beyond the limit are refused without decoding. Every message is checked for a stop, unreadable messages
@@ -32,7 +32,7 @@ TURN_BYTES = 16 << 20  # [bytes] read from a socket in one turn
 def _press_in(call: IncomingMessage) -> Command | None:
     """Return the press in a message, None if there is none.
 
-    If the content has no kind, the press may also be in the following frames, or span both.
+    If the content has no kind, the press is also sought in the following frames, and across both.
     """
     press, rest = parse_packed_press(call.payload), call.signature
     if press is not None or not rest or kind_of(call.payload):
@@ -59,7 +59,7 @@ class FairQueue:
         return bool(self._waiting)
 
     def take_turn(self) -> tuple[list[QueuedCommand], list[QueuedCommand]]:
-        """Return all urgent commands that have arrived, and this turn's share of the others."""
+        """Return all urgent commands that have arrived, and this turn's share of the other commands."""
         self.refused = None
         urgent = [asked for call in self._received() if (asked := self._take_if_urgent(call)) is not None]
         return urgent, self._take_share()

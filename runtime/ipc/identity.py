@@ -44,7 +44,7 @@ _DOMAIN = b"eva-web command 1\0"
 
 
 class Key:
-    """The secret that web and station share: DATA/stations/NAME/bus.key, readable by this account only."""
+    """Secret that web and station share: DATA/stations/NAME/bus.key, readable by this account only."""
 
     def __init__(self, station_dir: Path) -> None:
         self.path = station_dir / "bus.key"
@@ -101,7 +101,10 @@ class Key:
         return secret
 
     def _make(self) -> bytes:
-        """Create the key, whichever of station and web comes first; the link makes it appear complete."""
+        """Create the key and return it; if station and web create it at once, both get the first one.
+
+        The file appears complete, so that no reader gets a part of it.
+        """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             create_durably(self.path, secrets.token_bytes(_KEY_BYTES), 0o600)
@@ -111,10 +114,10 @@ class Key:
 
 
 def authenticate(command: Command, payload: bytes, signature: bytes, uid: int | None, key: Key) -> Command:
-    """Return the command with user and role as verified, whatever it claims.
+    """Return the command with user and role as verified, whatever the command claims.
 
-    `signature` is empty if unsigned; `uid` is the connecting account, None if unknown. The role is the one that the
-    web signed, "local" for a program of this account, "script" for a command that such a program forwards, else
+    `signature` is empty if unsigned; `uid` is the connecting account, None if unknown. The role is the one that the web
+    signed, "local" for a program of this account, "script" for a command that such a program forwards, else
     "unverified".
     """
     if signature:
@@ -139,14 +142,14 @@ def _unverified(command: Command, role: str) -> Command:
 
 
 def unverified_reason(command: Command) -> str:
-    """Return the reason to refuse an authenticated command, unless it is a stop; "" if its sender is verified."""
+    """Return the reason to refuse a command whose sender is not verified; "" if it is, or for a stop."""
     if command.role != UNVERIFIED:
         return ""
     return _FORGED(kind=command.kind)
 
 
 def missing_role(command: Command) -> str:
-    """Return why the sender's role does not permit the command; "" if it does."""
+    """Return the reason if the sender's role does not permit the command; "" if it does."""
     if command.kind in _OPEN or command.role in _ROLE_COMMANDS:
         return ""
     return _NEEDS_OPERATOR(kind=command.kind, user=command.user, role=command.role or _WITHOUT_ROLE)

@@ -7,7 +7,7 @@ import select
 
 
 class Lifeline:
-    """Standard input, which the supervisor holds open: end of file means that the supervisor has ended."""
+    """Standard input, which the supervisor holds open: its end of file means that the supervisor has ended."""
 
     def __init__(self, descriptor: int = 0) -> None:
         self.descriptor = descriptor

@@ -1,4 +1,4 @@
-"""Connections of a station process to the other processes."""
+"""Membership of a process in its station: shared state, boot id and lifeline."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def rest_s(heartbeat_timeout: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """Shared state, name of this start of the station, and lifeline to its supervisor."""
+    """Shared state, boot id (the name of this start of the station), and lifeline to the supervisor."""
 
     shared: SharedState
     boot: str
     lifeline: Lifeline
 
     def is_needed(self, now: float) -> bool:
-        """Return True while a process that outlives control is needed, even if the supervisor is gone."""
+        """Return True while the supervisor lives, or control does; for a process that must outlive control."""
         return not self.lifeline.is_cut or self.shared.alive("control", now, _OUTLIVES_S)

@@ -45,7 +45,7 @@ Mode = Literal[PolicyMode, "collect"]
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order to control, valid from its next tick."""
+    """Order of the coordinator to control, valid from control's next tick."""
 
     number: int
     kind: OrderKind
@@ -58,11 +58,11 @@ class Order:
 
 @dataclass(frozen=True, slots=True)
 class PostedChunk:
-    """A chunk in command space at control rate, not yet merged: float64 [H, D].
+    """Chunk in command space at control rate, not yet merged: float64 [H, D].
 
-    Row 0 is for `observation_step`. If `requested_while_stopped`, the robot was at rest during the request (or while
-    a person reviewed the chunk), and row 0 is for the first free tick. `intended_start` [D] is where the policy
-    intends to begin, at any distance; None: row 0.
+    Row 0 is for `observation_step`. If `requested_while_stopped`, the robot was at rest during the request (or while a
+    person reviewed the chunk), and row 0 is for the first free tick. `intended_start` [D] is where the policy intends
+    to begin, at any distance; None: row 0.
     """
 
     chunk_id: int
@@ -75,14 +75,14 @@ class PostedChunk:
 
 @dataclass(frozen=True, slots=True)
 class Tune:
-    """The strategy from the next tick on: its whole section, as in a deployment."""
+    """Strategy from the next tick on: its whole section, as in a deployment."""
 
     strategy: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyAway:
-    """The policy of `run` is lost, and is retried until `until` [s, monotonic clock].
+    """Message that the policy of `run` is lost, and is retried until `until` [s, monotonic clock].
 
     Until then an empty plan does not lead to holding.
     """
@@ -93,14 +93,14 @@ class PolicyAway:
 
 @dataclass(frozen=True, slots=True)
 class LockGrippers:
-    """Positions at which grippers are locked whatever is commanded: float64 [D], NaN for unlocked dimensions."""
+    """Positions at which grippers are locked, whatever is commanded: float64 [D], NaN for unlocked dimensions."""
 
     values: Float64
 
 
 @dataclass(frozen=True, slots=True)
 class NodeRequest:
-    """A control word for the execution node, sent at once in addition to commands; `data` are its fields."""
+    """Control word for the execution node, sent at once in addition to commands; `data` are its fields."""
 
     word: str
     data: Mapping[str, Any] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class NodeRequest:
 
 @dataclass(frozen=True, slots=True)
 class ExecutedTick:
-    """One control tick: the smoothed action, the action after safety, and its send time (our monotonic clock)."""
+    """Record of one control tick: smoothed action, action after safety, and its send time (our monotonic clock)."""
 
     step: int
     run: int
@@ -133,11 +133,12 @@ class ExecutedTick:
 class MergeResult:
     """Result of a merge: which rows of a chunk are planned for which steps.
 
-    `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is
-    the step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
-    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for.
-    `dropped` is the reason why no row is used, "" if any is. `contributions` [N, 3] are step, chunk id and weight for
-    all steps that the chunk does not make alone; None if `Merge.uses_rtc` is false or if there are too many.
+    `arrival_step` is the first step not yet sent, `delay` = arrival_step - observation_step. `targets` int64 [H] is the
+    step that each row was planned for, -1 if it was dropped. `mistimed` is the number of steps by which rows are
+    executed later than intended (see `k_max`), negative if the chunk arrived before the step that it is for. `dropped`
+    is the reason if no row is used, else "". `contributions` [N, 3] are step, chunk id and weight for all steps to
+    which this chunk does not contribute alone; None if the merge does not support RTC (`Merge.uses_rtc`), or if there
+    are too many.
     """
 
     chunk_id: int
@@ -154,7 +155,7 @@ class MergeResult:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event, described in one sentence; programs use `kind`."""
+    """Event, described in one sentence for people; programs use `kind`."""
 
     kind: str
     text: str
@@ -173,7 +174,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class BeginEpisode:
-    """Open an episode and let the source play from its start; `run` 0 records all that control does."""
+    """Request to open an episode and to play the source from its start; `run` 0 records all that control does."""
 
     run: int
     manifest: Mapping[str, Any] | None  # None: the run is not recorded
@@ -182,7 +183,7 @@ class BeginEpisode:
 
 @dataclass(frozen=True, slots=True)
 class PolicyAnswer:
-    """A chunk as received from the policy; `source_rows` [H'] is the row that each posted row was made from.
+    """Chunk as received from the policy; `source_rows` [H'] is the row that each posted row was made from.
 
     For poses, the errors float64 [H', arms] in m and rad, and the flags uint8 [H', arms] (bits of
     kinematics.base.IkFlag), describe how well the posted rows reach them. `eef` is the origin of the poses in the
@@ -204,7 +205,7 @@ class PolicyAnswer:
 
 @dataclass(frozen=True, slots=True)
 class EndEpisode:
-    """Close the open episode."""
+    """Request to close the open episode."""
 
     status: str
     reason: str
@@ -221,7 +222,7 @@ class EndEpisode:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeOpened:
-    """The recorder is ready, or failed with `error`."""
+    """Report that the recorder is ready, or failed with `error`."""
 
     run: int
     uuid: str
@@ -236,7 +237,7 @@ class EpisodeOpened:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeClosed:
-    """An episode is on disk, as far as it was recorded."""
+    """Report that an episode is on disk, as far as it was recorded."""
 
     uuid: str
     path: str
@@ -268,7 +269,7 @@ class MediaReport:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """An observation as runtime.core.types.Observation, with the slot numbers of its pictures."""
+    """Observation with the fields of runtime.core.types.Observation, and slot numbers in place of its pictures."""
 
     sequence: int
     arrived: float
@@ -286,7 +287,7 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class BeginRun:
-    """Begin a run of the source: a recording plays from its start."""
+    """Request to begin a run of the source: a recording plays from its start."""
 
     run: int
     generation: int = 0  # of the coordinator whose run it is; its successor numbers runs anew
@@ -294,7 +295,7 @@ class BeginRun:
 
 @dataclass(frozen=True, slots=True)
 class RunBegun:
-    """The source's run has begun; its first frame was passed on before this message."""
+    """Report that the source's run has begun; its first frame was passed on before this message."""
 
     run: int
     generation: int = 0
@@ -302,7 +303,7 @@ class RunBegun:
 
 @dataclass(frozen=True, slots=True)
 class EndRun:
-    """The source's run has ended."""
+    """Request to end the source's run."""
 
 
 # --- reception -> the coordinator -------------------------------------------------------------------------------------
@@ -330,7 +331,7 @@ class ReceptionReport:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A request of a person or a program.
+    """Request of a person or a program.
 
     `boot` and `sequence` are those of the snapshot on which the decision was based; `valid_until` is in the runtime's
     own clock, extrapolated from that snapshot. `holder` and `epoch` identify the lease. `user` and `role` are the
@@ -356,7 +357,7 @@ AckStatus = Literal["accepted", "refused", "done", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """The answer to a command; `allowed` names the commands that would be accepted now."""
+    """Answer to a command; `allowed` names the commands that would be accepted now."""
 
     uuid: str
     status: AckStatus
@@ -416,7 +417,7 @@ _ON_THE_WIRE: dict[Any, tuple[type, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """Valid values of a field: of one of `classes` and, if `words` are given, one of these."""
+    """Valid values of a field: instances of `classes` that, if `words` is not empty, are among these."""
 
     classes: tuple[type, ...]
     words: tuple[str, ...] = ()
@@ -454,7 +455,7 @@ def decode(payload: bytes) -> Message:
     """Return the message in `payload`; unknown fields are ignored.
 
     Raises:
-        CodecError: names what is invalid.
+        CodecError: the message is invalid; the error names the invalid part.
     """
     content = unpack(payload)
     name = content.get("type") if isinstance(content, dict) else type(content).__name__

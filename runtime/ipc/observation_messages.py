@@ -1,4 +1,4 @@
-"""Observations from reception to media: numbers in a message, pictures in shared memory until they are used."""
+"""Observations from reception to media: the message has slot numbers, and the pictures stay in shared memory."""
 
 from __future__ import annotations
 

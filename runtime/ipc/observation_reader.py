@@ -40,7 +40,7 @@ class ObservationReader:
         self._seen: LatestObservation
 
     def read_latest(self) -> LatestObservation:
-        """Return the newest observation."""
+        """Return the newest observation; it is decoded only if it is new."""
         version = self._shared_state.observation.version
         if version != self._version:
             self._seen, self._version = self._read(), version

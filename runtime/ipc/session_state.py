@@ -1,4 +1,4 @@
-"""States of a station's session and their meaning, one row per state, for all readers of a snapshot."""
+"""States of a station's session and their meanings, one row per state, for all readers of a snapshot."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Tone = Literal["neutral", "ok", "active", "warn", "danger"]  # colours of pages
 
 @dataclass(frozen=True, slots=True)
 class StateMeaning:
-    """Meaning of a session state. Clients use it instead of names, so that unknown states are handled correctly."""
+    """Meaning of a session state; clients use it instead of names, so that they handle unknown states correctly."""
 
     label: str  # a Sentence if it is a known state
     tone: Tone
@@ -27,7 +27,7 @@ class StateMeaning:
 
     @property
     def at_work(self) -> bool:
-        """Whether the policy is in use, or may be in a moment."""
+        """Whether a set-up is in progress or a run is open, so that the policy is in use."""
         return self.preparing or self.run_open
 
     @property
@@ -37,7 +37,7 @@ class StateMeaning:
 
     @property
     def ready(self) -> bool:
-        """Whether it is set up and no run is open."""
+        """Whether the station is set up and no run is open."""
         return self.set_up and not self.run_open
 
     @property
@@ -58,7 +58,7 @@ class StateMeaning:
 
 
 class SessionState(StrEnum):
-    """State of the session; the same word everywhere."""
+    """State of the session; every process and client uses these words."""
 
     DISCONNECTED = "disconnected"
     IDLE = "idle"
@@ -106,10 +106,10 @@ _NAMES = {state: fixed(f"state.{state}", state.value) for state in SessionState}
 
 
 def complete_state_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a snapshot `said`, of a station of any version, with a complete "state_is".
+    """Return the snapshot `said` of a station of any version, with a complete "state_is".
 
-    Missing entries are derived from its "state"; invalid "sentences" are removed. An unknown state is neutral:
-    nothing is in progress, and it counts as idle only if the station itself reports that.
+    Missing entries are derived from its "state"; invalid "sentences" are removed. An unknown state is neutral: nothing
+    is in progress, and it counts as idle only if the station itself reports that.
     """
     word, told = str(said["state"]), said.get("state_is") or {}
     row = SessionState.meaning_of(word)

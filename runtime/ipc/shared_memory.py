@@ -25,7 +25,7 @@ _ALIGN = 64  # [bytes] one cache line, so that two writers never share one
 def int64_view(memory: mmap.mmap, offset: int) -> memoryview[int]:
     """Return a view of one aligned 8-byte integer, which is read and written atomically.
 
-    Not struct.pack_into: it clears the bytes before it writes them, and a reader could get the zeros.
+    struct.pack_into is not used, because it clears the bytes before it writes them, so that a reader could get zeros.
     """
     return memoryview(memory)[offset : offset + 8].cast("q")
 
@@ -48,20 +48,20 @@ def create(size: int) -> int:
 
 
 def attach(descriptor: int, size: int = 0) -> mmap.mmap:
-    """Map an inherited shared file for reading and writing: its first `size` bytes, or all if 0."""
+    """Map the first `size` bytes of an inherited shared file for reading and writing; 0: the whole file."""
     return mmap.mmap(descriptor, size or os.fstat(descriptor).st_size)
 
 
 class TornReadError(RuntimeFault):
-    """A record changed during many successive reads; its writer is far faster than expected."""
+    """Error about a record that changed during many successive reads; its writer is far faster than expected."""
 
 
 class Record:
-    """One structured record, double-buffered: a preempted writer never makes it unreadable.
+    """Structured record with one writer and any number of readers.
 
-    One process writes, any number read. The checksum is seeded with the version, so that a read is correct also with
-    weakly ordered memory, and if the reader was delayed between version and content: the bytes then belong to another
-    version, and their checksum does not match.
+    It is double-buffered, so that a preempted writer never makes it unreadable. The checksum is seeded with the
+    version. Therefore a read is correct also with weakly ordered memory, and if the reader was delayed between version
+    and content: the bytes then belong to another version, and their checksum does not match.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, dtype: np.dtype[np.void]) -> None:
@@ -82,7 +82,7 @@ class Record:
         return int(self._version[0])
 
     def write(self, value: np.void | np.ndarray[Any, np.dtype[np.void]]) -> None:
-        """Replace the record's content; readers get it completely or not at all."""
+        """Replace the record's content; readers get the new content completely or not at all."""
         version = self.version + 1
         start = self._offset + _ALIGN + (version & 1) * self._slot
         payload = value.tobytes()
@@ -95,7 +95,7 @@ class Record:
         """Return the newest content, zeros if it was never written.
 
         Raises:
-            TornReadError: it changed during each of 100 attempts.
+            TornReadError: the record changed during each of 100 attempts.
         """
         for _ in range(100):
             version = self.version
@@ -119,10 +119,10 @@ def _single_record(records: np.ndarray[Any, np.dtype[np.void]]) -> np.void:
 
 
 class Ring:
-    """Queue of byte messages with one writer and one reader; a full ring refuses and never overwrites.
+    """Queue of byte messages with one writer and one reader; a full ring refuses messages and never overwrites.
 
-    A message becomes visible when the head moves, so a writer killed in the middle leaves no trace. A restarted
-    writer or reader continues at the positions in the memory.
+    A message becomes visible when the head moves, so a writer killed in the middle leaves no trace. A restarted writer
+    or reader continues at the positions in the memory.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, capacity: int) -> None:

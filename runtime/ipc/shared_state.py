@@ -54,7 +54,7 @@ PROCESSES = ("control", "coordinator", "reception", "media", "guard")
 
 
 class RecorderStage(IntEnum):
-    """Current work of the recorder, to explain a missing heartbeat."""
+    """Current work of the recorder, which may explain a missing heartbeat."""
 
     WAITING = 0
     OPENING = 1
@@ -70,7 +70,10 @@ _STAGES = {
 
 
 class EStop(IntEnum):
-    """State of the e-stop, from the guard: UNKNOWN until it has read its latch, and nothing is sent unless CLEAR."""
+    """State of the e-stop, as set by the guard.
+
+    It is UNKNOWN until the guard has read its latch. Commands are sent only if it is CLEAR.
+    """
 
     UNKNOWN = 0
     CLEAR = 1
@@ -104,7 +107,7 @@ def _observation_dtype(d: int, e: int, c: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True)
 class SharedStateLayout:
-    """Sizes that determine the shared state; the same in all station processes."""
+    """Sizes that determine the form of the shared state; they are the same in all station processes."""
 
     dim: int
     eef_dim: int
@@ -216,12 +219,13 @@ class SharedState:
     def attach(cls, layout: SharedStateLayout, descriptor: int, pictures: bool = True) -> SharedState:
         """Attach to the shared state behind an inherited descriptor.
 
-        `pictures` False maps everything but the picture slots, for a process that locks its memory (control).
+        If `pictures` is False, everything but the picture slots is mapped, for a process that locks its memory
+        (control).
         """
         return cls(layout, memory.attach(descriptor, 0 if pictures else cls._size_of_numbers(layout)))
 
     def hang(self, bells: Sequence[Bell]) -> None:
-        """Install the bells of sleeping processes, in the order of WOKEN."""
+        """Install the bells that wake sleeping processes, in the order of WOKEN."""
         self.bells = dict(zip(WOKEN, bells, strict=True))
         for process, rings in WOKEN.items():
             for ring in rings:
@@ -244,7 +248,7 @@ class SharedState:
         return now - self.last_beat(process) <= within
 
     def describe_silence(self, process: str, now: float) -> str:
-        """Return for how long `process` has had no heartbeat at `now`, as the end of a sentence."""
+        """Return how long `process` has had no heartbeat at `now`, as the end of a sentence."""
         beat = self.last_beat(process)
         if not beat:
             return _SINCE_RESTART
@@ -255,7 +259,7 @@ class SharedState:
 
     @contextmanager
     def recorder_stage(self, stage: RecorderStage) -> Iterator[None]:
-        """Publish the recorder's current work during the context; for media only."""
+        """Publish `stage` as the recorder's current work while the context is open; for media only."""
         before = self._stage[0]
         self._stage[0] = stage
         try:
@@ -289,7 +293,7 @@ class SharedState:
         return bool(self._unrecorded[0])
 
     def set_unrecorded(self, unrecorded: bool) -> None:
-        """Set `unrecorded`; for media only."""
+        """Set whether media needs no tick records; for media only."""
         self._unrecorded[0] = unrecorded
 
     @property
@@ -307,7 +311,7 @@ class SharedState:
 
     @property
     def joint_problem(self) -> str:
-        """Reason why no motion may begin, according to control's status of the joints; "" if it may."""
+        """Reason why no motion may begin, from control's status of the joints; "" if it may."""
         status = self.control.read()
         doubt = bytes(status["doubt"]).decode(errors="ignore")
         return doubt or ("" if status["believed"] else _JOINTS_NOT_SEEN)
@@ -382,7 +386,7 @@ class SharedState:
 
 
 class PictureSlots:
-    """The newest pictures of one camera; a reader detects that its slot was overwritten during a read."""
+    """Slots with the newest pictures of one camera; a reader detects if its slot is overwritten during a read."""
 
     _SHAPE = struct.Struct("@iii")  # height, width, channels
 
@@ -408,7 +412,7 @@ class PictureSlots:
         """Store `picture` as number `number` (counted from 1).
 
         Raises:
-            ValueError: it is too large for a slot.
+            ValueError: the picture is too large for a slot.
         """
         if picture.nbytes > self._bytes:
             raise ValueError(f"picture of {picture.nbytes} bytes {picture.shape}; at most {self._bytes} fit")

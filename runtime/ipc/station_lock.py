@@ -9,7 +9,7 @@ from typing import IO
 
 
 class StationLockedError(Exception):
-    """Another process has locked the folder; `by` is its description in the lock file."""
+    """Error that another process has locked the folder; `by` is its description in the lock file."""
 
     def __init__(self, by: str) -> None:
         self.by = by
@@ -17,12 +17,12 @@ class StationLockedError(Exception):
 
 
 def acquire(station_dir: Path, what: str = "") -> IO[str]:
-    """Lock the folder; the lock lasts as long as the returned file is open.
+    """Lock the station's folder and return the lock file; the lock lasts until the file is closed.
 
-    `what` is written after the process number.
+    The process number is written to the file, followed by `what`.
 
     Raises:
-        Taken: another process has the lock.
+        StationLockedError: another process has the lock.
         OSError: the lock file cannot be opened.
     """
     station_dir.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""`python -m runtime.link STATION`: links a station of this computer to the lab at which it is enrolled.
+"""`python -m runtime.link STATION`: links a station of this computer to the lab in which it is enrolled.
 
-The processes of an enrolled station start it by themselves; for a lockstep station it is started by hand.
+An enrolled station starts this program by itself; for a lockstep station it is started by hand.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
-    """Run the link until `ended`; restart it after a new enrolment. Raises: RuntimeFault without usable keys."""
+    """Run the link until `ended`; restart it after a new enrolment. Return the exit code, 1 if a thread failed.
+
+    Raises: RuntimeFault without usable keys.
+    """
     while not ended():
         written = _written(data, station_dir)
         lab, key = known_lab(station_dir), station_key(data)
@@ -75,7 +78,7 @@ def _linked(data: Path, station_dir: Path, ended: Callable[[], bool]) -> int:
 
 
 def _uploads() -> UploadSettings | None:
-    """Read the upload settings; None if they are invalid: then no episodes are sent, while stops and commands work."""
+    """Return the upload settings; None if they are invalid, which only stops the sending of episodes."""
     try:
         return UploadSettings.read(os.environ)
     except ConfigurationError as error:
@@ -84,7 +87,7 @@ def _uploads() -> UploadSettings | None:
 
 
 def _written(data: Path, station_dir: Path) -> list[tuple[int, int]]:
-    """Return the identity of the key files, which changes when they are replaced."""
+    """Return the identity of the key files, which changes when the files are replaced."""
     found = [path.stat() for path in (known_lab_path(station_dir), key_path(data)) if path.exists()]
     return [(one.st_ino, one.st_mtime_ns) for one in found]
 

@@ -1,4 +1,4 @@
-"""Admission of connections to a lab: the keys of its stations, and any key while a code for enrolment is open.
+"""Admission of connections to a lab: the keys of its stations, and any key while a code for enrolment is valid.
 
 ZMQ asks during the handshake (ZAP, RFC 27), so that no message of a refused key is ever received.
 """
@@ -29,7 +29,7 @@ _AT_ONCE, _PER_S = 100.0, 10.0
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """Keys of stations, hexadecimal, with the station names of each; whether unknown keys may enrol."""
+    """Admitted keys in hexadecimal, each with its station names; `enrolling`: unknown keys may connect to enrol."""
 
     stations: Mapping[str, frozenset[str]] = field(default_factory=lambda: MappingProxyType({}))
     enrolling: bool = False
@@ -48,7 +48,7 @@ class Allowed:
 
 
 class AllowList:
-    """Present admissions, replaced as a whole and read from any thread, and temporary refusals."""
+    """Present admissions, which are replaced as a whole and read from any thread, and temporary refusals."""
 
     def __init__(self, allowed: Allowed | None = None) -> None:
         self.now = allowed or Allowed()
@@ -58,12 +58,16 @@ class AllowList:
         self._lock = threading.Lock()
 
     def refuse(self, name: str, now: float) -> None:
-        """Refuse a key, or unknown keys from an address, for `_REFUSED_S`."""
+        """Refuse `name` for `_REFUSED_S`: a station's key, or an address from which unknown keys connect."""
         with self._lock:
             _note(self._refused, name, now + _REFUSED_S)
 
     def refused(self, key: str, address: str, now: float) -> bool:
-        """Record a handshake; return True if its key or address is refused or makes too many."""
+        """Record a handshake; return True if it must be refused.
+
+        The key of a station, or the address of an unknown key, is then temporarily refused or makes too many
+        handshakes.
+        """
         name = key if key in self.now.stations else address
         with self._lock:
             spent, at = self._spent.get(name, (0.0, now))
@@ -80,7 +84,7 @@ def _note(noted: dict[str, Any], name: str, value: Any) -> None:
 
 
 class Seldom:
-    """Log limiter: one line per name in ten seconds, of a bounded number of names, so that no flood fills the log."""
+    """Log limiter: one line per name in ten seconds, and a bounded number of names, so that no flood fills the log."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

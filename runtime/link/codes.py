@@ -33,12 +33,12 @@ class Code:
 
 
 def fresh(lab: bytes) -> Code:
-    """Return a new code of the lab with that public key."""
+    """Return a new code of the lab whose gate has the public key `lab`."""
     return Code(lab, secrets.token_bytes(SECRET_BYTES))
 
 
 def read(shown: str) -> Code:
-    """Parse a copied code. Raises: ConfigurationError if it is incomplete or mistyped."""
+    """Parse a copied code. Raises: ConfigurationError if the code is incomplete or mistyped."""
     letters = "".join(shown.split()).replace("-", "").upper()
     try:
         whole = base64.b32decode(letters)

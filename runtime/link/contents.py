@@ -79,7 +79,7 @@ def unpacked(sent: bytes) -> Contents:
 
 
 def is_episode(uuid: str) -> bool:
-    """Return True if it is a uuid as recorders write it, which makes it safe as a folder name."""
+    """Return True if `uuid` has the form that recorders write, which makes it safe as a folder name."""
     try:
         return str(UUID(uuid)) == uuid
     except ValueError:
@@ -87,7 +87,7 @@ def is_episode(uuid: str) -> bool:
 
 
 def contents_of(folder: Path) -> Contents:
-    """Return the list of a folder, reading every byte. Raises: RecordingError."""
+    """Return the list of a folder's files; every byte is read. Raises: RecordingError."""
     reading = contents_in_steps(folder)
     while True:
         try:
@@ -98,7 +98,7 @@ def contents_of(folder: Path) -> Contents:
 
 
 def contents_in_steps(folder: Path) -> Generator[None, None, Contents]:
-    """Do as `contents_of`, as a generator that pauses after every few megabytes."""
+    """Do the same as `contents_of`, as a generator that pauses after every few megabytes."""
     files = []
     try:
         for path in sorted(folder.iterdir(), key=lambda path: path.name):
@@ -132,7 +132,7 @@ def _file(row: Any) -> File:
 
 
 def _may_name(name: Any) -> bool:
-    """Return True if it names a visible file directly in the episode's folder."""
+    """Return True if an episode may have a file `name`: visible, and directly in its folder."""
     if not isinstance(name, str) or not name or name.startswith(".") or "/" in name or "\0" in name:
         return False
     try:

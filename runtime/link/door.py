@@ -1,8 +1,8 @@
-"""Listening port of a lab: its connections, their messages, and how they are cut off.
+"""Listening port of a lab: its connections, their messages, and the cutting off of connections.
 
 Everything that a connection can use up is bounded here: messages per turn, bytes per second, the time until it
-identifies itself, and the number of connections. A connection that exceeds a bound is cut off and its key refused for
-a while; other connections are not affected.
+identifies itself, and the number of connections. A connection that exceeds a bound is cut off and its key refused for a
+while; other connections are not affected.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Address = tuple[Any, ...]
 
 @dataclass(slots=True)
 class Peer:
-    """Connection: its descriptor in this process, the other end's address, and its counters."""
+    """Remote end of a connection: descriptor in this process, remote address, and counters."""
 
     descriptor: int
     address: Address
@@ -82,7 +82,7 @@ class _PeerIndex:
 
 
 class Door:
-    """Listening port. One thread uses it and calls `arrivals` and `look` regularly.
+    """Listening port. One thread uses it and calls `arrivals` and `poll` regularly.
 
     `rate`: Bytes per second that one connection may send, measured over about one second.
     """
@@ -145,7 +145,10 @@ class Door:
         return found
 
     def _message(self) -> list[zmq.Frame]:
-        """Return the frames of the next complete message, [] if none; of too many parts only one more is kept."""
+        """Return the frames of the next complete message, [] if there is none.
+
+        If a message has too many parts, only one part beyond the limit is kept.
+        """
         with suppress(zmq.Again):
             while self._room:
                 self._room -= 1
@@ -176,7 +179,10 @@ class Door:
         return str(peer.address[0]) if peer is not None else ""
 
     def cut(self, route: bytes, why: str, again_s: float = 30.0) -> None:
-        """Send the reason and close the connection a moment later; further messages of it are ignored."""
+        """Send the reason `why` and close the connection a moment later; its further messages are ignored.
+
+        The station may connect again after `again_s` [s].
+        """
         peer = self._known.by_route.pop(route, None)
         if peer is None:
             return
@@ -187,7 +193,7 @@ class Door:
             log.warning("%s is cut off: %s", peer, why)
 
     def poll(self) -> None:
-        """Cut off connections that flood, are silent or exceed the number allowed. Call regularly."""
+        """Cut off connections that flood, are silent, or are too many. Call regularly."""
         now = self._clock()
         for peer in [one for one in self._known.by_descriptor.values() if now >= one.cut_at]:
             self._shut(peer)
@@ -213,9 +219,9 @@ class Door:
                 self._end(peer, "it says nothing")
 
     def _watch(self) -> None:
-        """Cut off connections with an endless message, and surplus unidentified connections.
+        """Cut off connections that send a message without an end, and surplus unidentified connections.
 
-        Runs every `_WATCH_S`, because thousands of connections can arrive within a moment.
+        It runs every `_WATCH_S`, because thousands of connections can arrive within a moment.
         """
         unnamed = [peer for peer in self._known.by_descriptor.values() if not peer.route]
         for peer in unnamed[: max(0, len(self._known.by_descriptor) - _MOST_CONNECTIONS)]:
@@ -269,7 +275,10 @@ class Door:
         return Arrival(route, peer.key, message, parts)
 
     def _named(self, route: bytes, frame: zmq.Frame) -> Peer | None:
-        """Return the peer whose first message this is; None if the connection has ended or was cut off."""
+        """Return the peer whose first message on connection `route` this is.
+
+        None if the connection has ended or was cut off.
+        """
         try:
             descriptor, key = int(frame.get(zmq.SRCFD)), str(frame["User-Id"])
         except (zmq.ZMQError, KeyError, TypeError, ValueError):
@@ -289,15 +298,15 @@ class Door:
         return peer
 
     def _is_there(self, route: bytes) -> bool:
-        """Whether the connection still exists.
+        """Return True if the connection still exists.
 
-        A message may be read only after its connection has ended and its descriptor has gone to another connection.
+        A message may be read only after its connection has ended and its descriptor was given to another connection.
         """
         self.socket.get(zmq.EVENTS)  # makes ZMQ process ended connections
         return self.send(route, Beat())
 
     def _flood(self, peer: Peer, why: str) -> None:
-        """Cut the connection off and refuse its key, or its address if it is not a station's, for a while."""
+        """Cut the connection off, and refuse its key for a while; if the key is not a station's, refuse the address."""
         if peer.route in self._known.by_route:
             known = peer.key in self._allowed.now.stations
             self._allowed.refuse(peer.key if known else str(peer.address[0]), self._clock())
@@ -312,7 +321,10 @@ class Door:
                 log.warning("%s is cut off: %s", peer, why)
 
     def _shut(self, peer: Peer) -> None:
-        """Break the TCP connection, so that ZMQ notices; never a newer connection with the same descriptor."""
+        """Break the peer's TCP connection, so that ZMQ notices.
+
+        A newer connection with the same descriptor is never broken.
+        """
         self._known.by_descriptor.pop(peer.descriptor, None)
         with suppress(OSError), _same(peer.descriptor) as connection:
             if connection.getpeername() == peer.address:
@@ -345,7 +357,7 @@ def _received(peer: Peer) -> int:
 
 
 def _break(connection: sockets.socket) -> None:
-    """Reset the connection; a shutdown would leave the queued and still arriving bytes of a flood to be read.
+    """Reset the connection; after a shutdown the queued and still arriving bytes of a flood would have to be read.
 
     A reset is a connect to no address, which Python does not offer (connect(2), AF_UNSPEC).
     """
@@ -355,7 +367,10 @@ def _break(connection: sockets.socket) -> None:
 
 
 def _same(descriptor: int) -> sockets.socket:
-    """Return a socket over a duplicate of the descriptor. Raises: OSError if it is not a socket."""
+    """Return a new socket object for the same connection, over a duplicate of the descriptor.
+
+    Raises: OSError if the descriptor is not a socket.
+    """
     copy = os.dup(descriptor)
     try:
         return sockets.socket(fileno=copy)

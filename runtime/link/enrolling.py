@@ -1,4 +1,4 @@
-"""Enrolment at the lab's end: a thread asks the database, and the number of tries per minute is limited.
+"""Enrolment at the lab's end: a thread asks the database, and the number of attempts per minute is limited.
 
 The limit counts per address, so that guessing does not keep computers elsewhere from enrolling.
 """
@@ -23,7 +23,7 @@ Enroller = Callable[[str, str, str], Enrolled | str]
 
 
 class Enrolling:
-    """Tries to enrol and their results. One thread calls `ask` and `answers`; neither blocks."""
+    """Attempts to enrol and their results. One thread calls `request` and `answers`; neither blocks."""
 
     def __init__(self, enrol: Enroller, clock: Callable[[], float] = time.monotonic) -> None:
         self._enrol, self._clock = enrol, clock
@@ -34,7 +34,7 @@ class Enrolling:
         threading.Thread(target=self._work, name="enrolment", daemon=True).start()
 
     def request(self, route: bytes, address: str, key: str, enrol: Enrol) -> str:
-        """Queue a try; return why it is refused, "" if it is queued."""
+        """Queue an attempt; return the reason if it is refused, "" if it is queued."""
         now = self._clock()
         self._tries = [one for one in self._tries if now - one[0] < _WITHIN_S]
         if len(self._tries) >= _ALL or sum(one[1] == address for one in self._tries) >= _EACH:

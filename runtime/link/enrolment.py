@@ -38,12 +38,12 @@ def address_of(given: str) -> tuple[str, int]:
 
 
 def enrol(data: Path, address: str, code: Code, key: KeyPair, timeout: float = 10.0) -> KnownLab:
-    """Enrol this computer with the lab at `address` and write the station's record of it.
+    """Enrol this computer with the lab at `address` and write the station's record of the lab.
 
-    Tries again for `_HEARD_S` if the lab does not know the code yet.
+    If the lab does not know the code yet, the attempt is repeated for `_HEARD_S`.
 
     Args:
-        timeout: Longest wait for an answer [s], per try.
+        timeout: Longest wait for an answer [s], per attempt.
 
     Raises:
         ConfigurationError: The lab refuses, or the address or the name that it assigns is invalid.

@@ -1,7 +1,7 @@
-"""Lab's end of the link: makes linked stations look like local ones to the programs of this computer.
+"""Lab's end of the link, which makes linked stations appear as local ones to the programs of this computer.
 
-One thread relays stops and commands: first the stops of all stations, then a few messages of each. It never waits for
-a database or a station.
+One thread relays stops and commands: first the stops of all stations, then a few messages of each. It never waits for a
+database or a station.
 """
 
 from __future__ import annotations
@@ -62,7 +62,10 @@ _NOT_RUNNING = "its computer is linked, and the station does not run there: star
 
 
 class Gate:
-    """First port of a lab. One thread uses it and calls `turn`; only `linked` is for any thread."""
+    """Lab's end of the link, with its first port.
+
+    One thread uses it and calls `turn`; only `linked` may be called from any thread.
+    """
 
     def __init__(
         self,
@@ -108,7 +111,10 @@ class Gate:
         self._streams.start()
 
     def turn(self, wait_ms: int = _POLL_MS) -> None:
-        """Wait for messages and pass them on, stops first. Raises: TransportError if the streams' thread has failed."""
+        """Wait for messages and pass them on, stops first.
+
+        Raises: TransportError if the streams' thread has failed.
+        """
         self._wait(wait_ms)
         if self._streams.failed:
             raise TransportError("streams of stations elsewhere have ended: see the log above")
@@ -140,7 +146,7 @@ class Gate:
         self._streams.context.destroy(linger=0)
 
     def linked(self) -> set[str]:
-        """Return the stations that can be commanded now; from any thread."""
+        """Return the stations that can be commanded now; any thread may call it."""
         return {remote.name for remote in list(self._remotes.values()) if remote.up}
 
     def _wait(self, wait_ms: int) -> None:
@@ -159,7 +165,7 @@ class Gate:
     # --- from the lab's programs --------------------------------------------------------------------------------
 
     def _press(self, remote: Remote) -> None:
-        """Pass on all messages of the e-stop socket; hold presses for which there is no connection."""
+        """Pass on all messages of the e-stop socket; hold presses while there is no connection to the station."""
         if (mirror := remote.mirror) is None:
             return
         presses, others = mirror.estop_turns.take_turn()
@@ -181,7 +187,7 @@ class Gate:
             self._pass_command(remote, asked, (COORDINATOR, "commands"), server)
 
     def _pass_press(self, remote: Remote, held: PendingPress) -> bool:
-        """Send a press over a live connection, that for stops first; return False if there is none."""
+        """Send a press over a live connection, preferably that for stops; return False if there is none."""
         now = self._clock()
         line = remote.line(STOPS, now) or remote.line(COMMANDS, now)
         if line is None or remote.mirror is None:
@@ -221,7 +227,7 @@ class Gate:
         """Send a command, with a token if its user is verified.
 
         Args:
-            said: Payload, and whether the web has signed it.
+            said: Payload, and whether its user is verified because the web has signed it.
 
         Returns:
             Number of the request; 0 if it could not be sent.
@@ -237,7 +243,7 @@ class Gate:
     # --- from stations -----------------------------------------------------------------------------------------
 
     def _handle_safely(self, arrival: Arrival) -> str:
-        """Call `_hear`; after an unforeseen error cut off the sender, so that no other station is affected."""
+        """Call `_handle`; after an unforeseen error cut off the sender, so that no other station is affected."""
         try:
             return self._handle(arrival)
         except Exception:
@@ -347,7 +353,7 @@ class Gate:
                     remote.mirror.moved_streams(streams)
 
     def _find_remote(self, name: str) -> Remote | None:
-        """Return the record of an enrolled station, created if needed; None if it is not enrolled."""
+        """Return the record of a station, created if needed; None if the station is not enrolled."""
         if name not in self._remotes and name in self._allowed.now.names():
             self._remotes[name] = Remote(name)
         return self._remotes.get(name)
@@ -408,7 +414,7 @@ class Gate:
             remote.held = [held for held in remote.held if not self._pass_press(remote, held)]
 
     def _hold(self, remote: Remote) -> None:
-        """Drop pending commands whose answers were lost with the link.
+        """Drop pending commands, whose answers were lost with the link.
 
         Presses among them are held instead, and are sent again if the link returns in time.
         """
@@ -419,19 +425,19 @@ class Gate:
         remote.pending.clear()
 
     def _hold_press(self, remote: Remote, press: PendingPress) -> None:
-        """Hold a press until the link returns; if too many are held, the oldest is dropped and its sender answered."""
+        """Hold a press until the link returns; if too many are held, drop the oldest and answer its sender."""
         remote.held.append(press)
         if len(remote.held) > _MOST_HELD:
             self._give_up(remote, remote.held.pop(0))
 
     def _lower(self, remote: Remote, why: str) -> None:
-        """Publish why the station cannot be commanded."""
+        """Publish the reason why the station cannot be commanded."""
         if remote.told != why and remote.mirror is not None:
             remote.mirror.lower(why)
             self._log_once(remote, why)
 
     def _hold_on(self, remote: Remote, now: float) -> None:
-        """Answer senders of held presses when the link stays lost; drop presses older than `_HELD_S`."""
+        """Answer the senders of held presses if the link stays lost, and drop presses older than `_HELD_S`."""
         for held in list(remote.held):
             known = now - remote.lost_at > _HOPE_S  # lost before the press
             if known or now - held.at > _HOPE_S:
@@ -440,13 +446,13 @@ class Gate:
                 remote.held.remove(held)
 
     def _give_up(self, remote: Remote, held: PendingPress) -> None:
-        """Answer the sender of a held press, unless it has an answer already."""
+        """Answer the sender of a held press, unless the sender has an answer already."""
         told, held.told = held.told, True
         if not told and remote.mirror is not None:
             remote.mirror.estops.answer(held.call, _not_sent(remote, held.command, held.sent))
 
     def _lose(self, routes: list[bytes]) -> None:
-        """Remove connections that have ended."""
+        """Remove the connections `routes`, which have ended."""
         for route in routes:
             known = self._by_route.pop(route, None)
             remote = self._remotes.get(known[0]) if known is not None else None
@@ -517,7 +523,7 @@ def _not_sent(remote: Remote, command: Command, sent: bool = False) -> Ack:
 
 
 def _failed(remote: Remote, command: Command, reason: str, sent: bool = False) -> Ack:
-    """Return the answer in the station's place; that of a failed press demands the hardware stop.
+    """Return the answer that the lab gives for the station; the answer to a failed press demands the hardware stop.
 
     A command that was sent is never "refused", because it may have been carried out.
     """

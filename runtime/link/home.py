@@ -1,4 +1,4 @@
-"""Episodes of one station on its own computer: not yet sent, verified by the lab, and removable.
+"""Episodes of one station on its own computer: not yet sent, verified by the lab, or removable.
 
 DATA/uploads/STATION/UUID.json     receipt: digest that the lab has verified, when, and the digest of its labels
 DATA/episodes/.leaving/UUID/       episode that is being removed
@@ -30,7 +30,7 @@ _DAY_S = 86400.0
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """The lab's confirmation of an episode; `verified` is the Unix time [s]. Digests: SHA-256, hexadecimal."""
+    """Confirmation of an episode by the lab; `verified` is the Unix time [s], digests are SHA-256 in hexadecimal."""
 
     episode: str
     lab: str  # public key of the lab, hexadecimal
@@ -42,7 +42,7 @@ class Receipt:
 
 
 class Home:
-    """One station's episodes on the disk of its computer. One thread uses it.
+    """Episodes of one station on the disk of its computer. One thread uses it.
 
     `keep_days`: Days that an episode stays here after the lab has verified it; None: forever.
     """
@@ -77,14 +77,17 @@ class Home:
         return self._root / episode
 
     def next(self) -> str:
-        """Return the newest closed episode that the lab lacks and may be offered, else a removable one; "" if none."""
+        """Return the newest closed episode that the lab lacks and that may be offered now.
+
+        If there is none, return an episode that can be removed; "" if there is none either.
+        """
         self._poll()
         now = self._clock()
         found = [uuid for uuid in self._closed if now >= self._put_off.get(uuid, now)]
         return max(found, key=self._closed.__getitem__) if found else self._removable(now)
 
     def next_labels(self) -> tuple[str, bytes] | None:
-        """Return uuid and lines of an episode at the lab whose labels have changed; None if there is none."""
+        """Return uuid and label lines of an episode that the lab has with older labels; None if there is none."""
         folder, now = self._data / LABELS, self._clock()
         try:
             files = list(os.scandir(folder))
@@ -106,7 +109,8 @@ class Home:
     def arrived(self, episode: str, contents: Contents) -> None:
         """Record that the lab has verified the episode. Raises: RecordingError.
 
-        Writes a receipt; removes the episode instead if it was offered again because its retention time is over.
+        A receipt is written. If the episode was offered again because its retention time is over, it is removed
+        instead.
         """
         known = self._receipts.get(episode)
         if known is not None and known.digest == contents.digest and self._over(known):
@@ -117,11 +121,11 @@ class Home:
         self._closed.pop(episode, None)
 
     def labels_arrived(self, episode: str, lines: bytes) -> None:
-        """Record that the lab has these labels."""
+        """Record that the lab has the label lines `lines` of the episode."""
         self._store_receipt(replace(self._receipts[episode], labels=hashlib.sha256(lines).hexdigest()))
 
     def put_off(self, what: str, seconds: float) -> None:
-        """Do not offer an episode, or labels named "labels UUID", for so many `seconds`."""
+        """Do not offer `what` for `seconds` [s]: an episode, or labels under the name "labels UUID"."""
         self._put_off[what] = self._clock() + seconds
 
     # --- scan ---------------------------------------------------------------------------------------------------
@@ -142,7 +146,10 @@ class Home:
         self._look_at = self._clock() + max(_LOOK_S, _LOOK_SHARE * (self._clock() - now))
 
     def _sort_in(self, name: str) -> None:
-        """Classify a new folder. The recorder writes the outcome last: an episode without it is not closed."""
+        """Decide whether a new folder is an episode to send.
+
+        The recorder writes the outcome last: an episode without it is not closed.
+        """
         try:
             closed = (self._root / name / OUTCOME).stat().st_mtime
         except OSError:
@@ -160,7 +167,7 @@ class Home:
     # --- receipts ------------------------------------------------------------------------------------------------
 
     def _read(self) -> list[Receipt]:
-        """Read the receipts of this lab. Those of another lab do not count: this one lacks the episodes."""
+        """Return the receipts of this lab; a receipt of another lab does not mean that this one has the episode."""
         found = []
         for path in (self._data / UPLOADS / self._station).glob("*.json"):
             try:
@@ -184,7 +191,7 @@ class Home:
     # --- retention -----------------------------------------------------------------------------------------------
 
     def _over(self, receipt: Receipt) -> bool:
-        """Return True if the retention time of an episode that is still here is over."""
+        """Return True if the episode of this receipt is still here, and its retention time is over."""
         if self._keep_days is None or receipt.removed is not None:
             return False
         return self._wall() - receipt.verified >= self._keep_days * _DAY_S
@@ -192,7 +199,7 @@ class Home:
     def _removable(self, now: float) -> str:
         """Return an episode whose retention time is over, "" if there is none.
 
-        It is offered once more before its removal, so that the lab verifies the copy that it has now.
+        It is offered once more before its removal, so that the lab verifies its present copy.
         """
         if self._keep_days is None:
             return ""

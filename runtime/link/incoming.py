@@ -69,7 +69,10 @@ def progress_of(data: Path, station: str, uuid: str) -> Progress | None:
 
 
 def arrivals(data: Path) -> list[tuple[str, Path]]:
-    """Return uuid and mark of episodes that have arrived, or whose labels have; remove the mark after ingesting."""
+    """Return uuid and mark of each episode that has arrived, or whose labels have arrived.
+
+    The caller removes the mark, a file, after writing the episode's rows to the database.
+    """
     folder = data / ARRIVALS
     try:
         return [(path.name, path) for path in sorted(folder.iterdir()) if is_episode(path.name)]
@@ -78,7 +81,7 @@ def arrivals(data: Path) -> list[tuple[str, Path]]:
 
 
 class Incoming:
-    """Receiver of the episodes of all stations. One thread calls `hear` and `left`.
+    """Receiver of the episodes of all stations. One thread calls `handle` and `left`.
 
     The event descriptor `wake` becomes readable when `answers` has messages to send.
     """
@@ -96,7 +99,7 @@ class Incoming:
         self._desks[station].put(route, message, part)
 
     def left(self, station: str, route: bytes) -> None:
-        """Record that a connection has ended: the pieces requested over it do not arrive any more."""
+        """Record that a connection has ended: the pieces requested over it will not arrive."""
         if station in self._desks:
             self._desks[station].put(route, None, b"")
 
@@ -163,7 +166,7 @@ class _Desk:
 
 @dataclass(slots=True)
 class _Begun:
-    """Episode that is being received: its current file, and the pieces requested of it."""
+    """Episode that is being received, with its current file and the requested pieces."""
 
     episode: str
     contents: Contents
@@ -189,7 +192,7 @@ class _Begun:
 
 
 class _Unwanted(Exception):
-    """The episode is declined; `again_s`: pause before the station may offer it again [s]."""
+    """Error that the lab declines the episode; `again_s`: pause before the station may offer it again [s]."""
 
     def __init__(self, why: str, again_s: float) -> None:
         super().__init__(why)
@@ -226,7 +229,7 @@ class Shelf:
             yield self._declined(episode, str(disk_error("writing", self._root, error)), _SOON_S)
 
     def drop(self) -> None:
-        """Stop receiving the current episode; its files stay, to be continued later."""
+        """Stop receiving the current episode; its files stay, so that it can be continued later."""
         if self._begun is not None:
             self._begun.close()
         self._begun = None
@@ -289,7 +292,10 @@ class Shelf:
         yield self._finish(begun)
 
     def _compare(self, begun: _Begun, file: File) -> None:
-        """Verify a file by reading it back from the disk; a wrong one is sent again, `_MOST_TRIES` times in all."""
+        """Verify a file by reading it back from the disk; a file with another digest is requested again.
+
+        It is requested `_MOST_TRIES` times in all.
+        """
         os.fsync(begun.descriptor)
         begun.close()
         if _sha256(begun.path) == file.sha256:
@@ -320,7 +326,10 @@ class Shelf:
         return self._arrived(begun.episode, begun.contents)
 
     def _answer_existing(self, episode: str, contents: Contents) -> Message:
-        """Answer for an episode that the lab has already; one with other content is declined and not overwritten."""
+        """Return the answer for an episode that the lab has already.
+
+        An offer with other content is declined; nothing is overwritten.
+        """
         here = contents_of(self._episodes / episode)
         if here != contents:
             other = [file.name for file in contents.files if file not in here.files]
@@ -348,7 +357,7 @@ class Shelf:
             raise _Unwanted(f"episode {episode} is of another station of this lab", _NEVER_S)
 
     def _require_named(self, begun: _Begun) -> None:
-        """Check that the manifest names this episode and station; delete the files otherwise."""
+        """Check that the manifest names this episode and station; otherwise delete the files and decline."""
         try:
             manifest = read_json(begun.folder / MANIFEST)
         except RecordingError as error:
@@ -392,7 +401,7 @@ class Shelf:
         return folder
 
     def _forget(self, episode: str) -> None:
-        """Delete the partial files of an episode, its list and its refusal."""
+        """Delete the partial files of an episode, its list, and the record that it was declined."""
         shutil.rmtree(self._root / episode, ignore_errors=True)
         for kind in ("json", "declined"):
             _temporary_path(self._root, episode, kind).unlink(missing_ok=True)
@@ -408,7 +417,7 @@ class Shelf:
         return Declined(episode, why[:500], again_s)
 
     def _request_reconcile(self, episode: str) -> None:
-        """Mark the episode for the worker that writes its rows."""
+        """Create the mark by which a worker writes the episode's rows to the database."""
         folder = self._data / ARRIVALS
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(folder / episode, self.station.encode())
@@ -416,7 +425,7 @@ class Shelf:
     # --- labels --------------------------------------------------------------------------------------------------
 
     def _labelled(self, episode: str, lines: bytes) -> Message:
-        """Store label lines if they extend those that are here; otherwise decline them and change nothing."""
+        """Store label lines if they extend the lab's lines; otherwise decline them and change nothing."""
         if not is_episode(episode) or len(lines) > LARGEST_LABELS:
             raise _Unwanted(
                 f"{len(lines)} bytes of labels; allowed: {LARGEST_LABELS}, of an episode", _NEVER_S
@@ -447,7 +456,7 @@ def _sha256(path: Path) -> str:
 
 
 def _opened(path: Path, size: int) -> tuple[int, int]:
-    """Open a file for writing; return descriptor and present size. A file longer than `size` starts anew."""
+    """Open a file for writing; return descriptor and present size. A file longer than `size` is emptied first."""
     if path.is_symlink() or _size(path) > size:
         path.unlink()
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)

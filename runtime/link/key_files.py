@@ -45,7 +45,7 @@ class KeyPair:
 
 @dataclass(frozen=True, slots=True)
 class KnownLab:
-    """A station's record of its lab: its address, and the public keys that authenticate it."""
+    """Record that a station has of its lab: the lab's address, and the public keys that authenticate it."""
 
     station: str
     lab: str  # name that people use
@@ -81,7 +81,10 @@ def station_key(data: Path) -> KeyPair:
 
 
 def make_station_key(data: Path, replace: bool = False) -> KeyPair:
-    """Create a key pair for this computer. Raises: ConfigurationError if it has one and not `replace`."""
+    """Create a key pair for this computer.
+
+    Raises: ConfigurationError if it has one already, unless `replace` is set.
+    """
     path = key_path(data)
     if path.exists() and not replace:
         raise ConfigurationError(
@@ -106,7 +109,7 @@ def tokens_key(data: Path) -> bytes:
 
 
 def known_lab_path(station_dir: Path) -> Path:
-    """Return the path of the file that an enrolled station has."""
+    """Return the path of an enrolled station's record of its lab."""
     return station_dir / "lab.json"
 
 
@@ -166,7 +169,7 @@ def _read(path: Path) -> bytes:
 
 
 def _load_or_create(path: Path, secret: bytes) -> bytes:
-    """Return the key in the file, which becomes `secret` if there was none.
+    """Return the key in the file; if there is no file, create it with `secret`.
 
     The complete draft is linked into place: a concurrent reader never reads part of a key, and the first writer wins.
     """

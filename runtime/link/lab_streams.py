@@ -1,4 +1,4 @@
-"""Streams of linked stations at the lab: published as a station publishes them, requested while there are subscribers.
+"""Streams of linked stations at the lab, which publishes them like a station and requests them if they are subscribed.
 
 The second port has its own thread and ZMQ context, so that pictures delay no command. A station sends as many bundles
 as it has credit for; each bundle passed on renews its credit. Episodes arrive here too, for `incoming.py`.
@@ -68,14 +68,14 @@ class _Flow:
 
 @dataclass(slots=True)
 class _Sender:
-    """Connection over which a station sends episodes, with counts of pieces requested and offers unanswered."""
+    """Connection over which a station sends episodes, with the numbers of pieces and offers that it may still send."""
 
     station: str
     asked: int = 0
     offered: int = 0
 
     def may_send(self, message: Offer | Labels | Piece) -> bool:
-        """Count the message; return False if the station sends more of its kind than the protocol allows."""
+        """Count the message; return False if the station sends more messages of its kind than the protocol allows."""
         if isinstance(message, Piece):
             self.asked -= 1
             return self.asked >= 0
@@ -110,7 +110,7 @@ class LabStreams:
         self._thread = threading.Thread(target=self._work, name="streams", daemon=True)
 
     def open(self) -> int:
-        """Listen, after admission has started; return the port. Raises: TransportError."""
+        """Listen at the port and return its number; call it after admission has started. Raises: TransportError."""
         host, port, key = self._where
         largest = LARGEST_PICTURE
         self._door = Door(self.context, host, port, key, largest, RATE, self._allowed, self._clock)
@@ -121,16 +121,16 @@ class LabStreams:
         self._thread.start()
 
     def end(self) -> None:
-        """Stop the thread; nothing is published any more."""
+        """Stop the thread; no stream is published any more."""
         self._ended.set()
         self._thread.join()
 
     def serve(self, station: str, station_dir: Path) -> None:
-        """Publish the streams of a station in that folder; from any thread."""
+        """Publish the streams of a station in the folder `station_dir`; any thread may call it."""
         self._orders.put((station, station_dir))
 
     def leave(self, station: str) -> None:
-        """Stop publishing the streams of a station; from any thread."""
+        """Stop publishing the streams of a station; any thread may call it."""
         self.places.pop(station, None)
         self._orders.put((station, None))
 

@@ -1,4 +1,4 @@
-"""Connection of a station to its lab: connecting, greeting, signs of life, and dropping it if it is silent.
+"""Connection of a station to its lab: connecting, greeting, signs of life, and dropping a silent connection.
 
 The station connects, never the lab. Messages that are still unread when a connection is dropped are discarded: they
 belong to requests that the lab no longer waits for.
@@ -56,7 +56,7 @@ Heard = tuple[Message, list[bytes]]
 
 @dataclass(frozen=True, slots=True)
 class Dial:
-    """Everything that a line needs to reach its lab."""
+    """Parameters of a connection to the lab: lab, key of this computer, role and session."""
 
     lab: KnownLab
     key: KeyPair
@@ -74,7 +74,7 @@ Dialled = tuple[zmq.Socket[Any], zmq.Socket[Any]]  # connection and its monitor
 
 
 def dialled(context: zmq.Context[Any], endpoint: str, lab: bytes, key: KeyPair, low: bool = False) -> Dialled:
-    """Open a socket that connects once, without reconnecting, to the lab with that public key. Raises: ZMQError.
+    """Open a socket that connects once, without reconnecting, to the lab with the public key `lab`. Raises: ZMQError.
 
     Args:
         lab: Public key of the lab, 32 bytes.
@@ -114,7 +114,7 @@ def ended(socket: zmq.Socket[Any], monitor: zmq.Socket[Any]) -> None:
 
 
 class Line:
-    """Connection of one role. One thread uses it and calls `turn` regularly.
+    """Connection of a station to its lab in one role. One thread uses it and calls `turn` regularly.
 
     `beat` returns the sign of life that the station sends every BEAT_S.
     """
@@ -174,7 +174,7 @@ class Line:
 
         Args:
             why: Reason, logged if it is new.
-            again_s: Time until the next try [s]; None: soon, then with a growing delay of up to `_LONGEST_S`.
+            again_s: Time until the next attempt [s]; None: soon, then with a growing delay of up to `_LONGEST_S`.
         """
         self.close()
         if why != self.why:
@@ -237,7 +237,10 @@ class Line:
         self.connections += 1
 
     def _connection_problem(self) -> tuple[str, float | None] | None:
-        """Return why ZMQ reports the connection as failed, and the delay of the next try; None if it does not."""
+        """Return the reason why ZMQ reports the connection as failed, and the delay of the next attempt [s].
+
+        None if it does not report a failure.
+        """
         assert self._monitor is not None
         if not readable(self._monitor):
             return None

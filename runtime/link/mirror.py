@@ -1,7 +1,7 @@
-"""Mirror of a station on another computer: a folder with the sockets by which the lab's programs find any station.
+"""Mirror of a station on another computer: a folder with sockets, by which the lab's programs find it like any station.
 
-The e-stop socket exists as long as the station is enrolled, those for commands and streams while the link is up.
-While it is down, clients find the reason and the time of the loss instead.
+The e-stop socket exists as long as the station is enrolled, those for commands and streams while the link is up. While
+it is down, clients find the reason and the time of the loss instead.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _GATE = ", the gate, for a station on another computer"
 
 
 class MirrorLockedError(Exception):
-    """The station's name is used by another process of this computer."""
+    """Error that another process of this computer uses the station's name."""
 
 
 class Mirror:
-    """Folder of one station, locked until `close`. Raises: MirrorTaken, TransportError."""
+    """Folder of one linked station, locked until `close`. Raises: MirrorLockedError, TransportError."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
         self._context, self.station_dir = context, station_dir
@@ -67,7 +67,7 @@ class Mirror:
         self._endpoints.withdraw(LINK)
 
     def pictures(self, there: bool) -> None:
-        """Publish the endpoint of the pictures, or withdraw it; `there`: whether the station shows any."""
+        """Publish the endpoint of the pictures if the station has any (`there`), otherwise withdraw it."""
         if there != self._cameras:
             self._cameras = there
             self._tell_where()
@@ -100,7 +100,10 @@ class Mirror:
             self._tell_where()
 
     def close(self, why: str) -> None:
-        """Withdraw all endpoints and release the folder: the station is no longer this lab's. `why` is recorded."""
+        """Withdraw all endpoints, record the reason `why`, and release the folder.
+
+        The station does not belong to this lab any more.
+        """
         self.lower(why)
         self._endpoints.withdraw(GUARD)
         self.estops.socket.linger = _LAST_WORDS_MS

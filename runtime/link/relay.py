@@ -1,7 +1,7 @@
 """Relay of the lab's requests to the sockets of the station on this computer, and of the answers back.
 
-Each pending request uses a connection of its own, like that of a local program: none is refused because others are
-pending, and a late answer is never matched to another request.
+Each pending request uses a connection of its own, like that of a local program. So no request is refused because others
+are pending, and a late answer is never matched to another request.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _PendingQuestion:
 
 @dataclass(slots=True)
 class _Free:
-    """Idle connections to one socket."""
+    """Connections to one socket that are not in use."""
 
     endpoint: str
     clients: list[CommandClient] = field(default_factory=list)
@@ -55,7 +55,7 @@ class _Free:
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """Answer to the request with that number: as the station packed it, or why there is none."""
+    """Answer to the request `number`: as the station encoded it, or the reason why there is none."""
 
     number: int
     packed: bytes = b""
@@ -97,7 +97,7 @@ class Relay:
         return bool(self._asked)
 
     def sockets(self) -> list[zmq.Socket[Any]]:
-        """Return the sockets that become readable when an answer arrives."""
+        """Return the sockets of pending requests; each becomes readable when its answer arrives."""
         return [asked.client.socket for asked in self._asked.values() if asked.client is not None]
 
     def answers(self) -> list[Answered]:
@@ -124,7 +124,7 @@ class Relay:
         return found
 
     def forget(self) -> None:
-        """Drop all pending requests; commands that were sent are executed all the same."""
+        """Drop all pending requests; commands that were sent are executed nevertheless."""
         for number in list(self._asked):
             self._end(number)
 

@@ -1,4 +1,4 @@
-"""Version of this installation, as shown to people."""
+"""Version of this installation, for display."""
 
 from __future__ import annotations
 

@@ -32,7 +32,10 @@ class Pending:
 
 @dataclass(slots=True)
 class PendingPress:
-    """Press of the e-stop that waits for the link; `told`: its sender has an answer already, but it is still sent."""
+    """Press of the e-stop that waits for the link.
+
+    `told`: its sender has an answer already, but the press is still sent.
+    """
 
     call: IncomingMessage
     command: Command
@@ -45,7 +48,7 @@ class PendingPress:
 
 @dataclass(slots=True)
 class Remote:
-    """Station that is enrolled here."""
+    """Enrolled station, with its connections, pending commands and held presses."""
 
     name: str
     mirror: Mirror | None = None
@@ -62,6 +65,9 @@ class Remote:
     lost_at: float = -float("inf")
 
     def line(self, role: str, now: float) -> Line | None:
-        """Return the connection of that role; None if it is silent or has sent no challenge to sign with."""
+        """Return the connection of `role`; None if it is silent, or has sent no challenge yet.
+
+        Without a challenge no command can be signed.
+        """
         found = self.lines.get(role)
         return found if found is not None and found.challenge and now - found.heard_at <= LOST_S else None

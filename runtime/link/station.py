@@ -43,7 +43,7 @@ _MOST_STREAMS_S = 1 / 40  # shortest time between two bundles [s]
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Station of this computer, its lab, and the key that identifies it there."""
+    """Station of this computer, its lab, and the key that identifies it to the lab."""
 
     station_dir: Path
     lab: KnownLab
@@ -91,7 +91,7 @@ class Commands:
 
     @property
     def problem(self) -> str:
-        """Why there is no connection to the lab, "" if there is one; any thread may read it."""
+        """Reason why there is no connection to the lab, "" if there is one; any thread may read it."""
         return "" if self._line.up else self._line.why
 
     def close(self) -> None:
@@ -132,7 +132,10 @@ class Commands:
 
 
 class Streams:
-    """Relay of state and pictures, the newest of each within the lab's credit. One thread calls `turn`."""
+    """Relay of state and pictures: the newest message of each stream, within the lab's credit.
+
+    One thread calls `turn`.
+    """
 
     def __init__(self, place: Place, clock: Callable[[], float] = time.monotonic) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
@@ -221,14 +224,14 @@ class StationLink:
 
     @property
     def problem(self) -> str:
-        """Why the lab cannot stop the station at present, "" if it can."""
+        """Reason why the lab cannot stop the station at present, "" if it can."""
         return "not connected yet" if self._stops is None else self._stops.problem
 
     def _work(self, name: str, make: Callable[[], Commands | Streams]) -> None:
         """Run one thread of the link.
 
-        An unforeseen error sets `failed`, so that the whole process ends and is restarted: a link that works only in
-        part would be harder to notice.
+        An unforeseen error sets `failed`, so that the whole process ends and is restarted: a link of which only some
+        threads work would be harder to notice.
         """
         part = None
         try:

@@ -24,7 +24,7 @@ _MOST_CREDIT = 64
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Publishing socket of the station: its process and its name there."""
+    """Publishing socket of the station, identified by its process and its name."""
 
     endpoints: Endpoints
     process: str
@@ -39,13 +39,13 @@ class Source:
 
 
 def source_of(station_dir: Path, role: str) -> Source:
-    """Return the socket whose messages a connection of that role carries."""
+    """Return the socket whose messages a connection of `role` carries."""
     endpoints = Endpoints(station_dir)
     return Source(endpoints, COORDINATOR, "state") if role == STATE else Source(endpoints, MEDIA, "cameras")
 
 
 class Flow:
-    """Streams of one socket: subscribed while the lab wants any, and bundled as its credit allows."""
+    """Streams of one socket: subscribed while the lab wants any, and sent in bundles as the lab's credit allows."""
 
     def __init__(self, context: zmq.Context[Any], source: Source) -> None:
         self._context, self._source = context, source
@@ -57,7 +57,7 @@ class Flow:
         self._turns = 0
 
     def stop(self) -> None:
-        """Forget the lab's credit and requests, and unsubscribe."""
+        """Discard the lab's credit and requests, and unsubscribe."""
         self._credit, self._wanted = 0, []
         self._newest.clear()
         self._disconnect()

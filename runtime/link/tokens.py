@@ -33,7 +33,7 @@ def _signed(station: str, challenge: bytes, serial: int, place: str, payload: by
 
 
 class Signer:
-    """Lab's end: signs commands for stations, each with a new serial."""
+    """Signer of commands at the lab's end; each signature has a new serial."""
 
     def __init__(self, key: Ed25519PrivateKey) -> None:
         self._key = key
@@ -42,13 +42,13 @@ class Signer:
         )  # random start: two processes of a lab do not use the same serials
 
     def token(self, station: str, challenge: bytes, place: str, payload: bytes) -> tuple[int, bytes]:
-        """Return serial and signature for one message that uses the station's challenge."""
+        """Return serial and signature for one message, bound to the station's challenge."""
         self._serial += 1
         return self._serial, self._key.sign(_signed(station, challenge, self._serial, place, payload))
 
 
 class Challenges:
-    """Station's end: issues challenges and checks that each token is valid and used once."""
+    """Issuer of challenges at the station's end, which also checks that each token is valid and used once."""
 
     def __init__(
         self, station: str, key: Ed25519PublicKey, clock: Callable[[], float] = time.monotonic
@@ -57,7 +57,7 @@ class Challenges:
         self._made: OrderedDict[bytes, tuple[float, set[int]]] = OrderedDict()  # issue time, used serials
 
     def newest(self) -> bytes:
-        """Return the current challenge; issue a new one if the last is older than `_EVERY_S`."""
+        """Return the current challenge; issue a new one if it is older than `_EVERY_S`."""
         now = self._clock()
         last = next(reversed(self._made), None)
         if last is None or now - self._made[last][0] >= _EVERY_S:
@@ -70,7 +70,7 @@ class Challenges:
     def wrong(self, ask: Ask, payload: bytes) -> str:
         """Return the reason to reject a message's token, "" if it is valid.
 
-        A valid token is used up by this call: the same one is rejected from then on.
+        This call uses up a valid token: the same token is rejected from then on.
         """
         if not ask.signature:
             return "the lab names no user for it"

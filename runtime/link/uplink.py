@@ -16,7 +16,10 @@ _NOT_RUNNING = "the process of the link does not run"
 
 @dataclass(frozen=True, slots=True)
 class Uplink:
-    """Name of the lab; since when [Unix time, s] and why there is no link to it; `since` is 0 while there is one."""
+    """State of the link: name of the lab, since when [Unix time, s] and why it is down.
+
+    `since` is 0 while it is up.
+    """
 
     lab: str
     since: float = 0.0
@@ -24,7 +27,7 @@ class Uplink:
 
 
 class Telling:
-    """Writer of the link's state into the station's folder, whenever it changes."""
+    """Writer of the link's state to the station's folder."""
 
     def __init__(self, endpoints: Endpoints, lab: str, clock: Callable[[], float] = time.time) -> None:
         self._endpoints, self._clock = endpoints, clock
@@ -32,7 +35,10 @@ class Telling:
         self._lab = lab
 
     def update(self, trouble: str) -> None:
-        """Write the state if it has changed or its file is missing; `trouble`: why there is no link, "" if linked."""
+        """Write the state if it has changed or its file is missing.
+
+        `trouble` is the reason why the link is down, "" if it is up.
+        """
         before = self._said
         lost = before is not None and before.why
         since = 0.0 if not trouble else before.since if lost and before else self._clock()
@@ -47,7 +53,7 @@ class Telling:
 
 
 def read_uplink(endpoints: Endpoints) -> dict[str, Any] | None:
-    """Return lab, since and why for JSON; None if the station is not linked to a lab."""
+    """Return lab, since and why as a dict for JSON; None if the station has no link to a lab."""
     try:
         found = endpoints.read(UPLINK)
         told = {"lab": str(found["lab"]), "since": float(found["since"]), "why": str(found["why"])}

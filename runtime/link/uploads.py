@@ -52,7 +52,11 @@ _RATE, _LEAST_RATE, _MOST_RATE = 10.0, 0.01, 50.0  # MB/s; the lab cuts off conn
 
 @dataclass(frozen=True, slots=True)
 class UploadSettings:
-    """Transfer of a station's episodes: rate [bytes/s], whether it waits for the end of a run, days of retention."""
+    """Settings of the transfer of a station's episodes.
+
+    `rate` [bytes/s] is its limit, `waits` whether it pauses during a run, `keep_days` the retention at the station
+    [days].
+    """
 
     rate: float = _RATE * 1e6
     waits: bool = False
@@ -85,7 +89,7 @@ def _number(
 
 
 class Runs:
-    """Whether a run or a recording is active at the station, read from its published state."""
+    """Monitor of the station's published state, for whether a run or a recording is active."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path, clock: Callable[[], float]) -> None:
         self._context, self._clock = context, clock

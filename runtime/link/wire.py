@@ -56,7 +56,7 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The lab's answer to `Hello`: its release and version."""
+    """Answer of the lab to `Hello`, with its release and version."""
 
     release: int
     version: str
@@ -64,7 +64,7 @@ class Welcome:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """Reason to end this connection, and the pause before the next try [s]."""
+    """Message before a connection is closed: reason, and pause before the next attempt [s]."""
 
     why: str
     again_s: float = 30.0
@@ -72,7 +72,7 @@ class Bye:
 
 @dataclass(frozen=True, slots=True)
 class Beat:
-    """Sign of life of either end. The station's carries its newest challenge.
+    """Sign of life of either end; that of the station carries its newest challenge.
 
     On the connection for commands it also lists the station processes that listen.
     """
@@ -85,8 +85,8 @@ class Beat:
 class Ask:
     """Command for a socket of the station; the payload is the part that follows.
 
-    `challenge`, `serial` and `signature` are its token, empty if the lab has not verified a user. `stops`: it is passed
-    on even with an invalid token, and the station decides.
+    `challenge`, `serial` and `signature` are its token, empty if the lab has not verified a user. If `stops`, the
+    command is passed on even with an invalid token, and the station decides.
     """
 
     number: int
@@ -100,7 +100,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The station's answer to the `Ask` of that number: the part that follows, or the reason why there is none."""
+    """Answer of the station to the `Ask` of that number: the part that follows, or the reason why there is none."""
 
     number: int
     failure: str = ""
@@ -108,7 +108,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Credit:
-    """Permission to send so many more bundles, of streams whose names start with an entry of `wanted`."""
+    """Permission to send `count` more bundles, of streams whose names start with an entry of `wanted`."""
 
     count: int
     wanted: list[str] = field(default_factory=list)
@@ -156,7 +156,7 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """Confirmation that the lab has verified an episode or labels; `digest` is of the offered list or the lines."""
+    """Confirmation that the lab has verified an episode or labels; `digest` is of the offered list or of the lines."""
 
     episode: str
     digest: str
@@ -164,7 +164,10 @@ class Arrived:
 
 @dataclass(frozen=True, slots=True)
 class Declined:
-    """The lab does not accept what was offered of the episode; the station may offer it again after `again_s`."""
+    """Answer that the lab does not accept an offered episode or its labels.
+
+    The station may offer it again after `again_s` [s].
+    """
 
     episode: str
     why: str
@@ -183,7 +186,7 @@ class Enrol:
 
 @dataclass(frozen=True, slots=True)
 class Enrolled:
-    """Successful enrolment: name of the station and the lab, key that verifies tokens, port for pictures."""
+    """Answer to a successful `Enrol`: name of the station and the lab, key that verifies tokens, port for pictures."""
 
     station: str
     lab: str
@@ -273,7 +276,7 @@ def _fits(value: object, wanted: Any) -> bool:
 
 
 def apart(theirs: int, version: str, station: str, lab_side: bool) -> str:
-    """Return why the other end's release is incompatible with this one, naming both; "" if it is compatible."""
+    """Return why the release of the other end is incompatible with this one, naming both; "" if it is compatible."""
     if abs(theirs - RELEASE) <= 1:
         return ""
     from runtime.link.release import version as our_version

@@ -15,9 +15,9 @@ _IOPRIO_SET = {"x86_64": 251, "aarch64": 30}
 
 
 def lower_priority() -> None:
-    """Give the calling thread and those that it starts the lowest priority: nice 19, and the idle class of disk access.
+    """Give the calling thread and the threads that it starts the lowest priority.
 
-    The idle class takes effect only if the disk's scheduler supports classes.
+    That is nice 19 and the idle class of disk access, which takes effect only if the disk's scheduler supports classes.
     """
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICEST)
     number = _IOPRIO_SET.get(platform.machine())
@@ -28,7 +28,7 @@ def lower_priority() -> None:
 class Throttle:
     """Token bucket of bytes that fills at `rate` [bytes/s] and holds `burst` bytes.
 
-    Taking more than it holds is allowed; the debt is paid by waiting.
+    More bytes than it holds may be taken; the deficit is made up by waiting.
     """
 
     def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -42,5 +42,5 @@ class Throttle:
         return max(0.0, -self._left / self._rate)
 
     def consume(self, count: int) -> None:
-        """Record that so many bytes are sent; call `wait_s` before."""
+        """Record that `count` bytes are sent; call `wait_s` before."""
         self._left -= count

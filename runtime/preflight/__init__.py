@@ -1,1 +1,1 @@
-"""Preflight: a policy asked without a robot, from the deployment to action rows that a robot could execute."""
+"""Preflight: a query to a policy without a robot, from the deployment to action rows that a robot could execute."""

@@ -99,11 +99,11 @@ def _seconds(text: str) -> float:
 
 
 def _for_a_parent() -> int:
-    """Run one preflight for a parent process: the request is a line of JSON on standard input, so is the report on
-    standard output. Return early if standard input closes.
+    """Run one preflight for a parent process; stop early if standard input closes.
 
-    The request has "tree" (a resolved deployment) or "deployment" (path of a file), "changes" (tables merged over the
-    deployment, such as a checkpoint's), and "deadline_s" [s] (null: the default).
+    The request is a line of JSON on standard input, the report a line of JSON on standard output. The request has
+    "tree" (a resolved deployment) or "deployment" (path of a file), "changes" (tables merged over the deployment, such
+    as a checkpoint's), and "deadline_s" [s] (null: the default).
     """
     os.nice(_BACKGROUND_NICE)
     log.configure_logging("preflight")

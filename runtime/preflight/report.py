@@ -16,7 +16,7 @@ _LONGEST_TEXT, _LONGEST_LIST, _DEEPEST = 300, 40, 6  # limits of a server's meta
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call to the policy (connect, reset or infer), its duration [ms], and whether it succeeded."""
+    """Call to the policy (connect, reset or infer), its duration [ms], and whether it succeeded."""
 
     name: str
     ms: float
@@ -28,9 +28,9 @@ class Call:
 class Chunk:
     """Last response: `rows` of `width` values as the server sent them, at `rate` [Hz], `seconds` of motion.
 
-    `command_rows` of `joints` values at the control rate are its conversion. `first_away` [rad] is the distance of
-    the first one from the robot's pose, at the joint `first_joint`; `beyond_limits` is the number of rows that leave
-    the joint limits.
+    Its conversion has `command_rows` rows of `joints` values at the control rate. `first_away` [rad] is the distance of
+    the first of these from the robot's pose, at the joint `first_joint`; `beyond_limits` is the number of rows that
+    leave the joint limits.
     """
 
     rows: int
@@ -48,10 +48,10 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Verdict, its stage, and all measurements until then.
+    """Report of a preflight: its verdict, the stage in which it was reached, and all measurements until then.
 
-    `endpoint` is the policy's address, "" for a policy without a server; `name` is the server's own name. `metadata`
-    is cut to a length that a page can show. `notes` are remarks that do not prevent a set-up.
+    `endpoint` is the policy's address, "" for a policy without a server; `name` is the server's own name. `metadata` is
+    cut to a length that a page can show. `notes` are remarks that do not prevent a set-up.
     """
 
     verdict: PreflightVerdict
@@ -90,7 +90,7 @@ class Report:
         return answers[number] if number < len(answers) else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report in the form of JSON."""
+        """Return the report as a dict of JSON's own types."""
         told = asdict(self)
         return {
             **told,
@@ -127,7 +127,7 @@ def chunk_summary(chunk: Chunk) -> str:
 
 
 def truncate_value(value: Any, depth: int = 0) -> Any:
-    """Return a server's value in a form for JSON and people: long or deeply nested parts are cut."""
+    """Return a server's value in a form for JSON and people; long or deeply nested parts are cut."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int):

@@ -77,7 +77,10 @@ class TimedPolicy(Policy):
 
 
 class PreflightRunner:
-    """One preflight of one station spec; call `run` once. It has no transport, so no action can reach a robot."""
+    """Runner of one preflight of one station spec; call `run` once.
+
+    It has no transport, so no action can reach a robot.
+    """
 
     def __init__(self, spec: StationSpec, clock: Clock | None = None) -> None:
         self._plan = spec
@@ -111,7 +114,7 @@ class PreflightRunner:
 
     @property
     def _call(self) -> str:
-        """Present or last call: "connect" until the first request, "" after a response."""
+        """Name of the present or last call: "connect" until the first request, "" after a response."""
         policy = self._policy
         if policy is None:
             return ""
@@ -260,7 +263,7 @@ class PreflightRunner:
         return made
 
     def _rtc_remarks(self) -> list[str]:
-        """Return remarks on a strategy that continues the model's own rows: that needs absolute rows."""
+        """Return remarks if the strategy continues the model's own rows, which must then be absolute."""
         chunk = self._answered.chunk if self._answered else None
         if chunk is None or chunk.model_actions is None or not strategy_of(self._plan).query.uses_rtc:
             return []

@@ -129,7 +129,7 @@ def verdict_of(error: RuntimeFault) -> PreflightVerdict:
 
 
 def stage_of(verdict: PreflightVerdict, call: str) -> PreflightStage:
-    """Return the stage of a verdict; `call` is the policy's present call, "" after the last."""
+    """Return the stage to which a verdict belongs; `call` is the policy's present call, "" after the last one."""
     if verdict is PreflightVerdict.MISCONFIGURED:
         return PreflightStage.RESOLVE
     if call == "connect":

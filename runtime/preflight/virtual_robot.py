@@ -15,7 +15,7 @@ _GREY, _GRAIN = 128, 12  # noise, because a real camera's picture is never unifo
 class VirtualRobot:
     """Observation provider without a robot: at rest in the set-up pose, with grey-noise pictures.
 
-    Every observation has new time stamps. It measures no poses, so poses are computed from the joints.
+    Every observation has new time stamps. It contains no measured poses, so poses are computed from the joints.
     """
 
     simulated = False
@@ -28,7 +28,7 @@ class VirtualRobot:
         self._pictures = noise_images(spec)
 
     def latest(self, prompt: str, pictures: bool = True) -> Observation:
-        """Return the observation of this moment."""
+        """Return an observation with the present time."""
         self._number += 1
         robot, now = self._plan.robot, self._clock.now()
         streams = ("joints", *self._pictures)
@@ -45,15 +45,15 @@ class VirtualRobot:
         )
 
     def use_simulated(self, simulated: bool) -> None:
-        """Do nothing: the virtual robot replaces the real and the simulated one."""
+        """Do nothing, because the virtual robot replaces both the real and the simulated one."""
 
     def commanded(self) -> tuple[int, Float64] | None:
-        """Return None: there was no command."""
+        """Return None, because no command was ever sent."""
         return None
 
 
 def noise_images(spec: StationSpec) -> dict[str, UInt8]:
-    """Return grey noise [H, W, 3] for each camera of the deployment, in its size; the same at every call."""
+    """Return grey noise [H, W, 3] for each camera of the deployment, in its size; it is the same at every call."""
     noise = np.random.default_rng(0)
     made: dict[str, UInt8] = {}
     for key in spec.cameras:

@@ -1,4 +1,4 @@
-"""Start of every process of a station: its plan, the shared state, a lifeline, a log."""
+"""Start of a station process: its specification, the shared state, a lifeline, a log."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from runtime.station.spec import StationSpec, load_checked_spec
 
 @dataclass(frozen=True, slots=True)
 class ProcessContext(Membership):
-    """One process of a station: what it works with."""
+    """Membership of a process in its station, with the station's specification."""
 
     spec: StationSpec
 
 
 def join_station(process: str, pictures: bool = True, unread: Collection[str] = ()) -> ProcessContext:
-    """Read what the supervisor handed over on the command line; `unread` as by `planned`."""
+    """Parse the supervisor's command line, start the log, and attach the shared state.
+
+    `pictures`: attach the pictures too. `unread` names sections of the deployment that are not loaded, see
+    `load_checked_spec`.
+    """
     parser = argparse.ArgumentParser(prog=f"runtime.{process}", description="started by the supervisor")
     parser.add_argument("--resolved", required=True)
     parser.add_argument("--capabilities", required=True)

@@ -37,7 +37,7 @@ class Vector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VectorColumn:
-    """Column of vectors in a block: `values` float32 [N, W], zeros in rows that are `missing` or `malformed`."""
+    """Column of vectors in a block: `values` float32 [N, W], with zeros in rows that are `missing` or `malformed`."""
 
     values: Float32
     missing: Bools
@@ -46,7 +46,7 @@ class VectorColumn:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """Consecutive rows from `first` on; absent columns have no key."""
+    """Consecutive rows from row `first` on; columns that the episode lacks have no key."""
 
     first: int
     rows: int
@@ -60,7 +60,7 @@ class Block:
 
 
 class VideoEnd(NamedTuple):
-    """First row without a video frame of a camera, and the reason."""
+    """End of a camera's video: the first row without a frame, and the reason."""
 
     row: int
     reason: str
@@ -85,7 +85,10 @@ class JointSpecs:
 
 
 class EpisodeSource(ABC):
-    """One episode as it is stored. Damage beyond its rows is raised as RecordingError by `blocks`."""
+    """Source of one episode's rows, properties and pictures, however they are stored.
+
+    Damage that makes later rows unreadable is raised as RecordingError by `blocks`.
+    """
 
     name: str
     fps: float
@@ -100,7 +103,7 @@ class EpisodeSource(ABC):
 
     @abstractmethod
     def blocks(self) -> Iterator[Block]:
-        """Yield the rows in order. Raises RecordingError if they cannot be read further."""
+        """Yield the rows in order. Raises RecordingError if further rows cannot be read."""
 
     @abstractmethod
     def open_frames(self, camera: str, sampling: int) -> FrameStream:
@@ -108,7 +111,10 @@ class EpisodeSource(ABC):
 
     @abstractmethod
     def joints(self) -> tuple[JointSpecs | None, str]:
-        """Return the robot's dimensions (None without state or action), and why limits are unknown ("" if known)."""
+        """Return the robot's dimensions, and the reason if their limits are unknown.
+
+        The dimensions are None without state or action; the reason is "" if the limits are known.
+        """
 
 
 GRIPPER = "gripper"  # part of a gripper's name, if no description identifies it
@@ -116,9 +122,9 @@ _UNKNOWN = np.nan
 
 
 def known_joints(robot: str, names: Sequence[str]) -> JointSpecs:
-    """Return the dimensions of a described robot.
+    """Return the dimensions of the described robot `robot`.
 
-    Raises RobotError if it is unknown or its dimensions have other names.
+    Raises RobotError if the robot is unknown or its dimensions have other names than `names`.
     """
     described = robots.load_robot(robot, groups_of(names))
     if list(described.joint_names) != list(names):
@@ -144,5 +150,5 @@ def unknown_joints(names: Sequence[str]) -> JointSpecs:
 
 
 def groups_of(names: Sequence[str]) -> list[str]:
-    """Return the groups of names in the form GROUP.JOINT, each once, in their order."""
+    """Return the group in each name of the form GROUP.JOINT; each group once, in their order."""
     return list(dict.fromkeys(name.partition(".")[0] for name in names))

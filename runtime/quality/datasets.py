@@ -43,10 +43,10 @@ _INDEX = "frame_index"
 
 
 class DatasetSource(EpisodeSource):
-    """Episode `index` of a dataset.
+    """Source of the checks for episode `index` of a dataset.
 
-    `state` names the column of measured joints, "" for the usual ones. `robot` is the robot of these joints, in its
-    order; "" if only the dataset knows it.
+    `state` names the column of measured joints, "" for the usual columns. `robot` is the robot that has these joints in
+    this order; "" if only the dataset describes them.
     """
 
     def __init__(self, dataset: Dataset, index: int, state: str = "", robot: str = "") -> None:
@@ -70,9 +70,9 @@ class DatasetSource(EpisodeSource):
         self.started = "tick_time" if "tick_time" in self._features else ""
 
     def _state_column(self, state: str) -> str:
-        """Return the column of measured joints, "" without one.
+        """Return the column of measured joints, "" if there is none.
 
-        Raises RecordingError if `state` is given and absent.
+        Raises RecordingError if `state` is given and there is no such column.
         """
         if state and not (state in self._features and self._is_vector(state)):
             vectors = [name for name in self._features if self._is_vector(name)]
@@ -216,7 +216,7 @@ def _scalars(column: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _lists(column: Any, vector: Vector) -> VectorColumn:
-    """Return lists as float32 [N, W]; rows of another width are malformed and 0."""
+    """Return lists as float32 [N, W]; rows of another width are malformed and filled with 0."""
     rows = len(column)
     missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
     values = np.zeros((rows, vector.width), np.float32)

@@ -1,4 +1,4 @@
-"""Checks of one camera's pictures: present, of the declared size, on time, neither black nor uniform, and new."""
+"""Checks of one camera's pictures: present, of the declared size, on time, neither black nor uniform, not repeated."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ImageCheck:
     def add(
         self, first: int, moving: Bools, repeated: Bools | None = None, lost: Bools | None = None
     ) -> None:
-        """Check the pictures of the next rows."""
+        """Check the pictures of the next rows, from row `first` on."""
         rows = len(moving)
         nobody = np.zeros(rows, np.bool_)
         repeated, lost = nobody if repeated is None else repeated, nobody if lost is None else lost
@@ -103,7 +103,10 @@ class ImageCheck:
         return float(shot.luma.mean()), float(shot.luma.std()), change, off
 
     def close(self, rows: int, whole: bool) -> None:
-        """End the checks; the episode has `rows` rows. `whole`: all were readable, so further pictures are surplus."""
+        """End the checks of an episode with `rows` rows.
+
+        `whole`: all rows were readable, so that further pictures are surplus.
+        """
         for runs in self._runs.values():
             runs.close()
         self._losses.close(rows)

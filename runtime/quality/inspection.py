@@ -21,7 +21,10 @@ from runtime.quality.value_checks import ValueCheck
 
 
 def check_episode(folder: Path, settings: QualitySettings | None = None) -> Report:
-    """Check the episode in one of our folders. Damage is a flag; raises RecordingError without a readable manifest."""
+    """Check the episode in one of our folders and return the report; damage is one of its flags.
+
+    Raises RecordingError without a readable manifest.
+    """
     return run_checks(JournalSource(folder), settings or QualitySettings())
 
 
@@ -33,13 +36,16 @@ def check_dataset_episode(
     state: str = "",
     robot: str = "",
 ) -> Report:
-    """Check episode `index` of a LeRobot dataset. Raises RecordingError if the dataset has no such episode."""
+    """Check episode `index` of a LeRobot dataset and return the report.
+
+    Raises RecordingError if the dataset has no such episode.
+    """
     opened = open_dataset(dataset) if isinstance(dataset, Path) else dataset
     return run_checks(DatasetSource(opened, index, state, robot), settings or QualitySettings())
 
 
 def run_checks(source: EpisodeSource, settings: QualitySettings) -> Report:
-    """Run all checks on one episode from any source."""
+    """Run all checks on one episode from any source and return the report."""
     flags = FlagCollector(settings.most_flags)
     for kind, severity, sentence in source.remarks:
         flags.add(Flag(kind, severity, -1, -1, "", sentence))

@@ -1,4 +1,4 @@
-"""Our own episodes as a source of the checks; rows are read batch by batch."""
+"""Source of the checks for our own episodes; rows are read batch by batch."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ _SPARSE = ("qvel", "effort")  # columns that some robots fill only in some rows
 
 
 class JournalSource(EpisodeSource):
-    """Episode in a folder DATA/episodes/UUID. Raises RecordingError if its manifest cannot be read."""
+    """Source of the checks for an episode in a folder DATA/episodes/UUID.
+
+    Raises RecordingError if its manifest cannot be read.
+    """
 
     started = "tick_time"
 
@@ -157,7 +160,7 @@ class JournalSource(EpisodeSource):
 
 
 def fixed(column: Any, width: int) -> VectorColumn:
-    """Return a column of lists of equal length as arrays; null rows are missing."""
+    """Return a column of lists of `width` values as arrays; rows that are null count as missing."""
     missing = ~np.asarray(column.is_valid().to_numpy(zero_copy_only=False), np.bool_)
     values = np.zeros((len(column), width), np.float32)
     values[~missing] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)

@@ -10,7 +10,7 @@ from runtime.quality.settings import QualitySettings
 
 
 class LostFrames:
-    """Missing pictures of one camera; rows after the end of its video are one flag."""
+    """Check for missing pictures of one camera; all rows after the end of its video are one flag."""
 
     def __init__(
         self, camera: str, fps: float, settings: QualitySettings, flags: FlagCollector, end: VideoEnd | None
@@ -23,7 +23,7 @@ class LostFrames:
         self._runs = RunCollector(self._lost)
 
     def add(self, first: int, lost: Bools) -> None:
-        """Add rows from `first` on; `lost` marks those whose picture is missing in the video."""
+        """Add rows from `first` on; `lost` marks the rows whose picture is missing in the video."""
         self._runs.add(first, lost & ~self.past_end(first, len(lost)))
 
     def past_end(self, first: int, rows: int) -> Bools:

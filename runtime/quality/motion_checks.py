@@ -13,7 +13,7 @@ from runtime.quality.settings import QualitySettings
 
 
 class MotionCheck:
-    """Check of state and action, block by block; `add` returns in which rows the robot moves."""
+    """Check of state and action, block by block; `add` returns the rows in which the robot moves."""
 
     def __init__(
         self, source: EpisodeSource, joints: JointSpecs, settings: QualitySettings, flags: FlagCollector
@@ -57,7 +57,7 @@ class MotionCheck:
         return None if lag is None else lag / self._fps
 
     def add(self, block: Block) -> Bools:
-        """Check the next rows; return in which of them the robot moves [N]."""
+        """Check the next rows; return for each whether the robot moves in it, bool [N]."""
         state = _usable(block, self._state)
         moving = self._moving(state)
         some: Bools = np.asarray(moving.any(axis=1))
@@ -80,7 +80,10 @@ class MotionCheck:
         return some
 
     def _moving(self, state: Float32) -> Bools:
-        """Return which dimensions [N, D] differ from `lag` rows before, or from the start if that is nearer."""
+        """Return which dimensions moved, bool [N, D]: their state differs from that `lag` rows before.
+
+        Near the start of the episode it is compared with the first row.
+        """
         rows = np.concatenate([self._past, state])
         places = np.arange(len(self._past), len(rows))
         before = np.maximum(places - self._lag, 0)
@@ -233,14 +236,14 @@ class _TrackingDelay:
 
 
 def _usable(block: Block, name: str) -> Float32:
-    """Return the column, NaN for unknown values."""
+    """Return the column `name` as an array, NaN for unknown values."""
     numbers = block.vectors[name]
     known = ~(numbers.missing | numbers.malformed)
     return np.where(known[:, None] & np.isfinite(numbers.values), numbers.values, np.nan).astype(np.float32)
 
 
 def _idle_speeds(joints: JointSpecs, settings: QualitySettings) -> Float64:
-    """Return the speeds per dimension [D] up to which it counts as idle."""
+    """Return the speed of each dimension [D] up to which it counts as idle."""
     travel = joints.upper - joints.lower
     travel = np.where(np.isfinite(travel) & (travel > 0), travel, 1.0)
     return np.where(joints.grippers, settings.idle_gripper * travel, settings.idle_speed)

@@ -36,7 +36,7 @@ class Flag:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """Number of a kind's flags and of their frames, including those that the report omits."""
+    """Number of flags of one kind and of their frames; flags that the report omits are included."""
 
     flags: int
     frames: int
@@ -44,7 +44,10 @@ class Count:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """All findings on one episode. `unchecked` are sentences about checks that were impossible, and why."""
+    """Report of all findings on one episode.
+
+    `unchecked` are sentences about checks that were impossible, with the reason.
+    """
 
     episode: str  # uuid, or DATASET#index
     frames: int
@@ -86,7 +89,10 @@ def _plain(value: Any) -> Any:
 
 
 class FlagCollector:
-    """Collector of flags in constant memory: at most `most` per kind and stream are stored, all are counted."""
+    """Collector of flags in constant memory.
+
+    At most `most` flags per kind and stream are stored, but all are counted.
+    """
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -106,7 +112,7 @@ class FlagCollector:
         self._counts[flag.kind] = Count(before.flags + 1, before.frames + frames)
 
     def report(self, episode: str, frames: int, fps: float, figures: Mapping[str, float | None]) -> Report:
-        """Return the report, with the flags in the order of their frames, at the same frame the worst first."""
+        """Return the report; flags are in the order of their frames, and at the same frame the worst comes first."""
         order = sorted(
             self._kept,
             key=lambda flag: (flag.first, -SEVERITIES.index(flag.severity), flag.kind, flag.stream),
@@ -123,7 +129,7 @@ class FlagCollector:
 
 
 class FrameRun(NamedTuple):
-    """Consecutive frames with the same finding; `value` is the worst of them, at frame `at`."""
+    """Consecutive frames with the same finding; `value` is the worst value among them, found at frame `at`."""
 
     first: int
     last: int
@@ -147,7 +153,7 @@ class RunCollector:
         self._open: FrameRun | None = None
 
     def add(self, first: int, marked: NDArray[np.bool_], values: ArrayLike | None = None) -> None:
-        """Add frames from `first` on; `values` are their badness (larger is worse)."""
+        """Add frames from `first` on; `marked` have the finding, `values` is its degree per frame (larger is worse)."""
         frames = np.flatnonzero(marked)
         if not len(frames):
             if self._open is not None and first + len(marked) - self._open.last > self._apart + 1:
@@ -176,7 +182,7 @@ class RunCollector:
 
 
 def frame_range(first: int, last: int) -> str:
-    """Return frames as text, e.g. "frames 3 to 7"."""
+    """Return a range of frames as text, e.g. "frames 3 to 7"."""
     return f"frame {first}" if first == last else f"frames {first} to {last}"
 
 

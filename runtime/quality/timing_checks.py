@@ -13,7 +13,7 @@ JOINTS = ("joints", "eef")  # streams that are not cameras
 
 
 class TimingCheck:
-    """Check of order, gaps, skew and ages, block by block."""
+    """Check of the order of rows, gaps between them, capture skew and ages, block by block."""
 
     def __init__(self, source: EpisodeSource, settings: QualitySettings, flags: FlagCollector) -> None:
         self._source = source
@@ -77,7 +77,10 @@ class TimingCheck:
             self._mark("gap", name, block, gaps > bound + 1e-9, gaps)
 
     def _forwards(self, block: Block, name: str, times: Float64, *, again: bool) -> Float64:
-        """Return the steps [N] [s] from the last known time; a negative step is flagged, and zero unless `again`."""
+        """Return the step of each time from the last known time before it [s], [N].
+
+        A negative step is flagged, and also a step of zero unless `again`.
+        """
         known = np.isfinite(times)
         steps = np.full(len(times), np.nan)
         told = times[known]

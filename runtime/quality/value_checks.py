@@ -15,7 +15,7 @@ MOVING = ("state", "action")
 class ValueCheck:
     """Check of every column of vectors, block by block.
 
-    Values that are not finite are treated as unknown by all other checks; their rows are flagged and stay.
+    Values that are not finite are treated as unknown by all other checks; their rows are flagged and are not removed.
     """
 
     def __init__(
@@ -70,7 +70,10 @@ class _Column:
         self._worst: dict[int, int] = {}
 
     def _allowed(self, joints: JointSpecs | None) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
-        """Return the allowed change of each dimension [1/s], inf if any is allowed; None: the column is not checked."""
+        """Return the allowed change of each dimension [1/s], inf if any change is allowed.
+
+        None if the column is not checked.
+        """
         width, settings = self._vector.width, self._settings
         if self._vector.role == "poses":
             bound = np.full(width, np.inf)

@@ -23,9 +23,8 @@ from runtime.recording.scrub import episodes_in, verify_episode
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit code.
 
-    0 is success; 1 means that an episode is unreadable or damaged, or that the disk fails.
-
-    For scrub, 1 means damage, and 2 that an episode could not be read or marked.
+    0 is success; 1 means that an episode is unreadable or damaged, or that the disk fails. For scrub, 1 means damage,
+    and 2 that an episode could not be read or marked.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -65,7 +64,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _scrub(paths: Sequence[Path], as_json: bool) -> int:
-    """Verify every episode of `paths`; an episode that cannot be read or marked does not stop the others."""
+    """Verify every episode of `paths` and return the exit code.
+
+    An episode that cannot be read or marked does not stop the verification of the rest.
+    """
     codes = {0}
     for path in paths:
         try:
@@ -130,7 +132,7 @@ def _lines(episode: Episode) -> list[str]:
 
 
 def _export(paths: Sequence[Path], to: Path | None) -> int:
-    """Export every episode of `paths`; one that fails does not stop the others."""
+    """Export every episode of `paths` and return the exit code; an episode that fails does not stop the rest."""
     failed = 0
     for folder in (episode for path in paths for episode in episodes_in(path)):
         try:
@@ -150,14 +152,17 @@ def _data_of(folder: Path) -> Path:
 
 
 def _lower_priority() -> None:
-    """Run at the lowest priority, and end together with the process that started this one."""
+    """Give this process the lowest priority, and end it together with the process that started it."""
     os.nice(19)
     os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     threading.Thread(target=_end_with_standard_input, daemon=True).start()
 
 
 def _end_with_standard_input() -> None:
-    """End when standard input closes: the starting process holds the other end. A half-written file is only a draft."""
+    """End the process when standard input closes, whose other end the starting process holds.
+
+    A half-written file is only a draft.
+    """
     while os.read(0, 4096):
         pass
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Admission of records to the journal: check against the manifest, and copies of arrays that their owner may reuse."""
+"""Admission of records to the journal: a check against the manifest, and copies of arrays that may be reused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def admit_row(layout: Layout, row: Row, expected: int) -> Row:
     """Return a copy of `row` without pictures.
 
     Vectors that the manifest does not list are dropped; listed vectors may be absent (null in the table). Raises
-    RecordingError if it is not row `expected` or does not fit the manifest.
+    RecordingError if `row` does not have the index `expected` or does not fit the manifest.
     """
     if row.index != expected:
         raise RecordingError(

@@ -27,9 +27,9 @@ Status = Literal["finished", "interrupted", "failed"]
 class Row:
     """Row `index` of the dataset grid: the observation and the action sent at one control tick.
 
-    Vectors as in `runtime.core.types.Observation`. `captured` has the capture time of each stream on our monotonic
-    clock [s]. `pictures` has one entry per recorded camera, RGB uint8 [H, W, 3]; None repeats the previous picture
-    and is flagged.
+    Vectors are as in `runtime.core.types.Observation`. `captured` has the capture time of each stream on our monotonic
+    clock [s]. `pictures` has one entry per recorded camera, RGB uint8 [H, W, 3]; None repeats the previous picture and
+    is flagged.
     """
 
     index: int
@@ -57,7 +57,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class RawChunk:
-    """One chunk of the policy in the policy's own space, with its placement on the timeline."""
+    """Chunk of the policy in the policy's own space, with its placement on the timeline."""
 
     chunk_id: int
     observation_step: int
@@ -89,7 +89,7 @@ VIDEO_LOST = "video_lost"  # kind of the event about a camera whose video has en
 
 @dataclass(frozen=True, slots=True)
 class LostCamera:
-    """Camera whose video ends at row `row` while everything else is recorded on."""
+    """Camera whose video ends at row `row`, while the recording continues without it."""
 
     camera: str
     row: int
@@ -112,7 +112,7 @@ class Outcome:
 
 
 class Journal(ABC):
-    """Writer of one episode while it happens. A kill at any moment loses at most the last second."""
+    """Writer of one episode while it happens; a kill at any moment loses at most the last second."""
 
     @abstractmethod
     def begin(self, manifest: Mapping[str, object]) -> None:
@@ -131,8 +131,8 @@ class Journal(ABC):
 
     @abstractmethod
     def pop_lost_cameras(self) -> Sequence[LostCamera]:
-        """Return cameras that this episode, or the one that ended last, has lost since the last call."""
+        """Return the cameras whose video was lost since the last call, in this episode or the one that ended last."""
 
     @abstractmethod
     def end(self, outcome: Outcome) -> None:
-        """Write everything that waits, close every file, and put the outcome in place last."""
+        """Write all waiting records, close every file, and write the outcome last."""

@@ -23,7 +23,7 @@ _X265_AT_ONCE = (
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """One encoder; `coded` is the format that it writes."""
+    """Video encoder; `coded` is the format that it writes."""
 
     coded: str
     presets: tuple[str, ...]
@@ -62,7 +62,7 @@ def options(name: str, preset: str, crf: int, gop: int) -> dict[str, str]:
 def configure_context(
     context: Any, name: str, size: tuple[int, int], rate: Fraction, told: Mapping[str, str], gop: int
 ) -> None:
-    """Configure an encoder's context for pictures of `size` (height, width) at `rate`."""
+    """Configure an encoder's context for pictures of `size` (height, width) at `rate` [Hz], with the options `told`."""
     context.height, context.width = size
     context.pix_fmt = PIXELS
     context.time_base = 1 / rate

@@ -19,7 +19,7 @@ from runtime.recording.layout import Layout
 class RecordedRow(NamedTuple):
     """Row without its pictures, and the cameras whose frame repeats the previous one.
 
-    `lost` are those among them whose picture exists but is missing in their video.
+    `lost` are the repeated cameras whose picture exists but is missing in their video.
     """
 
     row: Row
@@ -149,7 +149,7 @@ def _vectors(values: Sequence[Float32 | None], width: int) -> Any:
 
 
 def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> list[list[Any] | None]:
-    """Return a list per row of every chunk, None for chunks without values."""
+    """Return one list of values per row of every chunk, None for the rows of chunks without values."""
     rows: list[list[Any] | None] = []
     for each, length in zip(figures, lengths, strict=True):
         rows += [None] * length if each is None else each.tolist()
@@ -157,5 +157,5 @@ def _by_arm(figures: Sequence[NDArray[Any] | None], lengths: Sequence[int]) -> l
 
 
 def _leading(tick: ExecutedTick) -> int:
-    """Return the chunk with the largest weight, the newest of equals; -1 if there is none."""
+    """Return the chunk with the largest weight, the newest if weights are equal; -1 if there is none."""
     return max(zip(tick.weights, tick.chunk_ids, strict=True), default=(0.0, -1))[1]

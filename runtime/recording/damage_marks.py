@@ -19,15 +19,15 @@ FOLDER = "quarantine"
 class DamageMark:
     """Damage found in a recording.
 
-    `damage` has the form of `IntegrityCheck.to_dict`. `seal` is that of the outcome when the damage was found; "" if
-    it had none, None if it is unknown.
+    `damage` has the form of `IntegrityCheck.to_dict`. `seal` is that of the outcome at that time; "" if the outcome had
+    no seal, None if it is unknown.
     """
 
     damage: list[dict[str, Any]]
     seal: str | None
 
     def is_resolved_by(self, verdict: IntegrityCheck) -> bool:
-        """Return True if the same recording is intact again, and not one that was sealed anew since."""
+        """Return True if the same recording is intact again; not if it was sealed anew since."""
         if verdict.state == "sound":
             return verdict.seal == self.seal if self.seal else self.seal is None or not verdict.repaired
         files = {one["file"] for one in self.damage}
@@ -47,7 +47,7 @@ def data_of(folder: Path) -> Path | None:
 
 
 def read_mark(data: Path, uuid: str) -> DamageMark | None:
-    """Return the mark of a recording or None. A mark that is itself unreadable is returned without damage."""
+    """Return the mark of a recording, or None if there is none; an unreadable mark is returned without damage."""
     path = mark_file(data, uuid)
     if not path.exists():
         return None
@@ -62,7 +62,7 @@ def read_mark(data: Path, uuid: str) -> DamageMark | None:
 
 
 def known_damage(verdict: IntegrityCheck) -> tuple[Damage, ...]:
-    """Return damage found by an earlier check that `verdict` does not resolve."""
+    """Return damage found by an earlier check that the check `verdict` does not resolve."""
     data = data_of(verdict.path)
     mark = read_mark(data, verdict.path.name) if data else None
     if mark is None or mark.is_resolved_by(verdict):
@@ -77,7 +77,7 @@ def _damage(told: Mapping[str, Any]) -> Damage:
 
 
 def _is_damage_table(one: object) -> bool:
-    """Return True if it has the form of a damage in `IntegrityCheck.to_dict`."""
+    """Return True if the value has the form of one damage in `IntegrityCheck.to_dict`."""
     if not isinstance(one, dict) or one.keys() != {"file", "what", "rows", "times", "text"}:
         return False
     words = all(isinstance(one[name], str) for name in ("file", "what", "text"))
@@ -85,6 +85,6 @@ def _is_damage_table(one: object) -> bool:
 
 
 def _are_spans(value: object, kind: type) -> bool:
-    """Return True if it is a list of [first, last] pairs."""
+    """Return True if the value is a list of [first, last] pairs whose ends are of type `kind`."""
     spans = value if isinstance(value, list) else [None]
     return all(isinstance(span, list) and [type(end) for end in span] == [kind, kind] for span in spans)

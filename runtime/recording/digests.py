@@ -1,4 +1,4 @@
-"""SHA-256 of a growing file, as a whole and in pieces, so that damaged rows can be located."""
+"""SHA-256 of a growing file and of its pieces, by which damaged rows can be located."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ FileDigest = dict[str, Any]  # "bytes", "sha256", "pieces": each "END ROWS SHA25
 
 
 def rows_per_piece(fps: float) -> int:
-    """Return the rows per piece of a video: one second, so that the list for a long video stays short."""
+    """Return the number of rows per piece of a video: those of one second.
+
+    This keeps the list of pieces of a long video short.
+    """
     return max(1, round(fps))
 
 
 class Digest:
-    """Digest of a growing file. A piece ends when it has at least `least` rows."""
+    """Digest of a growing file and of its pieces. A piece ends when it has at least `least` rows."""
 
     def __init__(self, least: int = 1) -> None:
         self._least = least
@@ -23,7 +26,7 @@ class Digest:
         self._pieces: list[str] = []
 
     def add(self, data: bytes | bytearray | memoryview, rows: int = 0) -> None:
-        """Add the next bytes of the file with their number of rows or lines; 0 for a header."""
+        """Add the next bytes of the file, which contain `rows` rows or lines (0 for a header)."""
         if not data:
             return
         self._whole.update(data)

@@ -1,4 +1,4 @@
-"""Encoder thread of one camera; its failure costs this camera's video and nothing else."""
+"""Encoder thread of one camera; its failure costs only this camera's video."""
 
 from __future__ import annotations
 
@@ -57,7 +57,10 @@ class DurationHistogram:
 
 
 class CameraEncoder:
-    """Encoder of one camera's pictures on its own thread. `put` waits for it only if a patience is given."""
+    """Encoder of one camera's pictures on its own thread.
+
+    `put` waits for a place in the queue only if it is called with a patience.
+    """
 
     def __init__(
         self, camera: str, path: Path, size: tuple[int, int], fps: float, settings: RecordingSettings
@@ -89,18 +92,21 @@ class CameraEncoder:
 
     @property
     def frames(self) -> int:
-        """Number of frames encoded so far; all are in the file once the encoder has drained without failure."""
+        """Number of frames encoded so far; all are in the file once `drain` has ended without a failure."""
         return self._video.frames
 
     @property
     def muxed_ms(self) -> dict[str, float] | None:
-        """Time from capture until the packet went to the muxer [ms], as percentiles; None if unknown."""
+        """Return p50, p99 and maximum of the time from capture until the packet went to the muxer [ms].
+
+        None if it is unknown.
+        """
         return self._muxed.milliseconds()
 
     def put(self, picture: UInt8 | None, patience: float = 0.0, captured: float = math.nan) -> bool:
-        """Queue the next row's picture, which must no longer change; return False if it became a repeat.
+        """Queue the next row's picture, which must no longer change; return False if the row becomes a repeat.
 
-        A failed encoder accepts nothing, and an encoder that is too far behind fails.
+        A failed encoder accepts no pictures, and an encoder that is too far behind fails.
 
         Args:
             picture: RGB uint8 [H, W, 3]; None repeats the previous one.
@@ -118,7 +124,7 @@ class CameraEncoder:
         return taken
 
     def finish(self) -> None:
-        """Request the thread to encode the waiting pictures and to end."""
+        """Tell the thread to encode the waiting pictures and to end."""
         self._queue.close()
 
     def drain(self, deadline: float) -> bool:
@@ -127,9 +133,10 @@ class CameraEncoder:
         return not self._thread.is_alive()
 
     def save(self) -> None:
-        """Write the part of an ended video that a full disk refused. Raises DiskFullError if it refuses again.
+        """Write the part of an ended video that a full disk refused.
 
-        Pictures that were dropped meanwhile are lost, and remain a failure.
+        Pictures that were dropped meanwhile are lost, and remain a failure. Raises DiskFullError if the disk refuses
+        again.
         """
         if isinstance(self.failure, DiskFullError):
             self._video.close()
@@ -170,7 +177,7 @@ class CameraEncoder:
             self._queue.close(discard=True)
 
     def _encode_or_fail(self, entry: Picture | int) -> None:
-        """Encode one entry; bytes that a full disk refuses stay in memory for the next write or the end."""
+        """Encode one entry; bytes that a full disk refuses stay in memory until the next write or the end."""
         try:
             self._encode(entry)
         except DiskFullError as error:
@@ -190,7 +197,7 @@ class CameraEncoder:
             self._muxed.add(self._video.muxed_at - self._captured.popleft())
 
     def _salvage(self, failure: RecordingError) -> None:
-        """Write the frames that the failed encoder still has, if possible."""
+        """Write the frames that the failed encoder still has in memory, if possible; else add a note to `failure`."""
         try:
             self._video.close()
         except Exception as error:

@@ -1,4 +1,4 @@
-"""Test of a deployment's video encoder on this machine: a few pictures are coded."""
+"""Check of a deployment's video encoder on this machine, by coding a few pictures."""
 
 from __future__ import annotations
 

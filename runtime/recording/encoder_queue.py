@@ -1,4 +1,4 @@
-"""Queue of pictures for one encoder with a bounded lag; a picture that does not fit becomes a repeat."""
+"""Queue of pictures for one encoder with a bounded lag; a picture that does not fit is replaced by a repeat."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _GUESS_S = (
 
 
 class Picture(NamedTuple):
-    """A picture RGB uint8 [H, W, 3] and its capture time [s, monotonic; NaN if unknown]."""
+    """Picture RGB uint8 [H, W, 3] and its capture time [s, monotonic; NaN if unknown]."""
 
     pixels: UInt8
     captured: float
 
 
 def encode_count(repeats: int) -> int:
-    """Return the number of frames to code for that many repeats in a row; the others are copies.
+    """Return the number of frames to code for `repeats` repeats in a row; the remaining frames are copies.
 
-    A run of copies alternates between two key frames and ends with the second, so for an odd number one more repeat
+    A run of copies alternates between two key frames and ends with the second, so if the number is odd, one more repeat
     is coded before it.
     """
     return repeats if repeats < RUN else 2 + repeats % 2
@@ -38,7 +38,7 @@ class Pace:
         self.coding_s = _GUESS_S
 
     def update(self, codings: int, seconds: float) -> None:
-        """Record that `codings` frames took `seconds`, including waiting for a processor."""
+        """Record that coding `codings` frames took `seconds`, including waiting for a processor."""
         each = seconds / codings
         self.coding_s = max(each, self.coding_s + 0.2 * (each - self.coding_s))
 
@@ -47,7 +47,7 @@ class PictureQueue:
     """Queue that accepts pictures as long as all its content can be coded within `max_lag_s` at the present pace.
 
     At most `places` pictures are stored. Repeats are only counted: a run of any length costs at most three codings. An
-    empty queue accepts a picture however slow the encoder is.
+    empty queue accepts a picture even if the encoder is too slow.
     """
 
     def __init__(self, places: int, max_lag_s: float = math.inf) -> None:

@@ -57,11 +57,11 @@ _PATIENCE = 6.0  # factor of the drain timeout in lockstep, which loses nothing 
 class EpisodeJournal(Journal):
     """Journal that writes `root`/<uuid>/, one episode after the other; one thread appends.
 
-    A picture that is missing, or that an encoder has no time for, becomes a flagged repeat, so that `append` never
+    A picture that is missing, or for which an encoder has no time, becomes a flagged repeat, so that `append` never
     waits for an encoder. With `patient` (lockstep has no deadline) it waits for a free place and for the end of
     encoders, long enough to distinguish a slow encoder from one that never ends. An encoder that fails, or whose file
-    cannot be written, costs the video of its camera: `pop_lost_cameras` names it, and everything else is recorded on.
-    Pictures are passed without a copy: they must no longer change.
+    cannot be written, costs the video of its camera: `pop_lost_cameras` names it, and the recording continues. Pictures
+    are passed without a copy: they must no longer change.
     """
 
     def __init__(
@@ -107,11 +107,11 @@ class EpisodeJournal(Journal):
         return told
 
     def end(self, outcome: Outcome) -> None:
-        """Write everything that waits, close every file, and put the outcome in place last.
+        """Write all waiting records, close every file, and write the outcome last.
 
         Measured figures (frames, duration_s, ...) replace those of `outcome.details`. An error of a thread makes the
         status "failed"; it is raised after everything else was saved, unless `append` has raised it already. Raises
-        UnclosedError if the disk has no room for the end: nothing is lost, and the end can be written again later.
+        UnclosedError if the disk has no room for the end: no data are lost, and the end can be written again later.
         """
         recording, self._recording = self._begun(), None
         try:
@@ -139,7 +139,7 @@ def _create(root: Path, name: str) -> Path:
 
 
 def lock_folder(folder: Path) -> int | None:
-    """Return a descriptor that marks `folder` as being written until it is closed; None if another process does so.
+    """Return a descriptor that locks `folder` for writing until it is closed; None if another process has locked it.
 
     The kernel releases the lock however the process ends.
     """
@@ -225,7 +225,7 @@ class _Recording:
         self._writer.add("rows", RecordedRow(kept, frozenset(repeated), frozenset(lost)), self._patience)
 
     def _capture_time(self, row: Row, camera: str) -> float:
-        """Return the capture time of the picture; NaN in lockstep, whose clock is not that of the encoders."""
+        """Return the capture time of the picture; NaN in lockstep, because encoders use another clock there."""
         return math.nan if self._patience else row.captured.get(camera, math.nan)
 
     def mark(self, event: Mapping[str, object]) -> None:
@@ -257,7 +257,10 @@ class _Recording:
         self._conclude(outcome, stuck)
 
     def _conclude(self, outcome: Outcome, stuck: Sequence[CameraEncoder]) -> None:
-        """Write the outcome. Raises UnclosedError, with the folder still locked, if the disk has no room."""
+        """Write the outcome, with digests of all files but those of the encoders `stuck`.
+
+        Raises UnclosedError, with the folder still locked, if the disk has no room.
+        """
         full: DiskFullError | None = self._writer.full
         try:
             if full is None:
@@ -278,7 +281,7 @@ class _Recording:
         self._conclude(outcome, stuck)
 
     def _report_losses(self) -> None:
-        """Report encoders that dropped pictures because the disk was full, even if it has room again."""
+        """Report a full disk as a fault for encoders that dropped pictures, even if the disk has room again."""
         for encoder in self._encoders.values():
             if isinstance(encoder.failure, DiskFullError):
                 self._faults.report(encoder.failure)
@@ -320,7 +323,10 @@ class _Recording:
         }
 
     def _digests(self, stuck: Sequence[CameraEncoder]) -> dict[str, FileDigest]:
-        """Return the digests of the written files, after a fault as they are on disk; none of files still in use."""
+        """Return the digests of the written files, except those that the encoders `stuck` may still write.
+
+        After a fault the files are read back from the disk.
+        """
         if self._faults.first is not None:
             digests = digests_of(self.folder, self._layout)
         else:
@@ -337,7 +343,7 @@ class _Recording:
         self._faults.raise_pending()
 
     def _check_encoders(self) -> None:
-        """End the recording if the disk is full; any other failure ends only the video of its camera."""
+        """Check for failed encoders: a full disk ends the recording, any other failure only the video of its camera."""
         for camera, encoder in self._encoders.items():
             failure = encoder.failure
             if isinstance(failure, DiskFullError):

@@ -69,7 +69,7 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """Content of an export: manifest, outcome and tables."""
+    """Content of an exported run: manifest, outcome and tables."""
 
     manifest: Mapping[str, object]
     outcome: Mapping[str, object]
@@ -79,7 +79,7 @@ class _Run:
 
 
 def write_export(folder: Path, root: Path) -> Path:
-    """Export the episode in `folder` to its path below `root`; an up-to-date export stays as it is. Return the path.
+    """Export the episode in `folder` to its path below `root`, unless an export there is up to date; return the path.
 
     Any number of processes may do so at once. Raises RecordingError if the episode has no outcome yet, is damaged, or
     the disk refuses the file.
@@ -101,7 +101,10 @@ def export_table(folder: Path) -> bytes:
 
 
 def export_path(manifest: Mapping[str, object], root: Path) -> Path:
-    """Return the path of the export of that manifest's run. Raises RecordingError if it lacks a valid uuid."""
+    """Return the path of the export of the run with this manifest.
+
+    Raises RecordingError if the manifest lacks a valid uuid.
+    """
     prompt, mode, strategy = (manifest.get(key) for key in ("task", "mode", "strategy"))
     run = Layout.from_manifest(manifest).uuid
     return root / FOLDER / slug(prompt, NO_PROMPT) / slug(mode) / slug(strategy) / f"{run}.parquet"
@@ -140,7 +143,10 @@ def _read(folder: Path, manifest: Mapping[str, object]) -> _Run:
 
 
 def _content(run: _Run) -> bytes:
-    """Return the parquet file; each stream begins a row group, so that a reader of one can skip the others."""
+    """Return the content of the parquet file.
+
+    Each stream begins a row group, so that a reader of one stream can skip the rest.
+    """
     schema = SCHEMA.with_metadata(_metadata(run))
     sink = pa.BufferOutputStream()
     try:
@@ -224,7 +230,7 @@ def _executed(run: _Run) -> dict[str, Any]:
 
 
 def _null_if_negative(numbers: Any) -> Any:
-    """Replace -1, which means none, by null."""
+    """Return the numbers with null in place of -1, which means none."""
     return pc.if_else(pc.less(numbers, 0), None, numbers)
 
 
@@ -237,7 +243,7 @@ def _owners(run: _Run, steps: Any) -> Any:
 
 
 def _at_steps(ticks: Any, column: str, steps: Any) -> Any:
-    """Return that column of the ticks of the given steps; null for a step without a tick."""
+    """Return the values of `column` of the ticks at the given steps; null for a step without a tick."""
     known, wanted = ticks["step"].to_numpy(), steps.to_numpy()
     places = np.searchsorted(known, wanted)
     found = places < len(known)

@@ -27,7 +27,10 @@ class DiskFullError(RecordingError):
 
 
 class UnclosedError(DiskFullError):
-    """Error of an episode's end that did not fit on the disk; call `again` to write the rest. It may raise anew."""
+    """Error that an episode's end did not fit on the disk.
+
+    Call `again` to write the rest; it may raise the error anew.
+    """
 
     def __init__(self, why: str, again: Callable[[], None]) -> None:
         super().__init__(why)
@@ -35,10 +38,10 @@ class UnclosedError(DiskFullError):
 
 
 class AppendFile:
-    """File that only grows, by whole writes: a write that fails midway is cut off again.
+    """File that only grows, by whole writes: a write that fails midway is undone.
 
-    One thread writes; another may sync at the same time. Disk errors become RecordingError. Its digest has pieces of
-    at least `least` rows.
+    One thread writes; another may sync at the same time. Disk errors become RecordingError. Its digest has pieces of at
+    least `least` rows.
     """
 
     def __init__(self, path: Path, least: int = 1) -> None:
@@ -71,7 +74,7 @@ class AppendFile:
         self._digest.add(data, rows)
 
     def sync(self) -> None:
-        """Wait until the written bytes are on the disk; returns at once if nothing is new."""
+        """Wait until the written bytes are on the disk; return at once if none were written since the last call."""
         size = self.size
         if size == self._synced:
             return
@@ -94,7 +97,10 @@ class AppendFile:
 
 
 def disk_error(doing: str, path: Path, error: OSError) -> RecordingError:
-    """Return the error with its cause, the file and the free space; DiskFullError if the disk or quota is full."""
+    """Return the error to raise for `error`, with its cause, the file and the free space.
+
+    It is a DiskFullError if the disk or quota is full.
+    """
     full = _FULL.get(error.errno or 0)
     what = full or _OTHERS.get(error.errno or 0, "disk error")
     reason = error.strerror or str(error)
@@ -120,7 +126,7 @@ def require_room(folder: Path, wanted: int) -> None:
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Call `write_durably`. Raises RecordingError or DiskFullError."""
+    """Replace the file at `path` durably by `write_durably`. Raises RecordingError or DiskFullError."""
     try:
         write_durably(path, data)
     except OSError as error:
@@ -129,7 +135,7 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 @contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Exclude other users of this lock from `folder`, which is created if it is absent.
+    """Hold a lock on `folder`, created if absent, while the context is open; wait if another process holds it.
 
     The kernel releases the lock however the process ends. Raises RecordingError.
     """

@@ -1,4 +1,4 @@
-"""Reading of fragmented MP4 with a possibly torn end: end of the whole fragments, number of decodable frames."""
+"""Reading of fragmented MP4 files whose end may be torn: their whole fragments, and the number of decodable frames."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _LONG = struct.Struct(">Q")
 
 
 def whole_bytes(path: Path) -> int:
-    """Return the bytes up to the end of the last whole fragment (moof and its mdat); 0 if the header is torn.
+    """Return the number of bytes up to the end of the last whole fragment (moof and its mdat).
 
-    Boxes as in ISO/IEC 14496-12, section 4.2.
+    0 if the header is torn. Boxes as in ISO/IEC 14496-12, section 4.2.
     """
     with open(path, "rb") as file:
         total = file.seek(0, 2)
@@ -35,7 +35,10 @@ def whole_bytes(path: Path) -> int:
 
 
 def fragments(path: Path) -> Iterator[tuple[bytes, int]]:
-    """Yield the parts of the file with their frames: header, fragments, rest after the last whole one."""
+    """Yield the parts of the file, each with its number of frames.
+
+    The parts are the header, the fragments, and the rest after the last whole fragment.
+    """
     with open(path, "rb") as file:
         total = file.seek(0, 2)
         begin = end = 0
@@ -72,7 +75,7 @@ def _samples(file: BinaryIO, position: int, total: int) -> int:
 
 
 def count_frames(path: Path) -> int:
-    """Return the number of frames that decode from the start of the file to its torn end; 0 if none does.
+    """Return the number of frames that decode from the start of the file to its possibly torn end; 0 if there are none.
 
     All packets are counted. Only the last two groups of pictures can have suffered from a kill or a power cut, so only
     these are decoded.

@@ -34,10 +34,10 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class IntegrityCheck:
-    """Integrity check of one episode: "sound", "damaged", "unsealed" (no digests) or "open" (no outcome).
+    """Result of the integrity check of one episode: "sound", "damaged", "unsealed" or "open".
 
-    "unsealed" means that nothing proves whether its files are as they were written. `seal` is that of its outcome, or
-    of the copy if the outcome is lost; "" if there is neither.
+    "unsealed" (no digests) means that nothing proves whether the files are as they were written, "open" that there is
+    no outcome. `seal` is that of the outcome, or of its copy if the outcome is lost; "" if there is neither.
     """
 
     path: Path

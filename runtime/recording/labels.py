@@ -17,7 +17,10 @@ FOLDER = "labels"
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """Label of an episode: `time` is Unix time [s]; `result` is None until a user has judged; discarding is final."""
+    """Label of an episode by a user.
+
+    `time` is Unix time [s]; `result` is None until a user has judged the episode; discarding is final.
+    """
 
     time: float
     by: str
@@ -38,7 +41,7 @@ def read_labels(data: Path, episode: str) -> list[Label]:
 
 
 def latest_label(data: Path, episode: str) -> Label | None:
-    """Return the newest label, which counts, or None."""
+    """Return the newest label of an episode, which is the one that counts; None if it has no label."""
     said = read_labels(data, episode)
     return said[-1] if said else None
 

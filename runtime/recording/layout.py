@@ -121,13 +121,13 @@ def _camera(key: str, size: object) -> tuple[int, int]:
 
 
 def _captured(size: Mapping[str, object]) -> tuple[int, int]:
-    """Return height and width of a camera's pictures; those of its video if it is not scaled."""
+    """Return height and width of a camera's pictures; if the manifest does not name them, those of its video."""
     names = ("captured_height", "captured_width") if "captured_height" in size else ("height", "width")
     return _count(size, names[0]), _count(size, names[1])
 
 
 def simulated(manifest: Mapping[str, Any]) -> bool:
-    """Return True if the episode's deployment declares a simulated bench, whose pictures are rendered."""
+    """Return True if the episode's deployment declares a simulated bench, so that its pictures are rendered."""
     configuration = manifest.get("configuration")
     transport = configuration.get("transport") if isinstance(configuration, Mapping) else None
     return isinstance(transport, Mapping) and transport.get("simulated") is True

@@ -1,4 +1,4 @@
-"""Outcome of an episode with the digests of its files and its own seal, so that it can be verified at any time."""
+"""Outcome of an episode, with the digests of its files and its own seal, by which it can be verified at any time."""
 
 from __future__ import annotations
 
@@ -53,7 +53,10 @@ def seal_outcome(outcome: Mapping[str, object], digests: Mapping[str, FileDigest
 
 
 def write_outcome(folder: Path, text: bytes) -> None:
-    """Write the sealed outcome and its copy. outcome.json comes last: with it the episode is closed."""
+    """Write the sealed outcome and its copy.
+
+    outcome.json is written last, because an episode with it counts as closed.
+    """
     for name in (OUTCOME_COPY, OUTCOME):
         write_atomic(folder / name, text)
 
@@ -76,7 +79,7 @@ def read_outcome(folder: Path, name: str = OUTCOME) -> dict[str, Any]:
 
 
 def without_digests(outcome: Mapping[str, object]) -> dict[str, object]:
-    """Return an outcome without its digests, for copies elsewhere."""
+    """Return an outcome without its digests, for copies of it elsewhere."""
     return {name: value for name, value in outcome.items() if name not in (COPY, DIGESTS, SEAL)}
 
 

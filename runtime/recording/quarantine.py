@@ -15,7 +15,7 @@ from runtime.recording.scrub import verify_episode
 
 
 def update_mark(verdict: IntegrityCheck) -> None:
-    """Update the mark of an episode in DATA/episodes to a check; remove it if the episode is intact again.
+    """Update the mark of an episode in DATA/episodes by the check `verdict`; remove it if the episode is intact again.
 
     The mark stays if the recording is now intact under another seal, or without one, because that does not show that
     its damage was mended. Episodes elsewhere have no marks. Raises RecordingError if the disk fails.
@@ -49,7 +49,7 @@ def _mark(data: Path, verdict: IntegrityCheck) -> None:
 
 
 def _remove_mark(data: Path, verdict: IntegrityCheck) -> None:
-    """Remove the mark after checking again: another process may have found damage since `verdict`."""
+    """Remove the mark, after another check because another process may have found damage since `verdict`."""
     path = mark_file(data, verdict.path.name)
     with exclusive(path.parent):
         mark = read_mark(data, verdict.path.name)

@@ -17,14 +17,14 @@ from runtime.recording.tables import SCHEMAS, read_table
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One episode as it is on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
+    """Episode as it is on disk; tables are pyarrow.Table with the columns of runtime.recording.tables.
 
     Its files are not verified against the digests in its outcome, and `outcome` does not contain them; for a check see
     runtime.recording.scrub.
 
     `rows` has exactly `frames` rows, and frame k of every video belongs to row k for k < `frames`. A video may have
-    more frames, and that of a lost camera has fewer: see `shown`. Without an outcome the episode is being written or
-    was cut off: then `frames` only counts rows, and videos may have fewer frames.
+    more frames, and that of a lost camera has fewer: see `frame_count`. Without an outcome the episode is being written
+    or was cut off: then `frames` only counts rows, and videos may have fewer frames.
     """
 
     path: Path
@@ -41,7 +41,7 @@ class Episode:
 
     @property
     def lost(self) -> Mapping[str, Mapping[str, Any]]:
-        """Cameras whose video ended before the episode: `row`, the first without a picture, and `reason`."""
+        """Cameras whose video ended before the episode, each with `row`, the first without a picture, and `reason`."""
         lost = (self.outcome or {}).get("lost_cameras")
         return lost if isinstance(lost, Mapping) else {}
 
@@ -83,7 +83,10 @@ class EventsRead:
 
 
 def read_events(path: Path) -> EventsRead:
-    """Return every line that is one JSON object; an absent log has none. Raises RecordingError."""
+    """Return all whole events of the log, lines that are one JSON object; an absent log has none.
+
+    Raises RecordingError if the log cannot be read.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:

@@ -42,12 +42,12 @@ UNPROVABLE = "its outcome is lost, and with it whether its files are as they wer
 
 @dataclass(frozen=True, slots=True)
 class RepairReport:
-    """Findings and actions of a repair, with one of these values of `verdict`:
+    """Findings and actions of the repair of an episode, with one of these values of `verdict`:
 
-    "complete": it has an outcome, nothing was done.
-    "restored": its outcome was restored from the copy; `problem` is the damage that it had.
-    "damaged": it has an outcome that its files do not match (`problem`); it cannot be mended, nothing was done.
-    "repaired": it now has an outcome; `problem` names facts that are lost if it had been closed before.
+    "complete": the episode has an outcome, nothing was done.
+    "restored": its outcome was restored from the copy; `problem` is the damage that the outcome had.
+    "damaged": its files do not match its outcome (`problem`); this cannot be mended, nothing was done.
+    "repaired": it has an outcome now; `problem` names facts that are lost if it had been closed before.
     "recording": it is being written, nothing was done.
     "unreadable": it has no usable manifest, nothing was done.
     "failed": stopped by `problem`.
@@ -90,7 +90,7 @@ def repair(path: Path) -> RepairReport:
 
 
 def repair_all(root: Path) -> list[RepairReport]:
-    """Repair every episode in `root` without an outcome; one that fails does not stop the others."""
+    """Repair every episode in `root` without an outcome; an episode that fails does not stop the rest."""
     folders = [folder for folder in sorted(root.iterdir()) if folder.is_dir()] if root.is_dir() else []
     return [_attempt(folder) for folder in folders if not (folder / OUTCOME).exists()]
 
@@ -114,9 +114,9 @@ def _judge(path: Path) -> RepairReport:
 
 
 def _closed(path: Path, found: IntegrityCheck) -> RepairReport:
-    """Restore a missing or damaged outcome, or its copy, from the other one; mend nothing else.
+    """Restore outcome.json or its copy, if one is missing or damaged, from the intact file; change no other file.
 
-    This is done only if all other files match.
+    This is done only if all other files match their digests. Return the report.
     """
     restored = ""
     if found.state in ("open", "damaged") and (whole := _whole_outcome(path, found)):
@@ -131,7 +131,10 @@ def _closed(path: Path, found: IntegrityCheck) -> RepairReport:
 
 
 def _whole_outcome(path: Path, found: IntegrityCheck) -> bytes | None:
-    """Return the intact one of the two outcome files if only the other one is damaged; else None."""
+    """Return the content of the only intact outcome file, outcome.json or its copy.
+
+    None unless exactly one of them is intact and no other file is damaged.
+    """
     if {one.file for one in found.damage} - {OUTCOME, OUTCOME_COPY}:
         return None
     whole = {}
@@ -161,7 +164,7 @@ def _complete(path: Path, layout: Layout) -> RepairReport:
 
 @dataclass(frozen=True, slots=True)
 class _FolderState:
-    """Episode before its repair, stored so that a repair can continue after a kill."""
+    """State of an episode's folder before its repair, stored so that a repair can continue after a kill."""
 
     ended: float  # time of its last write [Unix s]
     rows: int
@@ -171,7 +174,7 @@ class _FolderState:
 
 
 def _load_or_measure(path: Path, layout: Layout) -> _FolderState:
-    """Return the state that an earlier attempt stored; else measure and store it now."""
+    """Return the folder's state that an earlier attempt stored; if there is none, measure and store it now."""
     plan = path / PLAN
     if plan.exists():
         try:
@@ -194,7 +197,7 @@ def _measured(path: Path, layout: Layout) -> _FolderState:
 
 
 def _unproven(path: Path, closed: bool) -> str:
-    """Return a sentence on the lost facts of an episode that was closed; "" without a sign that it was."""
+    """Return a sentence about the facts that an episode lost if it had been closed; "" without a sign that it was."""
     data = data_of(path)
     table = export_path(read_json(path / MANIFEST), data) if data else None
     if table is not None and table.exists():
@@ -222,7 +225,7 @@ def _repair_videos(path: Path, layout: Layout) -> dict[str, int]:
 
 
 def _repair_tables(path: Path, layout: Layout, videos: Sequence[int]) -> int:
-    """Cut the rows to the shortest of `videos` and close all tables; return the common number of rows and frames."""
+    """Cut the rows to the frame count of the shortest of `videos`, and close all tables; return the common count."""
     frames = 0
     for name, schema in SCHEMAS.items():
         file = path / f"{name}.arrow"

@@ -1,4 +1,4 @@
-"""Content that a manifest's `collection` requires of a demonstration; other episodes record everything."""
+"""Schema of a demonstration, which a manifest's `collection` requires; other episodes record everything."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from runtime.core.types import Observation
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Recorded cameras and vectors, None for all. `reported`: actions are those that the node reports."""
+    """Recorded cameras and vectors; None: all of them. `reported`: actions are those that the node reports."""
 
     cameras: tuple[str, ...] | None = None
     columns: tuple[str, ...] | None = None
@@ -22,7 +22,7 @@ class Schema:
 
     @classmethod
     def from_manifest(cls, manifest: Mapping[str, Any]) -> Schema:
-        """Read it from a manifest that media has not completed yet."""
+        """Read the schema from a manifest that media has not completed yet."""
         said = manifest.get("collection")
         if not said:
             return cls()
@@ -36,15 +36,18 @@ class Schema:
         )
 
     def recorded_cameras(self, cameras: Sequence[str]) -> tuple[str, ...]:
-        """Return those of `cameras` that are recorded."""
+        """Return the cameras among `cameras` that are recorded."""
         return tuple(key for key in cameras if self.cameras is None or key in self.cameras)
 
     def records_column(self, column: str) -> bool:
-        """Return True if that vector is recorded when it is available."""
+        """Return True if the vector `column` is recorded when it is available."""
         return self.columns is None or column in self.columns
 
     def streams(self, *, qvel: bool, effort: bool, posed: bool) -> dict[str, bool]:
-        """Return which vectors, besides joints and actions, are recorded of a robot with these (`posed`: with arms)."""
+        """Return for each vector besides joints and actions whether it is recorded.
+
+        `qvel`, `effort` and `posed` (it has arms) state whether the robot has such vectors.
+        """
         there = {"qvel": qvel, "effort": effort, "eef": posed, "eef_action": posed}
         return {name: has and self.records_column(name) for name, has in there.items()}
 

@@ -32,7 +32,7 @@ from runtime.recording.unreadable_files import find_unreadable
 
 
 def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
-    """Check the files of the episode in `folder`, all or only `files`.
+    """Check all files of the episode in `folder`, or only `files`, against their digests; return the result.
 
     Raises RecordingError if the folder is no episode or cannot be read.
     """
@@ -51,7 +51,10 @@ def verify_episode(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
 
 
 def _without_outcome(folder: Path) -> IntegrityCheck:
-    """Return the check of an episode without an outcome: open, unless a copy or a mark shows that it was closed."""
+    """Return the check of an episode without an outcome.
+
+    It counts as open, unless a copy or a mark shows that it was closed.
+    """
     if (folder / OUTCOME_COPY).exists():
         found = _verify_by_copy(folder, Damage(OUTCOME, "is absent, and was there"))
         if found.seal and len(found.damage) == 1:
@@ -65,7 +68,7 @@ def _without_outcome(folder: Path) -> IntegrityCheck:
 
 
 def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
-    """Return the check of an episode whose outcome is lost or damaged, by its copy if that is whole."""
+    """Return the check of an episode whose outcome is lost or damaged, by the copy of the outcome if that is intact."""
     if not (folder / OUTCOME_COPY).exists():
         return IntegrityCheck(folder, "damaged", (lost,))
     try:
@@ -81,7 +84,10 @@ def _verify_by_copy(folder: Path, lost: Damage) -> IntegrityCheck:
 def _compare_digests(
     folder: Path, outcome: Mapping[str, Any], files: Collection[str], second: bool = True
 ) -> IntegrityCheck:
-    """Compare all files, or `files`, with their digests; with `second` all files include the copy of the outcome."""
+    """Compare all files, or only `files`, with their digests; return the result.
+
+    If `second`, the copy of the outcome counts as one of all files.
+    """
     manifest = _manifest(folder)
     digests = {name: told for name, told in outcome[DIGESTS].items() if not files or name in files}
     found = [_damage(folder / name, digest, manifest) for name, digest in digests.items()]
@@ -103,7 +109,10 @@ def _verify_copy(folder: Path) -> Damage | None:
 
 
 def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
-    """Verify the episode. Raises DamagedError if a file differs from its digest, or earlier damage is unresolved."""
+    """Verify the episode.
+
+    Raises DamagedError if a file differs from its digest, or damage found earlier is unresolved.
+    """
     verdict = verify_episode(folder, files)
     if verdict.state in ("sound", "unsealed") and (damage := known_damage(verdict)):
         verdict = IntegrityCheck(folder, "damaged", damage, verdict.bytes, verdict.seal)
@@ -113,7 +122,7 @@ def require_intact(folder: Path, files: Collection[str] = ()) -> IntegrityCheck:
 
 
 def episodes_in(path: Path) -> list[Path]:
-    """Return the episode folders at `path`, in it or in its folder `episodes`.
+    """Return the episode folders that `path` is, or that are in it or in its folder `episodes`.
 
     Raises RecordingError if there are none.
     """
@@ -149,7 +158,7 @@ def _damage(path: Path, digest: FileDigest, manifest: Mapping[str, object]) -> D
 
 
 def _located(name: str, file: BinaryIO, digest: FileDigest, rate: float | None) -> Damage:
-    """Return the damage with the rows of the changed pieces; a changed header makes all rows doubtful."""
+    """Return the damage of a file, with the rows of its changed pieces; a changed header makes all rows doubtful."""
     size = file.seek(0, os.SEEK_END)
     what = (
         "is changed" if size == digest["bytes"] else f"has {size} bytes, was recorded with {digest['bytes']}"
@@ -184,7 +193,7 @@ def _joined(spans: list[tuple[int, int]], first: int, last: int) -> list[tuple[i
 
 
 def _manifest(folder: Path) -> Mapping[str, object]:
-    """Return the manifest, needed only for times; {} if it is unreadable, which its digest reports."""
+    """Return the manifest, which is needed only for times; {} if it is unreadable, which its digest reports."""
     try:
         return read_json(folder / MANIFEST)
     except RecordingError:
@@ -192,7 +201,7 @@ def _manifest(folder: Path) -> Mapping[str, object]:
 
 
 def _rate(name: str, manifest: Mapping[str, object]) -> float | None:
-    """Return the rows per second of that file; None if its rows have no rate."""
+    """Return the rows per second of the file `name`; None if its rows have no rate."""
     key = "control_rate" if name == "ticks.arrow" else "fps"
     timed = name.endswith(".mp4") or name.startswith(("rows.", "ticks."))
     value = manifest.get(key) if timed else None

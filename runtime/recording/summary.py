@@ -107,5 +107,5 @@ class _Tally:
 
 
 def _count_true(batch: Any, column: str) -> int:
-    """Return the number of rows with the flag; 0 if the table is older than the flag."""
+    """Return the number of rows whose flag `column` is set; 0 if the table is older than the flag."""
     return int(batch.column(column).true_count) if column in batch.schema.names else 0

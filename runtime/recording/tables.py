@@ -20,7 +20,10 @@ END_OF_STREAM = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # Arrow columnar format, "I
 
 
 def rows_schema(layout: Layout) -> Any:
-    """Return the schema of rows.arrow: one row per step of the dataset grid; row k has frame k of every video."""
+    """Return the schema of rows.arrow: one row per step of the dataset grid.
+
+    Row k belongs to frame k of every video.
+    """
     vectors = [pa.field(name, _vector(layout.width(name))) for name in layout.streams]
     captures = [pa.field(f"capture_time.{stream}", pa.float64()) for stream in layout.capture_streams]
     flags = [
@@ -73,7 +76,10 @@ def ticks_schema(layout: Layout) -> Any:
 
 
 def smoothed_schema(layout: Layout) -> Any:
-    """Return the schema of smoothed.arrow: planned actions, with the chunks that made them, of ticks that have one."""
+    """Return the schema of smoothed.arrow: planned actions, with the chunks that made them.
+
+    Ticks without a planned action have no row.
+    """
     return pa.schema(
         [
             pa.field("step", pa.int64()),
@@ -127,7 +133,7 @@ ADDED = (
 
 
 def added(column: str) -> bool:
-    """Return True if older tables may lack that column."""
+    """Return True if `column` was added later, so that older tables may lack it."""
     return _among(column, frozenset[str]().union(*ADDED))
 
 
@@ -205,7 +211,7 @@ def _array(values: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class TableRead:
-    """Readable part of a table: its whole batches, and the state of the rest."""
+    """Result of reading a table: its whole batches, and the state of the rest of the file."""
 
     table: Any  # pyarrow.Table
     torn_bytes: int  # bytes after the last whole batch, without the end mark
@@ -215,9 +221,9 @@ class TableRead:
 def read_table(path: Path, schema: Any) -> TableRead:
     """Read an Arrow stream up to its torn end; an absent file or one without a header counts as empty.
 
-    The table also ends at a batch whose columns contradict each other, or whose `index` in rows.arrow does not count
-    on: a power cut can leave zeros instead of data. Columns that older files lack are null. Raises RecordingError if
-    the file cannot be read at all or has other columns than `schema`.
+    The table also ends at a batch whose columns contradict each other, or whose `index` in rows.arrow does not continue
+    that of the previous batch: a power cut can leave zeros instead of data. Columns that older files lack are null.
+    Raises RecordingError if the file cannot be read at all or has other columns than `schema`.
     """
     try:
         data = path.read_bytes()
@@ -242,7 +248,7 @@ def read_table(path: Path, schema: Any) -> TableRead:
 
 
 def _completed(table: Any, schema: Any) -> Any:
-    """Return the table with null columns for those of `schema` that it lacks."""
+    """Return the table with null columns in place of the columns of `schema` that it lacks."""
     for field in schema:
         if field.name not in table.column_names:
             table = table.append_column(field, pa.nulls(table.num_rows, field.type))

@@ -1,4 +1,4 @@
-"""Damage of a recording without digests: files that cannot be read, or only in part."""
+"""Damage of a recording without digests: files that cannot be read in full."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EVENTS = "events.jsonl"
 def find_unreadable(folder: Path) -> tuple[Damage, ...]:
     """Return damage for files of the closed episode in `folder` that are torn, empty or absent.
 
-    Tables and events of a failed episode may end anywhere: they were recorded like that.
+    Tables and events of a failed episode may end anywhere, because they were recorded like that.
     """
     try:
         episode = open_episode(folder)

@@ -89,7 +89,7 @@ class FragmentedVideo:
         self._store()
 
     def encode(self, picture: UInt8 | None) -> None:
-        """Append one frame: `picture` RGB uint8 [H, W, 3]; None repeats the previous one (black at first)."""
+        """Append one frame: `picture` RGB uint8 [H, W, 3]; None repeats the previous picture (black at first)."""
         if picture is not None:
             self._picture = to_yuv_planes(picture, self._size)
         self._mux(self._code(key=self._key_next))
@@ -97,10 +97,10 @@ class FragmentedVideo:
         self._store()
 
     def repeat(self, count: int) -> None:
-        """Append the previous picture `count` times; from RUN on all but three frames are copies without coding cost.
+        """Append the previous picture `count` times.
 
-        A run of copies alternates between two key frames: a decoder would take copies of one frame for a single
-        picture.
+        From RUN repeats on, all but three frames are copies without coding cost. A run of copies alternates between two
+        key frames: a decoder would take copies of one frame for a single picture.
         """
         plain = count if count < RUN else count % 2
         for _ in range(plain):
@@ -134,7 +134,7 @@ class FragmentedVideo:
         return packets
 
     def _copy(self, pair: list[Any], count: int) -> None:
-        """Mux `count` (even) copies of two key frames; the next frame must not refer to them."""
+        """Mux `count` (even) copies of two key frames; the frame after them must not refer to them."""
         contents = [bytes(packet) for packet in pair]
         for number in range(count):
             packet = av.Packet(contents[number % 2])
@@ -169,7 +169,7 @@ class FragmentedVideo:
 
 
 class _Muxed:
-    """Output of the muxer since the last write to the file. Without `seek`, so that the muxer never goes back."""
+    """Output of the muxer since the last write to the file; it has no `seek`, so that the muxer never goes back."""
 
     def __init__(self) -> None:
         self.bytes = bytearray()

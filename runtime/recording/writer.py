@@ -36,7 +36,10 @@ class ErrorLatch:
             self.first.add_note(str(error))
 
     def clear_disk_full(self) -> None:
-        """Forget a full disk that was not raised yet: refused bytes are still in memory, so nothing is lost."""
+        """Remove the error of a full disk that was not raised yet.
+
+        The refused bytes are still in memory, so no data are lost.
+        """
         if isinstance(self.first, DiskFullError) and not self.told:
             self.first = None
 
@@ -48,7 +51,7 @@ class ErrorLatch:
 
 
 class DiskWriter:
-    """Writer of the tables and events of one episode, synced together with `others` every flush period."""
+    """Writer of the tables and events of one episode; they are synced together with `others` every flush period."""
 
     def __init__(
         self,
@@ -103,7 +106,7 @@ class DiskWriter:
         """Write and sync everything, end the streams, close all files except those in `leave`.
 
         Return False if that was not finished by `deadline` (time.monotonic). If the disk is full, `full` is set, the
-        files stay open, and `save` tries again. `others` are further writes to do at the end.
+        files stay open, and `save` tries again. `others` are further functions that write at the end.
         """
         self._left, self._others = leave, others
         self._closing.set()
@@ -112,7 +115,7 @@ class DiskWriter:
         return not self._thread.is_alive()
 
     def digests(self) -> dict[str, FileDigest]:
-        """Return the digests of its own files by name, after it has finished."""
+        """Return the digests of the writer's files by name, after it has finished."""
         return {file.path.name: file.digest for file in self._own}
 
     def _wait_for_room(self, writer: TableWriter, patience: float) -> None:
@@ -143,7 +146,7 @@ class DiskWriter:
         require_room(self._folder, self._settings.min_free_bytes)
 
     def save(self) -> None:
-        """Save as much as possible: a file that fails does not prevent the others from being closed properly."""
+        """Save as much as possible: a file that fails does not prevent the rest from being closed properly."""
         if self._saved:
             return
         self.full = None
@@ -170,7 +173,10 @@ class DiskWriter:
             self._unwritten_lines = b""
 
     def _attempt(self, work: Callable[[], None], last: bool = False) -> None:
-        """Run `work` and report its error; with `last`, a full disk is stored in `full`: nothing is lost yet."""
+        """Run `work` and report its error.
+
+        With `last`, a full disk is stored in `full` instead, because no data are lost yet.
+        """
         try:
             work()
         except RecordingError as error:

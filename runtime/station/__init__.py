@@ -1,1 +1,1 @@
-"""Deployment of a station with its robot, before anything is connected."""
+"""Deployment of a station with its robot, checked before anything is connected."""

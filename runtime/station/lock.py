@@ -1,4 +1,4 @@
-"""Lock of a running station, so that a data folder has only one of each name."""
+"""Lock of a running station, so that each station name runs at most once per data folder."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from runtime.ipc.station_lock import StationLockedError, acquire
 
 
 def acquire_station_lock(settings: Deployment) -> IO[str]:
-    """Return the lock of a station, held until it is closed.
+    """Return the lock of a station, which is held until the returned file is closed.
 
-    Raises SetupError with the process that has it, or the cause.
+    Raises SetupError, which names the process that has the lock, or the cause.
     """
     try:
         return _locked(settings)
@@ -21,7 +21,7 @@ def acquire_station_lock(settings: Deployment) -> IO[str]:
 
 
 def unwritable_error(settings: Deployment, error: OSError) -> SetupError:
-    """Return the error about a station folder that cannot be written."""
+    """Return the error to raise for a station folder that cannot be written."""
     return SetupError(
         f"{settings.station_dir} cannot be written ({error.strerror}): make room there, or name another folder with "
         "data_dir"

@@ -1,4 +1,4 @@
-"""Permissions of commands: who may bring tables along, and which files and variables these may name.
+"""Permissions of commands: who may send tables with a command, and which files and variables these may name.
 
 The station's own account, used by `ctl` and the control channel, may name anything that it can access itself.
 """
@@ -50,7 +50,7 @@ _OF_ADMINISTRATORS = ("policy", "checkpoint")
 
 
 def require(command: Command, own: Resolved) -> None:
-    """Raise RuntimeFault if the sender may not bring the tables of its command; `own` is the station's deployment.
+    """Raise RuntimeFault if the sender may not send the tables of its command; `own` is the station's deployment.
 
     Commands that stop the robot are never refused.
     """
@@ -113,13 +113,19 @@ def _recordings(own: Deployment) -> Iterable[Path]:
 
 
 def _is_recording(value: str) -> bool:
-    """Return True for the folder of a recording or dataset; other files in the data folder must not be named."""
+    """Return True if the path is the folder of a recording or dataset.
+
+    Other files in the data folder must not be named.
+    """
     path = _resolved(value)
     return (path / "manifest.json").is_file() or (path / "meta" / "info.json").is_file()
 
 
 def _is_inside(value: str, allowed: Iterable[str | Path]) -> bool:
-    """Return True if the path is one of these files or below one of these folders, after resolving links and `..`."""
+    """Return True if the path is one of the files `allowed` or below one of these folders.
+
+    Links and `..` are resolved first.
+    """
     try:
         path = _resolved(value)
         return any(path.is_relative_to(_resolved(one)) for one in allowed)

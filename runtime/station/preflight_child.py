@@ -43,7 +43,7 @@ Spawn = Callable[[], "subprocess.Popen[bytes]"]
 
 @dataclass(slots=True)
 class PreflightRun:
-    """One preflight: running until `over` is set, then with a report in `finished` or a `failure`."""
+    """State of one preflight: running until `over` is set, then with a report in `finished` or a `failure`."""
 
     id: str
     about: str
@@ -54,17 +54,17 @@ class PreflightRun:
     over: threading.Event = field(default_factory=threading.Event)
 
     def end(self, why: str) -> None:
-        """Kill the process; `why` replaces its report."""
+        """Kill the process; `why` takes the place of its report."""
         self.failure = why
         self.child.kill()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the answer to a query: `running`, `report` or null, and the failure."""
+        """Return the answer to a query: `running`, `report` (or null), and `failure`."""
         return {"running": not self.over.is_set(), "report": self.finished or None, "failure": self.failure}
 
 
 class Preflights:
-    """Preflights of a station, one at a time. Call `poll` regularly. Not for several threads."""
+    """Preflights of a station, one at a time. Call `poll` regularly. Use it from one thread only."""
 
     def __init__(self, spawn: Spawn | None = None, now: Callable[[], float] = time.monotonic) -> None:
         self._spawn = spawn or _spawn_child
@@ -74,13 +74,13 @@ class Preflights:
 
     @property
     def current(self) -> str:
-        """Subject of the running preflight, "" without one."""
+        """Subject of the running preflight, "" if none is running."""
         return self._flight.about if self._flight else ""
 
     def start(self, asked: PreflightRequest, resolved: Resolved) -> float:
         """Start a preflight; return the longest time until its end [s], compilation included.
 
-        Whether the request is a valid deployment is not checked here but in the report.
+        Whether the request results in a valid deployment is not checked here; the report states it.
 
         Raises:
             RuntimeFault: Another preflight is running, or the process cannot be started.
@@ -104,7 +104,7 @@ class Preflights:
         return longest
 
     def poll(self) -> PreflightRun | None:
-        """Return the preflight that has ended since the last call, once; kill one whose time is over."""
+        """Return a preflight that has ended since the last call, else None; kill a preflight whose time is over."""
         flight = self._flight
         if flight is None:
             return None
@@ -135,7 +135,10 @@ class Preflights:
 
 
 def _deadline_for(resolved: Resolved, asked: PreflightRequest) -> float:
-    """Return the sum of the policy's deadlines [s]; a default for an invalid deployment, which its process reports."""
+    """Return the longest time for the policy [s]: the sum of its deadlines.
+
+    For an invalid deployment it is a default; the preflight's process reports what is invalid.
+    """
     try:
         return default_deadline(apply_changes(resolved, asked.changes, "preflight").deployment)
     except RuntimeFault:
@@ -169,7 +172,7 @@ def run_preflight(asked: Mapping[str, Any], longest: float) -> dict[str, Any]:
 
 
 def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
-    """Wait for the child; whatever happens to it, the preflight is over afterwards."""
+    """Wait for the child and store its result; whatever happens, the preflight is over afterwards."""
     report: dict[str, Any] = {}
     failure: str = _UNREADABLE
     try:
@@ -181,7 +184,7 @@ def _supervise(flight: PreflightRun, asked: Mapping[str, Any]) -> None:
 
 
 def _child_result(child: subprocess.Popen[bytes], asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """Return the child's report and why there is none; returns when the child has ended."""
+    """Wait until the child has ended; return its report, and the reason if there is none."""
     assert child.stdin is not None
     assert child.stdout is not None
     with contextlib.suppress(BrokenPipeError):  # it ended without reading; the exit code is reported below
@@ -213,6 +216,6 @@ def default_deadline(settings: Deployment) -> float:
 
 
 def _deadlines(table: Mapping[str, Any]) -> float:
-    """Return the sum of all deadlines in a table and its nested tables, e.g. that of a tunnel."""
+    """Return the sum of all deadlines in a table and its nested tables, for example that of a tunnel [s]."""
     own = [float(value) for key, value in table.items() if key.endswith("_deadline") and value is not None]
     return sum(own) + sum(_deadlines(value) for value in table.values() if isinstance(value, Mapping))

@@ -1,4 +1,4 @@
-"""Start of a deployment again from the manifest of an earlier run, with a report of the differences."""
+"""New start of the deployment of an earlier run, from its manifest, with a report of the differences."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Rerun:
 
 
 def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
-    """Return the deployment of the run in `data` whose uuid begins with `run`, with `key=value` assignments on top.
+    """Return the deployment of the run in `data` whose uuid begins with `run`, changed by `key=value` assignments.
 
-    It includes the options of that run (mode, simulated state, duration). New recordings go to `data`.
-    Raises ConfigurationError if something is missing, was changed since, or is no longer a setting.
+    It includes the options of that run (mode, simulated state, duration). New recordings go to `data`. Raises
+    ConfigurationError if something is missing, was changed since, or is no longer a setting.
     """
     folder = find_episode(run, data)
     try:
@@ -52,7 +52,10 @@ def rerun(run: str, data: Path, assignments: Sequence[str] = ()) -> Rerun:
 
 
 def find_episode(run: str, data: Path) -> Path:
-    """Return the folder of the one episode in `data` whose uuid begins with `run`. Raises ConfigurationError."""
+    """Return the folder of the only episode in `data` whose uuid begins with `run`.
+
+    Raises ConfigurationError if there is none or several.
+    """
     episodes = data / "episodes"
     wanted = run.strip().lower()
     if not wanted or not set(wanted) <= set("0123456789abcdef-"):
@@ -90,7 +93,10 @@ def _configuration(folder: Path, manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _requested_settings(tree: dict[str, Any], manifest: Mapping[str, Any], data: Path) -> dict[str, Any]:
-    """Return the configuration with the options of the run itself; other modes (observe) are not runs."""
+    """Return the configuration with the options of the run that the manifest names.
+
+    Episodes of the mode "observe" are not runs: their options stay out.
+    """
     run = tree.get("run")
     if isinstance(run, dict) and manifest.get("mode") != "observe":
         for key in ("mode", "sim_state", "duration_s"):
@@ -143,7 +149,7 @@ def _revisions(then: object) -> str:
 
 
 def _revision(given: object) -> str:
-    """Return the short revision; one with uncommitted changes never counts as equal."""
+    """Return the short form of a revision; a revision with uncommitted changes never counts as equal to another."""
     if not isinstance(given, Mapping) or not given.get("commit"):
         return _UNKNOWN
     return _short(str(given["commit"])) + (_DIRTY if given.get("dirty") else "")
@@ -163,7 +169,7 @@ def _hashes(then: str, stored: Mapping[str, Any], now: Resolved) -> str:
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return every setting by its full key."""
+    """Return every setting of the nested tables by its full key."""
     found: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:

@@ -27,7 +27,7 @@ def installed_versions() -> dict[str, str]:
 
 @dataclass(slots=True)
 class Run:
-    """One open run; times on our monotonic clock [s]."""
+    """Open run; times on our monotonic clock [s]."""
 
     number: int
     uuid: str
@@ -49,7 +49,7 @@ class Run:
     reached: dict[str, float] = field(default_factory=dict)  # milestones of a simulated bench [s of the run]
 
     def figures(self, now: Mapping[str, Any]) -> dict[str, Any]:
-        """Return control's figures `now`, with its counters relative to the start of this run.
+        """Return control's figures at `now`, with its counters relative to the start of this run.
 
         If control was restarted meanwhile, they are relative to that restart.
         """
@@ -58,7 +58,7 @@ class Run:
 
     @property
     def never_began_data(self) -> dict[str, Any]:
-        """Data for the client about a run that ended before control followed; {} if it did."""
+        """Data for the client about a run that ended before control followed it; {} for a run that began."""
         if self.begun_at is not None:
             return {}
         return {"unbegun": {"command": self.command, "episode": self.uuid, "unopened": self.unopened}}
@@ -68,15 +68,15 @@ class Run:
         self.opened = True
 
     def fail_to_open(self) -> None:
-        """Record that its recording could not be opened, so that it must not begin."""
+        """Record that the run's recording could not be opened, so that the run must not begin."""
         self.unopened = True
 
     def stop_recording(self, why: str) -> None:
-        """Record that it continues without its recording, which could not be opened or has ended."""
+        """Record that the run continues without its recording, which could not be opened or has ended."""
         self.unrecorded = why
 
     def wait(self) -> None:
-        """Let it begin later, when everything that it needs is loaded."""
+        """Record that the run begins later, when everything that it needs is loaded."""
         self.waiting = True
 
     def approach(self) -> None:
@@ -84,36 +84,36 @@ class Run:
         self.is_approaching = True
 
     def arrive(self) -> None:
-        """Record that this motion has ended."""
+        """Record that the motion to the start of the proposal has ended."""
         self.is_approaching = False
 
     def begin(self, now: float) -> None:
-        """Start its clock: control follows."""
+        """Start the run's clock, because control follows the run from now on."""
         self.waiting = False
         self.begun_at, self.held_since, self.held = now, None, 0.0
         self.followed_at = now
 
     def hold(self, now: float) -> None:
-        """Pause its clock; a waiting run begins when it is resumed."""
+        """Pause the run's clock; a run that still waits begins when it is resumed."""
         self.waiting = False
         if self.held_since is None:
             self.held_since = now
 
     def resume(self, now: float) -> None:
-        """Continue its clock."""
+        """Continue the run's clock."""
         if self.held_since is not None:
             self.held += now - self.held_since
             self.held_since = None
             self.followed_at = now
 
     def elapsed(self, now: float) -> float:
-        """Return the time it has run [s], without holds."""
+        """Return for how long the run has been executed [s], without holds."""
         if self.begun_at is None:
             return 0.0
         return (now if self.held_since is None else self.held_since) - self.begun_at - self.held
 
     def status(self, now: float) -> dict[str, Any]:
-        """Return its number, uuid, running and held time [s], and its limit [s]."""
+        """Return the run's number, uuid, executed and held time [s], and its limit [s]."""
         held = self.held + (now - self.held_since if self.held_since is not None else 0.0)
         return {
             "number": self.number,
@@ -126,7 +126,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Entries of every manifest about the station as last set up; `spec` is in force since then."""
+    """Entries of every manifest about the station; `spec` is that of the last set-up."""
 
     spec: StationSpec
     boot: str
@@ -136,7 +136,10 @@ class Provenance:
     git: Mapping[str, Any] = field(default_factory=revision)  # {} without a git checkout
 
     def manifest(self, mode: str, info: PolicyInfo | None, sim_state: str = "") -> dict[str, Any]:
-        """Return the manifest of a new episode, without entries of media; `sim_state` is used in mode "sim" only."""
+        """Return the manifest of a new episode, without the entries of media.
+
+        `sim_state` is used in mode "sim" only.
+        """
         settings = self.spec.deployment
         return {
             "uuid": str(uuid.uuid4()),

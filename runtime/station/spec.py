@@ -30,7 +30,7 @@ CAPABILITIES = TypeAdapter(Capabilities)
 class StationSpec:
     """Deployment with its robot and everything known of both before connecting; plain values.
 
-    `collecting`: it is set up to collect, so that the policy is the leader of its [collection].
+    `collecting`: the station is set up to collect, so that the policy is the leader of its [collection].
     """
 
     resolved: Resolved
@@ -83,7 +83,10 @@ class StationSpec:
 
 
 def delivered_cameras(settings: Deployment, robot: Robot) -> tuple[str, ...]:
-    """Return the keys of the cameras that the transport delivers: the robot's, unless it names fewer."""
+    """Return the keys of the cameras that the transport delivers.
+
+    These are all cameras of the robot, unless the transport names fewer.
+    """
     named = getattr(variants("runtime.transports")[settings.transport.kind], "cameras", None)
     if named is None:
         return tuple(camera.key for camera in robot.cameras)
@@ -120,7 +123,7 @@ def build_spec(resolved: Resolved, capabilities: Capabilities | None = None) -> 
 def load_checked_spec(path: str, capabilities: str, unread: Collection[str] = ()) -> StationSpec:
     """Load the spec that a supervisor has checked: the resolved deployment from a file, capabilities as JSON.
 
-    Tables of the packages in `unread` stay plain tables, and modules of their kinds are not loaded.
+    Tables of the packages in `unread` stay plain tables, and the modules of their kinds are not loaded.
     """
     resolved = loader.resolve_deployment(json.loads(Path(path).read_text("utf-8")), {}, path, unread)
     return build_spec(resolved, CAPABILITIES.validate_json(capabilities))

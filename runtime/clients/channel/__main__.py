@@ -37,7 +37,7 @@ _AGAIN_S = 1.0
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until a signal or the supervisor's end; return exit code 2 if the station is unknown."""
+    """Serve until a signal or the supervisor's end; return the exit code, 2 if the station is unknown."""
     given = _parser().parse_args(arguments)
     log.configure_logging("channel")
     station_dir = data_folder(given.data_dir) / "stations" / given.station
@@ -75,7 +75,7 @@ def _settings(station_dir: Path) -> ControlChannelSettings:
 
 
 def serve(station_dir: Path, settings: ControlChannelSettings, ended: Callable[[], bool]) -> None:
-    """Serve until `ended`; if the port is in use, try again every second."""
+    """Serve until `ended` returns True; if the port is in use, try again every second."""
     operator = settings.operator or f"{getpass.getuser()}@{socket.gethostname()}"
     names = HolderNames(operator, settings.scripts)
     door = _open(station_dir, settings, names, ended)

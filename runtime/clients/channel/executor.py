@@ -1,4 +1,4 @@
-"""Execution of the scripts' commands, one after the other, and their answers."""
+"""Execution of the scripts' commands, one after the other, and the answers to them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LOOK_S = 0.1
 
 
 class CommandExecutor:
-    """Only path of the channel to the coordinator, except for stops. One thread uses it."""
+    """Only path from the channel to the coordinator, except for stops. One thread uses it."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class CommandExecutor:
         return json_answers.command_answer(message, outcome, data, self._state(script, outcome)) | special
 
     def _repeated(self, message: Message, known: Outcome, script: Script) -> dict[str, Any]:
-        """Answer a repeated command with the outcome of its first execution, as known now."""
+        """Answer a repeated command with the outcome of its first execution, as far as it is known now."""
         if known.said != message.name:
             why = f"its id was given to {known.said!r} before"
             other = Outcome(known.id, message.name, "", "refused", why)
@@ -77,7 +77,10 @@ class CommandExecutor:
         return json_answers.command_answer(message, known, {}, self._state(script, known))
 
     def _state(self, script: Script, outcome: Outcome) -> str | None:
-        """Return the state after a command; None if it was refused or is unknown, or the station is gone."""
+        """Return the station's state after a command.
+
+        None if the command was refused or its outcome is unknown, or if the station does not answer.
+        """
         if outcome.result in ("refused", "unknown"):
             return None
         try:
@@ -109,7 +112,7 @@ class CommandExecutor:
     # --- commands ------------------------------------------------------------------------------------------
 
     def _verb(self, script: Script, message: Message, outcome: Outcome) -> Mapping[str, Any]:
-        """Execute the commands that a verb of the older channel stands for; return the answer's data."""
+        """Execute the commands of EVA Web that a verb of the older channel stands for; return the answer's data."""
         if message.name not in VERBS:
             raise UnsupportedVerb(
                 f"command not allowed: {str(message.fields['cmd'])!r:.80}; known: {', '.join(VERBS)}"
@@ -237,7 +240,7 @@ def _commanded(client: StationClient) -> list[float]:
 
 @contextmanager
 def _refused_if_unreachable() -> Iterator[None]:
-    """Turn a TransportError into a RuntimeFault, as long as no command was sent.
+    """Turn a TransportError into a RuntimeFault, for a block in which no command has been sent yet.
 
     The command then counts as refused: its outcome is not unknown.
     """

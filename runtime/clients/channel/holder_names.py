@@ -1,4 +1,4 @@
-"""Holders of the channel's messages, and which messages show that the commanding script is alive."""
+"""Holders of the lease for the channel's messages, and which messages show that the commanding script is alive."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _CONNECTIONS = 1000  # connections remembered
 class HolderNames:
     """Assignment of messages to holders: a script that names itself, a connection, or all scripts together.
 
-    `user` is the account of the channel's process, from the deployment. Names that scripts add are their own claim,
-    which nothing verifies.
+    `user` is the account of the channel's process, from the deployment. A name that a script gives itself is appended
+    to it, and is not verified.
     """
 
     def __init__(self, operator: str, scripts: Literal["apart", "together"]) -> None:
@@ -24,7 +24,10 @@ class HolderNames:
         self._commanded: dict[bytes, bool] = {}  # by connection: whether it has sent a command
 
     def holder(self, connection: bytes, client: str) -> str:
-        """Return the name of the lease's holder; scripts can only choose names below the channel's own."""
+        """Return the name of the lease's holder for a message on `connection`; `client` is the script's own name.
+
+        A script can only choose a name below the channel's own.
+        """
         if client:
             return f"{self.user}/{client}"
         if not self._apart:
@@ -35,11 +38,12 @@ class HolderNames:
         return f"{self.user}#{number}"
 
     def is_alive(self, connection: bytes, message: Message, stops: bool) -> bool:
-        """Return True if the message shows that its holder is alive; `stops`: whether it ends something.
+        """Return True if the message shows that its holder is alive; `stops`: the message is a stop.
 
-        If all scripts are one holder, a script that only watches must not keep alive the command of another. A query
-        therefore counts only on a connection that has sent a command, if it asks for the result of a command, or if it
-        is the first message of a connection and asks for the status: clients that reconnect for each call wait so.
+        If all scripts are one holder, a script that only watches must not keep alive the command of another script. A
+        query therefore counts only on a connection that has sent a command, if it asks for the result of a command, or
+        if it is the first message of a connection and asks for the status: clients that reconnect for each call wait
+        like that.
         """
         if self._apart or message.client:
             return True

@@ -19,7 +19,7 @@ def dumps(content: Mapping[str, Any]) -> bytes:
 
 
 def to_builtin(value: Any) -> Any:
-    """Convert to JSON's own types: NaN and infinity to None, arrays to lists, foreign types to text."""
+    """Convert a value to JSON's own types: NaN and infinity to None, arrays to lists, other types to text."""
     if isinstance(value, Mapping):
         return {str(key): to_builtin(part) for key, part in value.items()}
     if isinstance(value, list | tuple):

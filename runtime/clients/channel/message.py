@@ -20,12 +20,12 @@ _OWN_KEYS = ("command", "arguments", "client", "id")
 
 
 class Malformed(RuntimeFault):
-    """A message cannot be read; the text is returned to the script."""
+    """Error about a message that cannot be read; its text is returned to the script."""
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Request: a query, a `cmd` of the older channel (`name` is its verb), or a `command` of EVA Web.
+    """Request of a script: a query, a `cmd` of the older channel (`name` is its verb), or a `command` of EVA Web.
 
     `argument` is the text after the verb's colon, None without a colon. `client` is the name that the script gives
     itself, "" if none. `fields` is the message as received.
@@ -46,7 +46,10 @@ class Message:
 
 
 def read(frames: list[bytes]) -> Message:
-    """Parse the frames behind the address. Raises: Malformed, but never for a press of the e-stop."""
+    """Parse the frames behind the address.
+
+    Raises: Malformed, but never for a press of the e-stop.
+    """
     for frame in frames:
         if (said := pressing.parse_json_press(frame, "command", "cmd")) is not None:
             return _press(said)
@@ -66,7 +69,7 @@ def read(frames: list[bytes]) -> Message:
 
 
 def _press(said: Mapping[str, Any]) -> Message:
-    """Return a press of the e-stop; invalid fields of it are ignored, and `arguments` has the reason."""
+    """Return the press of the e-stop in `said`; its invalid fields are ignored, and `arguments` has the reason."""
     form: Literal["cmd", "command"] = "cmd" if isinstance(said.get("cmd"), str) else "command"
     word = said.get(form)
     named = word if isinstance(word, str) else pressing.NAME
@@ -136,7 +139,10 @@ def _client(fields: Mapping[str, Any]) -> str:
 
 
 def _identity(fields: Mapping[str, Any]) -> str:
-    """Return the uuid under which a repeated command gets its first answer. A plain name could recur by accident."""
+    """Return the uuid under which a repeated command gets its first answer.
+
+    A plain name does not count, because two scripts could use it by accident.
+    """
     given = fields.get("id", "")
     if given == "":
         return ""

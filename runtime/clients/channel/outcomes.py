@@ -1,4 +1,4 @@
-"""Outcomes of commands that continue after they were accepted; polled until they are over."""
+"""Outcomes of commands that continue after they were accepted; these are polled until they are over."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Outcome:
     """Outcome of one command: "accepted", "refused", "unknown", "done" or "failed".
 
     Only "accepted" changes later: to "done" or "failed", or to "unknown" if the station restarts. `said` is the name in
-    the script's message, `kind` the command of EVA Web that it stands for.
+    the script's message, `kind` the command of EVA Web that this name stands for.
     """
 
     id: str
@@ -60,7 +60,7 @@ class Outcome:
     def accept(self, kind: str, before: Mapping[str, Any]) -> None:
         """Record that the station accepted the command `kind`.
 
-        `before` is the status before a command that continues; {} if the command is done at once.
+        `before` is the status before a command that continues; if it is {}, the command is already done.
         """
         self.kind, self.result, self.before = kind, "accepted" if before else "done", before
 
@@ -90,7 +90,7 @@ class Outcome:
     def _is_settled(self, status: dict[str, Any]) -> bool:
         """Return True if the station was at rest in two polls at least CALM_TICKS apart: its events are then complete.
 
-        Polls in the first CALM_TICKS do not count: the command may not have begun.
+        Polls in the first CALM_TICKS do not count, because the command may not have begun.
         """
         step = status["control"]["step"]
         if self.looked_since is None:

@@ -23,7 +23,7 @@ _PERIOD_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Message to answer at `address`; `stops`: number of stops received before it."""
+    """Message to answer at `address`; `stops` is the number of stops that were received before it."""
 
     address: list[bytes]
     holder: str
@@ -45,9 +45,9 @@ Reply = Callable[[list[bytes], dict[str, Any]], None]
 class RequestWorker:
     """Thread that passes jobs to one handler, and closes the handler at its end.
 
-    `keep` is called about ten times a second. A worker without `keep` is for stops: it executes every job, also those
-    still queued when it ends. Other workers refuse a command that has waited longer than LATE_S, because its sender no
-    longer waits, or that was followed by a stop.
+    `keep` is called about ten times a second. A worker without `keep` is for stops: it executes every job, even jobs
+    that are still queued when it ends. Other workers refuse a command that has waited longer than LATE_S, because its
+    sender no longer waits, and a command that was followed by a stop.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class RequestWorker:
         self._thread.start()
 
     def submit(self, job: Job) -> bool:
-        """Queue a job; return False if the queue or its connection's share is full."""
+        """Queue a job; return False if the queue is full, or its connection has too many jobs in it."""
         connection = job.address[0]
         with self._lock:
             if self._waiting[connection] >= EACH:
@@ -119,7 +119,7 @@ class RequestWorker:
             )
 
     def _void(self, job: Job) -> str:
-        """Return why a command is not executed any more, "" if it is."""
+        """Return the reason why a command must not be executed any more, "" if it may be."""
         if self._keep is None or job.message.form == "query":  # stops are always executed
             return ""
         waited = time.monotonic() - job.came

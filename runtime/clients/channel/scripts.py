@@ -13,7 +13,7 @@ from runtime.core.errors import TransportError
 
 @dataclass(slots=True)
 class ScriptSelection:
-    """Choices of one script. Values that are None or empty were not chosen: the deployment's apply."""
+    """Choices of one script. If a value is None or empty, the deployment's value applies."""
 
     task: str | None = None
     collect_task: str | None = None
@@ -22,7 +22,7 @@ class ScriptSelection:
     target: list[float] | None = None  # joints [D] of `manual_qpos`
 
     def choose(self, **chosen: Any) -> None:
-        """Record choices; strategy parameters are added to those chosen before."""
+        """Record choices; strategy parameters are added to the parameters chosen before."""
         for name, value in chosen.items():
             setattr(self, name, self.strategy | value if name == "strategy" else value)
 
@@ -43,7 +43,7 @@ KEPT = 200  # greatest number of scripts remembered; the oldest are dropped
 
 @dataclass(slots=True)
 class Script:
-    """One script: its client, its choices, and whether it holds the lease."""
+    """Script behind the channel: its client, its choices, and whether it holds the lease."""
 
     client: StationClient
     selection: ScriptSelection = field(default_factory=ScriptSelection)

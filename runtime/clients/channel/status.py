@@ -40,9 +40,10 @@ _ABSENT: dict[str, Any] = {
 
 
 def status(snapshot: Mapping[str, Any], selection: ScriptSelection, newest: str) -> dict[str, Any]:
-    """Return every key of the older channel, and `state`, `reason`, `allowed`, `lease` and `estop` of EVA Web.
+    """Return the station's status with every key of the older channel.
 
-    `newest` is the reason of the newest command that was refused or failed.
+    It also has `state`, `reason`, `allowed`, `lease` and `estop` of EVA Web. `newest` is the reason of the newest
+    command that was refused or failed.
     """
     return _ABSENT | _robot(snapshot) | _session(snapshot, selection, newest) | _run(snapshot, selection)
 

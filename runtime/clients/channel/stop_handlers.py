@@ -1,4 +1,7 @@
-"""Handlers of stops, which wait for nothing: `stop` and `halt` at the coordinator, the e-stop at the guard."""
+"""Handlers of stops, which are never queued behind other messages.
+
+`stop` and `halt` go to the coordinator, the e-stop to the guard.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ def is_estop(message: Message) -> bool:
 
 
 class StopHandler:
-    """Handler of stops at the coordinator; it uses the lease of whichever script of this channel holds it."""
+    """Handler of stops at the coordinator; it uses the lease of the script of this channel that holds it."""
 
     def __init__(
         self, open_client: Callable[[str], StationClient], lives: ScriptActivity, outcomes: Outcomes
@@ -52,7 +55,10 @@ class StopHandler:
         return json_answers.command_answer(message, outcome, {}, state)
 
     def _stop(self, holder: str, kind: str) -> str:
-        """Stop under the lease that a script of the channel holds, else under a lease of the sender."""
+        """Send the stop under the lease that a script of the channel holds, else under a lease of the sender.
+
+        Return the state after it.
+        """
         client = self._open(holder)
         try:
             held = client.status()["lease"]["holder"]

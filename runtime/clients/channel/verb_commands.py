@@ -16,12 +16,12 @@ Step = tuple[str, Mapping[str, Any]]
 
 
 class UnsupportedVerb(RuntimeFault):
-    """A verb or one of its arguments has no meaning here; the message names an alternative."""
+    """Error about a verb or argument that has no meaning here; the message names an alternative."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandSequence:
-    """Commands to send in order, none if the verb needs nothing of the station; the last command's result counts.
+    """Commands to send in order, none if the verb requires no action of the station; the last command's result counts.
 
     `chosen` is recorded after they were accepted; `told` are further keys of the answer, `note` is its reason.
     """
@@ -57,7 +57,7 @@ class VerbContext:
         raise UnsupportedVerb(f"{self.verb}: {why}")
 
     def no_argument(self) -> None:
-        """Check that the verb has no argument. Raises: UnsupportedVerb."""
+        """Check that the verb was given no argument. Raises: UnsupportedVerb."""
         if self.message.argument:
             self.refuse(f"takes no argument; given {self.message.argument!r:.80}")
 
@@ -107,9 +107,9 @@ class VerbContext:
         return found
 
     def arm(self, side: str) -> str:
-        """Return the arm with a gripper on a side, by its name or its prefix. Raises: UnsupportedVerb.
+        """Return the name of the arm with a gripper that `side` names, in full or by its beginning.
 
-        The only gripper of a robot counts as left and as right.
+        The only gripper of a robot counts as left and as right. Raises: UnsupportedVerb.
         """
         arms: list[str] = self.status["facts"]["arms"]
         grips = [arm for arm in arms if arm in self.status["grippers"]]

@@ -15,25 +15,28 @@ _TABS = "there are no tabs here: nothing is done"
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """One verb: `build` returns its commands, `description` explains them to people."""
+    """Verb of the older channel: `build` returns its commands, `description` explains them to people."""
 
     build: Callable[[VerbContext], CommandSequence]
     description: str
 
 
 def stops(verb: str, argument: str | None) -> bool:
-    """Return True if a verb ends a motion, which overtakes waiting messages."""
+    """Return True if a verb ends a motion, so that it overtakes waiting messages."""
     intent = (argument or "").partition(":")[0]
     return verb in STOPS or (verb == "operator_action" and intent in _STOPPING_INTENTS)
 
 
 def commands_for_verb(scene: VerbContext) -> CommandSequence:
-    """Return the commands for a known verb. Raises: UnsupportedVerb with the reason and an alternative."""
+    """Return the commands for a known verb.
+
+    Raises: UnsupportedVerb with the reason and an alternative.
+    """
     return VERBS[scene.message.name].build(scene)
 
 
 def _plain(kind: str) -> Callable[[VerbContext], CommandSequence]:
-    """Return the builder of a verb that is one command without arguments."""
+    """Return the builder of a verb that stands for one command without arguments."""
 
     def does(scene: VerbContext) -> CommandSequence:
         scene.no_argument()
@@ -43,7 +46,7 @@ def _plain(kind: str) -> Callable[[VerbContext], CommandSequence]:
 
 
 def _stopping(kind: str) -> Callable[[VerbContext], CommandSequence]:
-    """Return the builder of a stop, which is not refused for a superfluous argument."""
+    """Return the builder of a stop, which ignores a superfluous argument instead of refusing."""
     return lambda scene: CommandSequence(((kind, {}),))
 
 
@@ -96,7 +99,7 @@ def _saved(scene: VerbContext) -> CommandSequence:
 
 
 def _reset(scene: VerbContext) -> CommandSequence:
-    """End a halted run, if there is one, and go home; a run in progress is not ended by it."""
+    """Return the commands that end a halted run, if there is one, and move home; a run in progress is not ended."""
     end: tuple[Step, ...] = (("stop", {}),) if scene.state_is["held"] else ()
     return CommandSequence((*end, ("home", {})))
 
@@ -190,7 +193,7 @@ def _gripper(scene: VerbContext) -> CommandSequence:
 
 
 def _gripper_at(scene: VerbContext, arm: str, value: float) -> CommandSequence:
-    """Move the gripper to a number in its own unit; the other joints stay as commanded."""
+    """Return the command that moves the arm's gripper to `value` in its own unit; other joints stay as commanded."""
     facts, joints = scene.status["facts"], scene.commanded()
     dims = dict(zip(scene.status["grippers"], facts["gripper_dims"], strict=True))
     joints[dims[arm]] = value

@@ -1,4 +1,4 @@
-"""`python -m runtime.clients.panel STATION [--set-pin]`: the station's own panel, and its PIN.
+"""`python -m runtime.clients.panel STATION [--set-pin]`: panel of a station, and its PIN.
 
 A station whose deployment has a [panel] starts it by itself; for a lockstep station it is started by hand.
 """
@@ -36,7 +36,7 @@ _AGAIN_S = 1.0
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until a signal or the end of standard input, or set the PIN.
+    """Serve until a signal or the end of standard input; with --set-pin set the PIN instead.
 
     Returns:
         Exit code: 2 if the deployment has no panel or the PIN cannot be set.
@@ -102,7 +102,7 @@ def _open(panel: Panel, ended: Callable[[], bool]) -> PanelServer | None:
 
 
 def _prompt_pin() -> str:
-    """Read the PIN: twice from a terminal, else the first line of standard input."""
+    """Return the PIN: typed twice at a terminal, else the first line of standard input."""
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
     pin = getpass.getpass("PIN: ")

@@ -1,4 +1,4 @@
-"""The panel's PIN: stored as a slow hash, and checked less and less often after wrong tries."""
+"""PIN of the panel: stored as a slow hash, and checked at growing intervals after wrong attempts."""
 
 from __future__ import annotations
 
@@ -77,7 +77,10 @@ class _Failures:
     last: float = 0.0
 
     def add(self, now: float, free: int, longest: float) -> None:
-        """Count a failure: the first `free` cost nothing, then the wait doubles each time, up to `longest` [s]."""
+        """Count a failure: the first `free` failures cost nothing.
+
+        From then on the wait doubles with each failure, up to `longest` [s].
+        """
         self.count, self.last = self.count + 1, now
         beyond = self.count - free
         if beyond >= 0:
@@ -96,7 +99,7 @@ class Attempts:
         self._all = _Failures()
 
     def wait(self, source: str) -> float:
-        """Return the time until the next PIN of that source is checked [s]; 0 if at once."""
+        """Return the time until the next PIN of that source is checked [s]; 0 if that may be done at once."""
         now = self._now()
         if now - self._all.last > _FORGOTTEN_S:
             self._all = _Failures()
@@ -116,5 +119,5 @@ class Attempts:
         self._all.add(now, _FREE_IN_ALL, _LONGEST_WAIT_IN_ALL_S)
 
     def passed(self, source: str) -> None:
-        """Record the right PIN: failures of this source are cleared, those of all sources stay counted."""
+        """Record the right PIN: the failures of this source are cleared, the count for all sources together is not."""
         self._sources.pop(source, None)

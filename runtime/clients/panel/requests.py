@@ -55,7 +55,7 @@ _HEADERS = {
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Everything that requests use: one station's address, PIN, sessions, stops and displayed state."""
+    """Everything that requests use: address, PIN, sessions, stops and displayed state of one station."""
 
     station: str
     place: PanelPlace
@@ -65,12 +65,12 @@ class Panel:
     watch: Watch
 
     def server(self) -> PanelServer:
-        """Start to listen. Raises: TransportError, ConfigurationError."""
+        """Return a new server that listens at the panel's address. Raises: TransportError, ConfigurationError."""
         return PanelServer(self.place, partial(PanelRequests, self))  # type: ignore[arg-type]
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie: with TLS one that browsers restrict to this host and to encrypted requests."""
+        """Name of the session cookie; with TLS, browsers restrict it to this host and to encrypted requests."""
         return "__Host-eva-panel" if self.place.certificate else "eva-panel"
 
 
@@ -163,7 +163,7 @@ class PanelRequests(BaseHTTPRequestHandler):
         self._json(HTTPStatus.OK, {}, self._cookie(secret, int(LASTS_S)))
 
     def _send_result(self, told: StopResult) -> None:
-        """Answer with JSON to our script, with text to a form, which works without the script."""
+        """Answer with JSON to our script, with text to a form that is used without the script."""
         status = HTTPStatus.OK if told.done else HTTPStatus.BAD_GATEWAY
         if HEADER in self.headers:
             self._json(status, {"done": told.done, "text": told.text})
@@ -255,7 +255,7 @@ class PanelRequests(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer an unreadable request in the same form as others, and close the connection."""
+        """Answer an unreadable request in the same form as other requests, and close the connection."""
         self._refuse(HTTPStatus(code), message or HTTPStatus(code).phrase)
 
     def log_message(self, format: str, *args: Any) -> None:
@@ -264,7 +264,7 @@ class PanelRequests(BaseHTTPRequestHandler):
 
 
 def _uuid(said: dict[str, Any]) -> str:
-    """Return the uuid that the page sent, so that a repetition is not a second press; else a new one."""
+    """Return the uuid that the page sent, so that a repetition is not a second press; else a new uuid."""
     try:
         return str(uuid.UUID(str(said.get("uuid"))))
     except ValueError:

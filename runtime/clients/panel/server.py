@@ -1,7 +1,7 @@
-"""HTTP server of the panel: few connections, each with a deadline, and always room for another.
+"""HTTP server of the panel: few connections, each with a deadline, and always room for a new one.
 
-Independent of stations. Each connection has a thread; if there are too many, the oldest that is not pressing the
-e-stop is cut off for the newest, so that slow or greedy clients cannot block the e-stop.
+Independent of stations. Each connection has a thread; if there are too many, the oldest that is not pressing the e-stop
+is cut off for the newest, so that slow or greedy clients cannot block the e-stop.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class PanelServer(ThreadingHTTPServer):
         return f"{self.place.scheme}://{host}:{self.server_address[1]}"
 
     def turn(self) -> None:
-        """Accept a connection or wait a moment; cut off those past their deadline, except during a press."""
+        """Accept a connection or wait a moment; cut off connections past their deadline, except during a press."""
         self.handle_request()
         now = time.monotonic()
         with self._lock:
@@ -100,7 +100,7 @@ class PanelServer(ThreadingHTTPServer):
     # --- connections -------------------------------------------------------------------------------------------
 
     def server_bind(self) -> None:
-        """Bind like a plain TCP server: HTTPServer would ask a name server for our own name."""
+        """Bind like a plain TCP server, because HTTPServer would ask a name server for our own name."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = self.place.host, int(self.server_address[1])
 
@@ -135,7 +135,10 @@ class PanelServer(ThreadingHTTPServer):
             self._ended(made)
 
     def _surplus(self, source: str) -> Connection | None:
-        """Return the oldest connection that must be cut off to admit another of that source, None if none."""
+        """Return the oldest connection that must be cut off to admit a new one from `source`; None if there is room.
+
+        Connections that press the e-stop are never cut off.
+        """
         going = [one for one in self._connections if not one.gone]
         of_it = [one for one in going if one.source == source]
         among = of_it if len(of_it) >= MOST_OF_ONE else going

@@ -1,4 +1,7 @@
-"""Browser sessions after the PIN was entered: valid for LASTS_S, until another PIN is set or the panel restarts."""
+"""Browser sessions, which begin with the PIN.
+
+A session is valid for LASTS_S, until another PIN is set or the panel restarts.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ _MOST = 32
 
 
 class Refusal(ConfigurationError):
-    """The PIN is not accepted; `wait_s`: time until another from this source is checked [s]."""
+    """Error that the PIN is not accepted; `wait_s`: time until the next PIN from this source is checked [s]."""
 
     def __init__(self, why: str, wait_s: float = 0.0) -> None:
         super().__init__(why)
@@ -35,7 +38,7 @@ class Sessions:
     def begin(self, pin: str, source: str) -> str:
         """Check the PIN and return the secret of a new session. Raises: Refusal.
 
-        One PIN is checked at a time: parallel tries gain nothing and cost little.
+        One PIN is checked at a time: parallel attempts gain nothing and cost little.
         """
         if not self._trying.acquire(blocking=False):
             raise Refusal("another PIN is being looked at: try again", 1.0)

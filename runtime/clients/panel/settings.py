@@ -16,7 +16,7 @@ _HOST = re.compile(r"([a-z0-9.-]+|\[[0-9a-f:.]+\])(?::\d{1,5})?")
 
 @dataclass(frozen=True, slots=True)
 class PanelPlace:
-    """Address, port, host names in lower case, and the certificate's files, "" without TLS."""
+    """Address of the panel: address, port, host names in lower case, and the certificate's files, "" without TLS."""
 
     host: str
     port: int
@@ -38,7 +38,7 @@ class PanelPlace:
         return made
 
     def load(self, context: ssl.SSLContext) -> None:
-        """Load certificate and key; also after a renewal. Raises: ConfigurationError."""
+        """Load certificate and key into `context`; also used after a renewal. Raises: ConfigurationError."""
         try:
             context.load_cert_chain(self.certificate, self.key)
         except (OSError, ssl.SSLError) as error:

@@ -1,4 +1,4 @@
-"""Actions of the panel: press the e-stop and stop a run. It can neither move a robot nor release the e-stop."""
+"""Actions of the panel: press the e-stop and stop a run. It can neither move the robot nor release the e-stop."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _GUARD_S, _COORDINATOR_S = 1.0, 1.0
 
 @dataclass(frozen=True, slots=True)
 class StopResult:
-    """Result of an action: whether the station has done it, and the text for the page."""
+    """Result of an action: whether the station has carried it out, and the text for the page."""
 
     done: bool
     text: str
 
 
 class Stops:
-    """Stop commands of one station's panel; thread-safe, because each uses a connection of its own."""
+    """Sender of stops for one station's panel; thread-safe, because each stop uses a connection of its own."""
 
     def __init__(self, context: zmq.Context[Any], station_dir: Path) -> None:
         self._context, self._endpoints = context, Endpoints(station_dir)

@@ -1,4 +1,4 @@
-"""State and images that the panel shows; the station's streams are received only while the page is in use."""
+"""State and images that the panel displays; the station's streams are received only while the page is in use."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _ELSEWHERE = "the console and the station's log say why"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A camera's newest image, JPEG, numbered from 1."""
+    """Newest image of a camera, JPEG, numbered from 1."""
 
     number: int
     jpeg: bytes
@@ -77,7 +77,10 @@ class Watch:
         self._wanted.set()
 
     def status(self) -> dict[str, Any]:
-        """Return the content of the page, for JSON; `silent_s`: time without a state [s], 0 if below SILENT_S."""
+        """Return the content of the page, for JSON.
+
+        `silent_s` is the time without a new state [s], 0 if it is below SILENT_S.
+        """
         silent = self._clock() - self._heard
         told = displayed_state(self._state) if self._state else {}
         told["silent_s"] = 0.0 if silent < SILENT_S else round(min(silent, 1e6), 1)
@@ -134,7 +137,7 @@ class Watch:
 
 
 class _Ear:
-    """Subscription to a stream, at whichever endpoint it is published."""
+    """Subscription to a stream, which follows the stream's endpoint if that changes."""
 
     def __init__(self, context: zmq.Context[Any], stream: str) -> None:
         self._context, self._stream = context, stream
@@ -159,7 +162,10 @@ class _Ear:
 
 
 def displayed_state(snapshot: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a snapshot that a person at the robot needs: state, reason, holder, run time, e-stop."""
+    """Return the part of a snapshot that a person at the robot needs.
+
+    It has state, reason, lease holder, running time, and whether the e-stop is latched.
+    """
     meaning, run = snapshot["state_is"], snapshot.get("run") or {}
     lease = snapshot.get("lease") or {}
     told: dict[str, Any] = {
@@ -182,7 +188,7 @@ def _reason(snapshot: Mapping[str, Any]) -> str:
 
 
 def _open(said: Any) -> bool:
-    """Return True if a sentence and all sentences in its arguments belong to the families that are shown."""
+    """Return True if a sentence, and all sentences in its arguments, are of kinds that the panel may display."""
     if not isinstance(said, Mapping) or str(said.get("id")).split(".")[0] not in _SHOWN:
         return False
     within = said.get("arguments") or {}

@@ -1,4 +1,4 @@
-"""Targets of the robot: joints from the command line, and the description of a target for the operator."""
+"""Targets of the robot at the terminal: joints from the command line, and descriptions for the operator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STILL = 5e-4  # smallest change of a joint that is printed [rad, or the gripper
 
 
 def aim_arguments(client: StationClient, given: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of `aim` from the command line. Raises: RuntimeFault if the robot has no such joint."""
+    """Return the arguments of `aim` from the command line `given`. Raises: RuntimeFault if there is no such joint."""
     arm = getattr(given, "arm", None)
     if arm is not None:
         return {"jog": _jog(given, arm)}
@@ -71,7 +71,7 @@ def aim_lines(
 
 
 def aim_problem(aim: Mapping[str, Any]) -> str:
-    """Return why the aim differs from the request, "" if it does not."""
+    """Return how the target in the answer `aim` differs from the request, "" if it does not."""
     parts = []
     if aim["clipped"]:
         parts.append(f"stopped by the limits of {', '.join(aim['clipped'])}")

@@ -8,7 +8,7 @@ from typing import Any
 
 
 def arguments(given: argparse.Namespace) -> dict[str, Any]:
-    """Return the arguments of a command that can be built without asking the station."""
+    """Return the arguments of a command that can be built from the command line alone, without the station."""
     build = _BUILDERS.get(given.command)
     return {} if build is None else _without_none(build(given))
 

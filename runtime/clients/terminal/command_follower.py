@@ -1,4 +1,4 @@
-"""Follower of a long-running command: it keeps the lease as long as the terminal runs; Ctrl-C stops the command."""
+"""Follower of a long-running command: it renews the lease while the terminal runs; Ctrl-C stops the command."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def follow_command(
 
 
 def _keys_of(kind: str, status: dict[str, Any]) -> Keys:
-    """Return the keyboard for a run that a person drives, else NoKeys."""
+    """Return the keyboard for a run in which a person decides about steps, else NoKeys."""
     if LASTING[kind] != "going" or status["mode"] not in _KEYED:
         return NoKeys()
     return keys()
@@ -97,7 +97,7 @@ class _PeriodicLine:
 
 
 class _KeyLine(_PeriodicLine):
-    """Line printed at each change, with the keys if the run waits for a person."""
+    """Line that is printed at each change, with the available keys if the run waits for a person."""
 
     def __init__(self, tell: EventCallback, mode: str) -> None:
         super().__init__(tell)

@@ -1,4 +1,4 @@
-"""Single keys of the terminal, if a person uses it."""
+"""Single keys of the terminal, if a person uses the terminal."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from types import TracebackType
 
 
 class Keys(ABC):
-    """Pause that a key can end. A context manager, which restores the terminal."""
+    """Source of single keys, which waits for them. It is a context manager, which restores the terminal."""
 
     @abstractmethod
     def key(self, seconds: float) -> str:
-        """Return the key pressed within so many seconds, "" if none."""
+        """Return the key that is pressed within `seconds` [s], "" if none is."""
 
     @abstractmethod
     def __enter__(self) -> Keys: ...
@@ -30,7 +30,7 @@ class Keys(ABC):
 
 
 class NoKeys(Keys):
-    """Keys without a keyboard: no key is ever pressed."""
+    """Source of keys without a keyboard: no key is ever pressed."""
 
     def __enter__(self) -> NoKeys:
         return self
@@ -41,13 +41,13 @@ class NoKeys(Keys):
         return None
 
     def key(self, seconds: float) -> str:
-        """Wait and return ""."""
+        """Wait for `seconds` [s] and return ""."""
         time.sleep(seconds)
         return ""
 
 
 class Keyboard(Keys):
-    """Keys of a terminal, read at once, without Enter and without echo; Ctrl-C keeps its meaning."""
+    """Keyboard of a terminal, read at once, without Enter and without echo; Ctrl-C keeps its meaning."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor

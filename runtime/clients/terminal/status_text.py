@@ -1,4 +1,4 @@
-"""A station's snapshot as text: one line for its activity, a report for all of its state."""
+"""Text of a station's snapshot: one line for its activity, a report for all of its state."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def status_line(status: Mapping[str, Any], me: str | None = None) -> str:
-    """Return the status in one line; with `me`, a lease of another holder is named too."""
+    """Return the status in one line; if `me` is given, a lease of a holder other than `me` is named too."""
     parts = [_headline(status), *_run_figures(status), *_tick_figures(status)]
     holder = status["lease"]["holder"]
     if me is not None and holder not in ("", me):
@@ -51,7 +51,7 @@ def _tick_figures(status: Mapping[str, Any]) -> list[str]:
 
 
 def format_figure(value: float) -> str:
-    """Format as a whole number, or as a dash if it has not been measured."""
+    """Return the figure as a whole number, or as a dash if it has not been measured."""
     return "-" if math.isnan(value) else f"{value:.0f}"
 
 
@@ -118,7 +118,7 @@ def _mode(status: Mapping[str, Any]) -> str:
 
 
 def distance_text(found: Mapping[str, Any], what: str) -> str:
-    """Return the distance of the robot from an action as text; "" if there is no action."""
+    """Return a text about the robot's distance `found` from the action `what`; "" if there is no action."""
     if not found:
         return ""
     far = ": FAR, approach it first" if found["far"] else ""
@@ -126,7 +126,10 @@ def distance_text(found: Mapping[str, Any], what: str) -> str:
 
 
 def tuning_lines(status: Mapping[str, Any], everything: bool = False) -> list[str]:
-    """Return the strategy in force and its parameters; `everything`: also those that it does not use."""
+    """Return the strategy in force and its parameters as lines.
+
+    With `everything`, parameters that this strategy does not use are included.
+    """
     in_force = status["tuning"]
     uses = status["facts"]["strategies"].get(in_force["kind"], [])
     told = [in_force["kind"]]

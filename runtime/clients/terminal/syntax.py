@@ -42,7 +42,10 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _press(words: Sequence[str]) -> argparse.Namespace | None:
-    """Return the press in an invalid line with STATION and estop, in either order; None if it has none."""
+    """Return the press of the e-stop in an invalid command line, None if there is none.
+
+    STATION and estop may come in either order.
+    """
     said, data_dir = [], _data_dir()
     left = iter(words)
     for word in left:
@@ -109,7 +112,7 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
 
 
 def _check(given: argparse.Namespace, command: argparse.ArgumentParser) -> None:
-    """Check combinations of options, which argparse cannot."""
+    """Check the combinations of options of `command` that argparse cannot check."""
     if given.command == "tune" and not (given.show or given.strategy or given.set or given.task is not None):
         command.error("tune needs --strategy, --set, --task or --show")
     if given.command == "setup" and given.cancel and _setup_says_more(given):
@@ -170,7 +173,7 @@ def _waits(line: argparse.ArgumentParser) -> None:
 
 
 def _target(line: argparse.ArgumentParser, *more: str) -> Any:
-    """Add the exclusive options that name a target; return their group, to which a caller may add."""
+    """Add the exclusive options that name a target; return their group, to which the caller may add options."""
     group = line.add_mutually_exclusive_group(required=True)
     group.add_argument("--pose", metavar="NAME", help="a pose of the robot")
     group.add_argument(
@@ -310,7 +313,7 @@ def _triple(text: str) -> list[float]:
 
 
 def _joint(text: str) -> tuple[str, str, float]:
-    """Parse into (name, "=" or "+" or "-", value)."""
+    """Parse a joint's target into (name, "=" or "+" or "-", value)."""
     name, found, value = text.partition("=")
     how = name[-1:] if name[-1:] in ("+", "-") else ""
     name = name[: len(name) - len(how)]
@@ -320,7 +323,7 @@ def _joint(text: str) -> tuple[str, str, float]:
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """Parse into (key, value): JSON if valid, else text; "none" becomes None."""
+    """Parse a setting into (key, value): JSON if valid, else text; "none" becomes None."""
     key, found, value = text.partition("=")
     if not (found and key):
         raise argparse.ArgumentTypeError(f"{text} was given; allowed: KEY=VALUE")

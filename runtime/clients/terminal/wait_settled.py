@@ -17,14 +17,17 @@ _FAILURES = ("chunk_dropped", "policy_failed", "policy_lost")
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """End of a command: the state when it was sent, the status when it was over, and the events until then."""
+    """End of a command: the state in which it was sent, the status when it was over, and the events in between."""
 
     began: str
     status: dict[str, Any]
     events: list[dict[str, Any]]
 
     def failure(self, wants: str = "") -> str:
-        """Return why the command failed, "" if it did not; `wants`: kind of the event that must have occurred."""
+        """Return the reason why the command failed, "" if it did not.
+
+        `wants` is the kind of an event that must have occurred, "" for none.
+        """
         if self.status["state"] != self.began:
             return f"{self.began} no longer: {self.status['state']}, {self.status['reason']}"
         failed = [str(event["text"]) for event in self.events if event["kind"] in _FAILURES]
@@ -38,7 +41,7 @@ class Settled:
 def wait_until_settled(
     client: StationClient, before: dict[str, Any], tell: Callable[[dict[str, Any]], None]
 ) -> Settled:
-    """Wait until nothing moves and no request is pending, or the state differs from that of `before`.
+    """Wait until nothing moves and no request is pending, or the state differs from the state in `before`.
 
     The lease is renewed meanwhile; events since the status `before` are passed to `tell`.
     """
@@ -65,5 +68,8 @@ def wait_until_settled(
 
 
 def is_busy(status: dict[str, Any]) -> bool:
-    """Return True if an activity is in progress. A gripper may also move without an open run."""
+    """Return True if a run is in an active phase or a motion is in progress.
+
+    The motion of a gripper needs no open run.
+    """
     return status["phase"] in _BUSY or status["control"]["behaviour"] == "motion"

@@ -1,4 +1,4 @@
-"""Display of a station's activity: figures as they change, and every event, by number."""
+"""Display of a station's activity: figures as they change, and every event."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PATIENCE_S = 2.0
 
 
 def watch(client: StationClient, as_json: bool) -> int:
-    """Print figures and events until interrupted. Raises: TransportError if the station is gone.
+    """Print figures and events until interrupted. Raises: TransportError if the station does not answer.
 
     The stream only wakes the loop; events are fetched by number, so that none is missed.
     """

@@ -1,1 +1,1 @@
-"""Control process, the tick: merges chunks, checks actions, sends commands; without policy and cameras."""
+"""Control process: each tick merges chunks, checks actions and sends commands; it uses neither policy nor cameras."""

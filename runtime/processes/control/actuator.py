@@ -61,7 +61,7 @@ class TickSettings:
 
 
 class TickResult(NamedTuple):
-    """Result of one tick: its target, and the sent action float64 [D], None if nothing was sent."""
+    """Result of one tick: its target, and the action that was sent, float64 [D]; None if nothing was sent."""
 
     time: float  # our monotonic clock [s]
     target: Target | None = None
@@ -75,7 +75,7 @@ class TickResult(NamedTuple):
 
 
 class Actuator(ABC):
-    """A robot with its last command; the command is known only while it is engaged."""
+    """Robot with its last command, which is known only while the robot is engaged."""
 
     def __init__(self, settings: TickSettings) -> None:
         dim = len(settings.limits.lower)
@@ -91,11 +91,14 @@ class Actuator(ABC):
 
     @abstractmethod
     def state(self, seen: LatestObservation, planned: float, aim: Float64 | None) -> RobotState:
-        """Return the state for checking an action; `aim` is the action requested at the previous tick."""
+        """Return the robot's state at time `planned`, against which safety checks an action.
+
+        `aim` is the action that was requested at the previous tick.
+        """
 
     @abstractmethod
     def _deliver(self, step: int, action: Float64) -> float:
-        """Send `action` to the robot; return the time of sending."""
+        """Send `action` to the robot; return the time at which it was sent."""
 
     def engage(self, measured: Float64) -> None:
         """Engage the robot at its measured position: from now on a command is sent on every tick.
@@ -128,7 +131,7 @@ class Actuator(ABC):
     def rebase_command(self, measured: Float64, why: str, farthest: Float64 | float = np.inf) -> None:
         """Restart the command at `measured`, at most `farthest` [D] from the last command.
 
-        The only way in which a command may jump; it jumps towards the robot, so that nothing pulls it. The tick
+        No other method lets the command jump; it jumps towards the robot, so that nothing pulls the robot. The tick
         record carries `why`.
         """
         before = self.commanded
@@ -160,7 +163,7 @@ class Actuator(ABC):
         self._last_planned = planned
 
     def braking_motion(self) -> Brake:
-        """Return a stop from the last commanded velocity, as hard as necessary for the joint limits."""
+        """Return a braking motion from the last commanded velocity, within the joint limits."""
         velocity = self.velocity if self._ends is None else self._ends
         return braking(self.commanded, velocity, self._settings.limits, self._settings.safety)
 
@@ -196,12 +199,15 @@ class Actuator(ABC):
         return False
 
     def _checked(self, action: Float64, elapsed: float, stop: bool) -> LimitedCommand:
-        """Return the part of `action` that may be sent."""
+        """Return `action` after the checks of measurements: unchanged, because this robot is not measured."""
         return LimitedCommand(action)
 
 
 class RobotActuator(Actuator):
-    """The robot itself, through a transport. A restarted control continues from the last command, at rest."""
+    """Actuator of the real robot, which sends commands through a transport.
+
+    A restarted control process continues at rest from the last command of its predecessor.
+    """
 
     def __init__(
         self, shared: SharedState, sink: Sink, settings: TickSettings, clock: Callable[[], float]
@@ -234,16 +240,19 @@ class RobotActuator(Actuator):
         )
 
     def _unwrapped_joints(self, seen: LatestObservation) -> Float64:
-        """Return the joints; wrapping angles are in the turn of the last command, which the node may not count."""
+        """Return the measured joints [D]; wrapping angles are shifted by whole turns to be nearest to the last command.
+
+        The node may not count turns.
+        """
         wrapping = self._settings.dims.wrapping
         if not wrapping or not self.engaged:
             return seen.joints
         return self.commanded + difference(seen.joints, self.commanded, wrapping)
 
     def send_node_request(self, word: str, data: Mapping[str, Any]) -> str:
-        """Send a control word to the node; return why it was not sent, "" if it was.
+        """Send the control word `word` to the node; return the reason if it was not sent, "" if it was.
 
-        Unless the e-stop is clear, only END is sent: the word that ends the node's own driving.
+        Unless the e-stop is clear, only END is sent, the word that ends node-driven mode.
         """
         if self._shared_state.estop is not EStop.CLEAR and word != END:
             return _NOT_PASSED_ON(word=word)
@@ -270,7 +279,7 @@ class RobotActuator(Actuator):
 
 
 class SimulatedActuator(Actuator):
-    """A simulated robot that reaches each command at once; it has no transport, so nothing is sent."""
+    """Simulated robot that reaches each command at once; without a transport, nothing is sent."""
 
     def __init__(self, start: Float64, settings: TickSettings, clock: Callable[[], float]) -> None:
         super().__init__(settings)

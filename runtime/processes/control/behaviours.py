@@ -14,9 +14,10 @@ from runtime.safety.filter import Path
 
 
 class Target(NamedTuple):
-    """Target of a behaviour for one tick, float64 [D], with the limits that apply.
+    """Target of a behaviour for one tick, float64 [D], with the limits that apply to it.
 
-    `path` None marks a braking or held target, which safety does not check: a refusal would leave nothing to send.
+    If `path` is None, the target is part of braking or holding: safety does not check it, because a refusal would leave
+    nothing to send.
     """
 
     action: Float64
@@ -50,7 +51,7 @@ class Disengaged(Behaviour):
 
 
 class NodeDriven(Behaviour):
-    """Behaviour that sends nothing, because the node drives the robot by its own leader; any stop ends that."""
+    """Behaviour that sends nothing, because the node's own leader drives the robot; any stop ends it."""
 
     name = "yield"
     moving = True
@@ -79,9 +80,9 @@ class Hold(Behaviour):
 
 
 class MoveTo(Behaviour):
-    """Behaviour that brakes, then executes a generated trajectory; its time advances only with sent commands.
+    """Behaviour that brakes, then executes a generated trajectory; its time advances only when a command is sent.
 
-    `speed` is the share of the speed of generated motions with which it was planned.
+    `speed` is the share of the speed of generated motions with which the trajectory was planned.
     """
 
     name = "motion"
@@ -113,11 +114,11 @@ class MoveTo(Behaviour):
 class EStopHold(Behaviour):
     """Behaviour that sends the position at which the robot comes to rest, or the last command if that is unknown.
 
-    Joints within their steady error keep their command. The command of the others follows the measurement for
+    Joints within their steady error keep their command. The command of all other joints follows the measurement for
     `_FOLLOWS_S`, while the arm comes to rest: with the offset of their last steady error, and within the stopping
     distance of the first measurement. After that it is constant: an arm that is sent its own measurement sinks under
-    its weight. `position` float64 [D] is None if the robot was never measured: nothing is sent then. `rest` [D] is
-    the stopping distance.
+    its weight. `position` float64 [D] is None if the robot was never measured: nothing is sent then. `rest` [D] is the
+    stopping distance.
     """
 
     name = "estop"
@@ -125,7 +126,7 @@ class EStopHold(Behaviour):
     _SLACK = 0.05  # [rad] added to the stopping distance: lead of a command over the robot that follows it
 
     def __init__(self, position: Float64 | None, rest: Float64, captured: float = float("-inf")) -> None:
-        """`captured`: capture time of the newest joints when the e-stop was pressed [s]."""
+        """Begin to hold; `captured` is the capture time of the newest joints when the e-stop was pressed [s]."""
         self.position = position
         self.rest = rest
         self.captured = captured

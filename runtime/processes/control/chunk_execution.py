@@ -43,7 +43,7 @@ _ONE_BY_ONE: tuple[Mode, ...] = ("step", "preview")  # a person requests each ch
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """The merge half of a strategy, with its kind."""
+    """Merge half of a strategy, with its kind."""
 
     kind: str
     merge: Merge
@@ -70,9 +70,10 @@ def build_strategy(section: Mapping[str, Any], dims: DimensionKinds) -> Strategy
 
 
 class JoinResult(NamedTuple):
-    """Result of joining a chunk; `distance_note` describes a distant start, "" if it was near.
+    """Result of joining a chunk to the plan.
 
-    `too_far`: the chunk was dropped for that reason.
+    `distance_note` describes how far the chunk's start is from the robot, "" if it is near. If `too_far`, the chunk was
+    dropped for that reason.
     """
 
     merged: MergeResult
@@ -132,8 +133,8 @@ class ExecuteChunks(Behaviour):
     def join(self, chunk: PostedChunk, step: int, commanded: Float64) -> JoinResult:
         """Merge a chunk into the plan from `step` (first step not yet sent) on; `commanded` [D] was sent last.
 
-        A dropped chunk ends the wait for the first chunk; if the robot waited for it, it ends that wait too. So a
-        policy whose chunks are all dropped starves the run.
+        The wait for the first chunk ends even if the chunk is dropped. If the robot was stopped while a dropped chunk
+        was requested, that wait ends too. So a policy whose chunks are all dropped starves the run.
         """
         try:
             joined = self._join(chunk, step, commanded)
@@ -191,14 +192,20 @@ class ExecuteChunks(Behaviour):
         )
 
     def _first_used_distance(self, arrival: ArrivedChunk, step: int, commanded: Float64) -> tuple[float, str]:
-        """Return distance and description of the first row that is not stale, as `_first_action_distance`."""
+        """Return how far the first row of a chunk that is not stale is from `commanded` [rad], and describe it.
+
+        0 and "" unless the chunk is the first of the run.
+        """
         if not self._expecting:
             return 0.0, ""
         placed = self._strategy.merge.place(self.timeline, arrival, step)
         return self._first_action_distance(placed.rows[0], commanded) if len(placed.rows) else (0.0, "")
 
     def _first_action_distance(self, row: Float64, commanded: Float64) -> tuple[float, str]:
-        """Return the distance of a run's first action from the robot [rad], and a description; 0 for later ones."""
+        """Return how far `row` [D], a run's first action, is from `commanded` [rad], and a description.
+
+        0 and "" for later actions, and if safety only reports.
+        """
         settings = self._settings
         if not self._expecting or settings.safety.report_only:
             return 0.0, ""
@@ -208,9 +215,9 @@ class ExecuteChunks(Behaviour):
         return worst, _FIRST_ACTION_FAR(joint=name, distance=worst)
 
     def bear(self, until: float) -> None:
-        """Tolerate an empty plan until `until`, because a lost policy is retried.
+        """Tolerate that nothing is planned until `until`, because requests to a lost policy are being retried.
 
-        While nothing is planned, only one loss is tolerated, and not the next.
+        Within one gap without planned actions only the first loss of the policy is tolerated.
         """
         if self._starved_since is None or self.borne_until < self._starved_since:
             self.borne_until = until
@@ -219,7 +226,7 @@ class ExecuteChunks(Behaviour):
 
     @property
     def is_waiting(self) -> bool:
-        """Whether an empty timeline is expected: the operator or the strategy then makes the request."""
+        """Whether an empty timeline is expected: the operator or the strategy decides about the next request."""
         if self._useless:
             return False
         return self._expecting or self._one_by_one or self._strategy.merge.requests_while_stopped

@@ -55,18 +55,19 @@ _GAPS, _GAPS_S = 2, 10.0  # gaps within so many seconds during which a run waits
 
 @dataclass(slots=True)
 class _Gap:
-    """Gap in the joint measurements during which a run waits."""
+    """Gap in the joint measurements, during which a run waits."""
 
     since: float  # capture time of the last joints before it, our clock [s]
     unseen: float  # newest tick without fresh joints
 
 
 class CommandPipeline:
-    """Behaviour -> target -> locks and binary grippers -> safety -> actuator, once per tick.
+    """Sequence behaviour, target, gripper locks, safety, actuator, executed once per tick for one robot.
 
-    A refused action is replaced by the next point of a braking motion, so that a command is sent on every tick. Too
-    many refusals, or starvation, lead to holding for that reason. If the only problem of a run is the age of its
-    joints, it waits a moment longer: it continues by itself if they return soon, and at the same position.
+    A refused action is replaced by the next point of a braking motion, so that a command is sent on every tick. After
+    too many refusals, or when actions are missing for too long, the pipeline holds. If actions are refused only because
+    the joints are too old, the run brakes and waits for a limited time: it continues by itself if the joints return
+    soon and at the commanded position.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class CommandPipeline:
 
     @property
     def run(self) -> ExecuteChunks | None:
-        """The run that is executed, None if the behaviour is another."""
+        """Run that is being executed; None if the behaviour is not the execution of chunks."""
         return self.behaviour if isinstance(self.behaviour, ExecuteChunks) else None
 
     @property
@@ -142,7 +143,7 @@ class CommandPipeline:
         self.behaviour = self._new_hold() if self.actuator.engaged else Disengaged()
 
     def hold_because(self, kind: str, reason: str) -> None:
-        """Hold for a reason of control's own, and emit it as an event; nothing if not moving."""
+        """Hold on control's own decision, and emit `reason` as an event; do nothing if the robot is not moving."""
         if self.behaviour.moving:
             self.hold()
             self._report.emit(kind, reason)
@@ -162,7 +163,7 @@ class CommandPipeline:
         self.behaviour = run
 
     def on_locks_changed(self) -> None:
-        """Restart the current stop or motion, so that it does not use the previous positions of grippers."""
+        """Restart the present hold or motion with the new locks, because it was planned with the previous ones."""
         self._standing = None
         if isinstance(self.behaviour, Hold):
             self.hold_here()
@@ -234,7 +235,10 @@ class CommandPipeline:
         )
 
     def _send_hold(self, step: int, planned: float, target: Target, seen: LatestObservation) -> TickResult:
-        """Send a braking or held target without check; a gripper locked elsewhere moves there within its limits."""
+        """Send a braking or held target without a safety check.
+
+        A locked gripper that is not at its lock moves there within its limits.
+        """
         self._aim = None
         action = target.action
         notes: tuple[str, ...] = ()
@@ -257,7 +261,7 @@ class CommandPipeline:
         return self._safety.reachable(locked, state, "motion")
 
     def _approach(self, where: Float64, seen: LatestObservation, planned: float) -> Float64:
-        """Move towards the position that the e-stop holds, within limits; a mobile base stops at once."""
+        """Move towards the position that the e-stop holds, within velocity limits; a mobile base stops at once."""
         if not self._settings.checks_measurements:
             return where
         state = self.actuator.state(seen, planned, where)
@@ -331,7 +335,7 @@ class CommandPipeline:
     def _check_joints_returned(
         self, run: ExecuteChunks, step: int, planned: float, seen: LatestObservation
     ) -> None:
-        """Discard the plan if joints are back before the run had to wait, but the plan has moved on."""
+        """Discard the plan if the joints are back after a short gap, but the plan went on without the robot."""
         state = self.actuator.state(seen, planned, None)
         if (
             not self._safety.unseen(state)
@@ -341,12 +345,15 @@ class CommandPipeline:
             self._go_on(run, planned - self._unseen_since)
 
     def _may_wait(self, planned: float) -> bool:
-        """Return True if a run may wait for its joints: neither for long nor repeatedly."""
+        """Return True if a run may wait for its joints: their gap is short, and gaps are not too frequent."""
         often = len(self._gaps) == _GAPS and planned - self._gaps[0] < _GAPS_S
         return not often and planned - self._unseen_since < self._settings.safety.joint_gap_s
 
     def _elsewhere(self, state: RobotState, missing: float) -> str:
-        """Return a message about a joint that is not at its commanded position, "" if there is none."""
+        """Return a message if a joint returned away from its commanded position, "" if none did.
+
+        `missing` is for how long the joints were missing [s].
+        """
         limits, allowed = self._settings.limits, self._settings.safety.steady_error
         apart = np.where(limits.position_mask, np.abs(state.measured - state.previous), 0.0)
         apart[np.isnan(apart)] = np.inf  # unmeasured joints count as displaced
@@ -393,7 +400,10 @@ class CommandPipeline:
         return self._standing
 
     def _finish(self, move: MoveTo, sent: TickResult) -> None:
-        """Advance the motion, and end it when its end was sent without refusal or limiting."""
+        """Advance the motion by the command that was sent; end it when its goal was sent without refusal or limiting.
+
+        After a refusal, plan the motion again from the present position.
+        """
         if sent.executed is None:
             return
         if sent.refused:

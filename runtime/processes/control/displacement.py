@@ -31,9 +31,9 @@ _VERDICTS = 3  # inconclusive convergences after which a joint is distrusted
 
 
 def stale_heartbeat(shared: SharedState, now: float, allowed: Callable[[str], float]) -> str:
-    """Return a message about the process with an expired heartbeat, "" if there is none.
+    """Return a message about a process with an expired heartbeat, "" if there is none.
 
-    `allowed` is the timeout of a process [s], by name.
+    `allowed` maps the name of each process to its timeout [s].
     """
     for process in ("coordinator", "guard"):
         if not shared.alive(process, now, allowed(process)):
@@ -45,15 +45,17 @@ class DisplacementMonitor:
     """Monitor of the displacement of a holding robot; it moves the hold target to the measured position.
 
     A displaced robot was moved by hand, switched off, or its node was restarted, perhaps during an outage of the
-    measurements: to send the old target would move it unexpectedly. A single sample is not enough: several must agree
+    measurements: sending the old target would move it unexpectedly. A single sample is not enough: several must agree
     (`JointPlausibility.is_displaced`).
 
-    An encoder with an offset looks the same, but its joint follows the command, so that the displacement remains. So
-    the command does not follow a joint that leapt until both have agreed for _AGREES_S. If a displacement remains after
-    the command has followed it, it is not followed again before a set-up, because the operator must check the robot.
+    An encoder with an offset looks the same, but there the joint follows its command, so that the displacement remains.
+    Therefore the command does not follow a joint whose reading jumped until reading and command have agreed for
+    _AGREES_S. A displacement that remains after the command has followed the joint is not followed again before the
+    next set-up, because the operator must check the robot.
 
-    A held arm may be displaced by the permitted following error. Under the e-stop, an arm at rest is followed from
-    0.1 rad on: if its drive is off it has sagged, and would jump back when it is switched on.
+    A held arm may be displaced by the permitted following error. Under the e-stop, the command of an arm at rest
+    already follows a displacement of 0.1 rad: an arm whose drive is off has sagged, and would jump back when the drive
+    is switched on.
     """
 
     def __init__(self, settings: TickSettings, plausibility: JointPlausibility) -> None:
@@ -87,9 +89,9 @@ class DisplacementMonitor:
     def __call__(
         self, robot: RobotActuator, seen: LatestObservation, now: float, held: bool, stopped: bool = False
     ) -> Float64 | None:
-        """Return the new command [D] if the robot is too far from where it is `held`, None if it is not.
+        """Return the new command [D] if the robot is too far from its held position, None if it is not.
 
-        Call once per tick. `stopped`: the e-stop holds it.
+        Call once per tick. `held`: the robot holds a position; `stopped`: the e-stop holds it.
         """
         self.begins = False
         self._note_moves(robot, now)
@@ -182,7 +184,10 @@ class DisplacementMonitor:
 
     @property
     def speed(self) -> Float64:
-        """Velocity limit of the convergence [D]: that of generated motions, full for proven joints."""
+        """Velocity limit of the convergence [D].
+
+        Joints that converge without parts have their full limit, all other joints that of generated motions.
+        """
         whole = False if self._meeting or self._led is None else self._led.whole
         return self._settings.limits.velocity * np.where(
             whole, 1.0, self._settings.safety.motion_velocity_scale
@@ -213,9 +218,9 @@ class DisplacementMonitor:
         self._led = Led(robot.commanded, measured, speed, now, at_once=at_once, along=self._along)
 
     def _finish(self, robot: RobotActuator) -> None:
-        """End a convergence.
+        """End the convergence, and decide for each joint whether its reading may be followed again.
 
-        A joint that was proven to move on its own may be followed again, one without a conclusion a few times.
+        A joint that was proven to move on its own may be followed again; a joint without a conclusion only a few times.
         """
         assert self._led is not None
         verdict = np.where(self._blind, 1, self._led.verdict)
@@ -246,7 +251,10 @@ class DisplacementMonitor:
         return now - self._restless_at >= _STILL_S
 
     def _compare(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
-        """Trust those joints again that agree with their command."""
+        """Trust joints again whose readings have agreed with their command for _AGREES_S.
+
+        A joint that was displaced again after its convergence stays distrusted.
+        """
         if not robot.engaged:
             self.trust_all_joints()
             self.goal = None

@@ -31,7 +31,7 @@ class GripperLocks:
         self.on = np.zeros(len(limits.lower), bool)  # [D]
 
     def set(self, values: Float64, commanded: Float64) -> str:
-        """Lock grippers at `values` [D] within their limits, NaN: unlock. Return why not, "" if done.
+        """Lock grippers at `values` [D] within their limits, NaN: unlock; return the reason if refused, else "".
 
         Binary grippers are locked open or closed, with hysteresis around `commanded` [D].
         """

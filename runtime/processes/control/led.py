@@ -16,11 +16,12 @@ _THERE = 1e-6
 class Led:
     """Convergence of a command to the measured joints, in parts with a rest after each, until two parts agree.
 
-    Readings of a joint that is moved by hand do not depend on its command. Those of a joint with an encoder offset
-    follow the command, and rest (or slip on) with it. So the criterion is how far readings moved in a part beyond
-    their speed before and after it: if that is more than half of the command's motion in two parts, the encoder is
-    off. A part after which the readings' speed has changed, as with a hand that moves to and fro, is inconclusive,
-    unless the readings moved against the command.
+    It distinguishes a joint that is moved by hand from one whose encoder has an offset. Readings of the former do not
+    depend on the command; readings of the latter follow the command, and rest (or drift on) when it rests. The
+    criterion is how far readings moved during a part, beyond what their speed before and after the part explains: if
+    that is more than half of the command's motion in two parts, the encoder has an offset. A part is inconclusive if
+    the readings' speed changed during it, as with a hand that moves to and fro, unless the readings moved against the
+    command.
     """
 
     def __init__(
@@ -35,9 +36,9 @@ class Led:
     ) -> None:
         """Start at `commanded` [D], with readings at `measured` [D] that move at `speed` [D] by themselves.
 
-        `at_once`, bool [D]: joints without parts. A re-energised arm would otherwise be pulled back meanwhile, and a
-        blocked arm would press on. `along`, int [D]: parts of earlier convergences in which readings moved with the
-        command.
+        `at_once`, bool [D], marks joints that converge without parts and rests: during these a re-energised arm would
+        be pulled back, and a blocked arm would press on. `along`, int [D], is the number of parts of earlier
+        convergences in which readings moved with the command.
         """
         self.at_once = np.broadcast_to(np.asarray(at_once, bool), commanded.shape)
         self.along: np.ndarray = np.zeros(len(commanded), np.int64) + along

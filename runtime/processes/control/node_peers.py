@@ -17,10 +17,11 @@ _APART_S = 0.02
 
 
 class NodeHandover:
-    """Sender of `collect_start` when the robot is yielded to its node, and `collect_stop` when that ends.
+    """Sender of `collect_start` when the robot is yielded to its node, and of `collect_stop` when that ends.
 
-    `tell` sends a word and returns why it could not, "" if it did; `say` emits that reason, once per word. `before`:
-    an earlier control process died while the robot was yielded, which must end.
+    `tell` sends a control word and returns the reason if it could not, "" if it did; `say` emits that reason as an
+    event, once per word. `before` is True if an earlier control process died while the robot was yielded, which must
+    then be ended.
     """
 
     def __init__(
@@ -32,7 +33,7 @@ class NodeHandover:
 
     @property
     def is_repeating(self) -> bool:
-        """Whether the word must be sent again."""
+        """Whether the control word will be sent again, because words are repeated against loss."""
         return self._left > 0
 
     def update(self, yielded: bool, now: float) -> None:
@@ -69,7 +70,10 @@ class SubscriberCheck:
         self._told: dict[str, str] = {}
 
     def poll(self, now: float) -> None:
-        """Check, if due; the state is reported again to a restarted coordinator."""
+        """Ask the transport for command topics without a subscriber, if a check is due, and emit changes.
+
+        The state is emitted again when the coordinator was restarted.
+        """
         if self._shared_state.last_beat("coordinator") == 0.0:
             self._told, self._next = {}, now
             return

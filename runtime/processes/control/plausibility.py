@@ -125,7 +125,7 @@ class JointPlausibility:
         self.dead = ""  # joints that read exactly 0 since they returned from elsewhere
 
     def reset_zeros(self) -> None:
-        """Accept joints at exactly 0: the robot is being engaged anew."""
+        """Accept joints that read exactly 0, because the robot is being engaged anew."""
         self.dead = ""
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
@@ -153,7 +153,7 @@ class JointPlausibility:
 
     @property
     def is_settled(self) -> bool:
-        """Whether samples have agreed for the required time, up to the newest."""
+        """Whether all samples of the required time, up to the newest, have agreed."""
         return self._chain is not None and not self._doubt and bool(self._chain.recent(self._needed))
 
     def is_displaced(self, held: Float64, allowed: Float64 | float, but: np.ndarray | bool = False) -> bool:
@@ -211,7 +211,7 @@ class JointPlausibility:
         return self._contradiction(sample)
 
     def _continues(self, chain: _Chain, sample: _Sample) -> bool:
-        """Return True if the sample continues the trusted samples, rather than those that contradict them."""
+        """Return True if `sample` continues the trusted samples, rather than the samples that contradict them."""
         if self._faster(chain.newest, sample).any() or self._drop_to_zero(chain, sample):
             return False
         if self._has_swapped(chain, sample):
@@ -222,7 +222,7 @@ class JointPlausibility:
         )
 
     def _min_travel_time(self, before: _Sample, after: _Sample) -> float:
-        """Return the least time between two samples, of the joint that needs longest [s]."""
+        """Return the least time [s] in which all joints can move from one sample to the other."""
         moved = np.abs(difference(after.joints, before.joints, self._wrapping)) / self._limits.velocity
         return float(moved.max(where=self._places, initial=0.0))
 
@@ -267,7 +267,10 @@ class JointPlausibility:
         )
 
     def _faster(self, before: _Sample, after: _Sample, longest: float = _LONGEST_S) -> np.ndarray:
-        """Return which joints, bool [D], cannot have moved from one sample to the other in at most `longest` [s]."""
+        """Return which joints, bool [D], moved more between two samples than they can.
+
+        The time between the samples counts at most as `longest` [s].
+        """
         between = max(after.captured - before.captured, after.seen - before.seen, 0.0)
         allowed = _EXCESS * self._limits.velocity * (min(between, longest) + _NOISE) + _NOISE
         moved = np.abs(difference(after.joints, before.joints, self._wrapping))
@@ -288,7 +291,7 @@ class JointPlausibility:
         )
 
     def _permanent_reason(self, sample: _Sample) -> str:
-        """Return why samples from this one on are never trusted, "" if they may be.
+        """Return the reason why samples from this one on are never trusted, "" if there is none.
 
         It is phrased as a question, because numbers alone do not decide it.
         """
@@ -314,7 +317,7 @@ class JointPlausibility:
         return " and ".join(self._limits.names[i] for i in other)
 
     def _has_swapped(self, chain: _Chain, sample: _Sample) -> bool:
-        """Return True if joints leapt, within their velocity but beyond any acceleration, to each other's values."""
+        """Return True if joints jumped to each other's values, within their velocity but beyond any acceleration."""
         newest, before = chain.newest, chain.samples[-2 if len(chain.samples) > 1 else -1]
         passed = max(sample.captured - newest.captured, _EPSILON)
         onwards = passed / max(newest.captured - before.captured, _EPSILON)
@@ -331,7 +334,10 @@ class JointPlausibility:
         return False
 
     def _stuck(self, chain: _Chain) -> str:
-        """Return a message on a joint that reads a constant, far from before, although its encoder never rested."""
+        """Return a message about a joint that now reads a constant far from its trusted reading, "" if there is none.
+
+        Only joints count whose last digits otherwise never rest.
+        """
         if self._chain is None or len(chain.samples) < _CONSISTENT:
             return ""
         joints = np.array([sample.joints for sample in chain.samples])
@@ -343,14 +349,17 @@ class JointPlausibility:
         return self._stays(self._places & never & moved & still, joints[-1])
 
     def _stays(self, which: np.ndarray, joints: Float64) -> str:
-        """Return a message on the first of the joints `which`, which jumped and were constant at once; "" if none."""
+        """Return a message that the first joint of `which` (bool [D]) jumped to a constant; "" if `which` has none."""
         if not which.any():
             return ""
         first = int(which.argmax())
         return _STUCK(joint=self._limits.names[first], value=joints[first])
 
     def _drop_to_zero(self, chain: _Chain, sample: _Sample) -> str:
-        """Return a message on joints that jump to exactly 0, without passing or returning to it; "" if none."""
+        """Return a message about joints that jump to exactly 0, "" if there are none.
+
+        Joints that pass through 0 at their speed, or return to it, do not count.
+        """
         newest = chain.newest
         if not (zeros := self._zeros(newest.joints, sample.joints)) or len(chain.samples) < _CONSISTENT:
             return zeros
@@ -375,7 +384,7 @@ class JointPlausibility:
 
 
 class TrustingPlausibility(JointPlausibility):
-    """Plausibility that trusts each sample: if no robot moves, a recording jumps when it restarts."""
+    """Plausibility check that trusts every sample: if no robot moves, a replayed recording jumps when it restarts."""
 
     def judge(self, seen: LatestObservation, now: float, commanded: Float64 | None) -> LatestObservation:
         if seen.measured:
@@ -391,7 +400,10 @@ class TrustingPlausibility(JointPlausibility):
 
 
 class _LastDigitActivity:
-    """Detector of joints whose last digits never rest: they reversed several times, and were not constant since."""
+    """Detector of joints whose readings never rest in their last digits.
+
+    A joint counts if its reading reversed several times by small steps, and has not been constant since.
+    """
 
     def __init__(self, dim: int) -> None:
         self._step: Float64 = np.zeros(dim)  # the last one that was not 0
@@ -420,12 +432,12 @@ class _LastDigitActivity:
 
     @property
     def changing(self) -> np.ndarray:
-        """Joints that changed with each of the last samples, bool [D]."""
+        """Joints, bool [D], whose reading changed with each of the last samples."""
         return np.asarray(self._changed >= _STILL)
 
     @property
     def leapt(self) -> np.ndarray:
-        """Joints that jumped to a number and have read exactly that in all samples since, bool [D]."""
+        """Joints, bool [D], that jumped to a number and have read exactly this number in all samples since."""
         return np.asarray(self._leapt & (self._still >= _CONSISTENT - 1))
 
 

@@ -95,7 +95,7 @@ class Lateness:
         status["scheduling"] = scheduling.encode()
 
     def add(self, lateness: float, missed: int) -> None:
-        """Add one tick."""
+        """Add the lateness [s] of one tick, and the number of ticks missed before it."""
         self._late[self._count % _LATENESS_KEPT] = lateness
         self._count += 1
         self._ticks += 1

@@ -30,15 +30,15 @@ class _Sample(NamedTuple):
 
 
 class SteadyError:
-    """Distinction of an arm that sags below its command from one that is blocked or moving.
+    """Distinction of an arm that sags below its command from an arm that is blocked or moving.
 
-    A command that follows the measurement of a sagging arm makes it sink, tick by tick. A lasting error is that of
-    the servo, and no reason to move the command. An error that has grown within the last second, or arose while the
-    command moved and its joint did not, may come from an obstacle.
+    If the command of a sagging arm followed the measurement, the arm would sink tick by tick. A lasting error is caused
+    by the servo, and is no reason to move the command. An error that has grown within the last second, or arose while
+    the command moved and its joint did not, may be caused by an obstacle.
     """
 
     def __init__(self, settings: TickSettings, inherited: bool) -> None:
-        """`inherited`: the command is that of an earlier control process."""
+        """Begin without samples; `inherited`: the present command was sent by an earlier control process."""
         self._settings = settings
         self._samples: deque[_Sample] = deque()
         self._inherited = inherited
@@ -47,7 +47,7 @@ class SteadyError:
         self._presses = np.zeros(len(self.last), bool)  # joints that did not follow their command, bool [D]
 
     def update(self, robot: RobotActuator, measured: Float64 | None, now: float) -> None:
-        """Update at each tick; `measured` [D] is None if the joints are unknown."""
+        """Add a sample; call at each tick. `measured` [D] is None if the joints are unknown."""
         if not robot.engaged:
             self._samples.clear()
             self.last[:], self._presses[:] = np.nan, False
@@ -89,7 +89,10 @@ class SteadyError:
         return np.asarray(standing | self._moved_at_rest(robot, measured, now))
 
     def _moved_at_rest(self, robot: RobotActuator, measured: Float64, now: float) -> np.ndarray:
-        """Return the joints, bool [D], displaced by more than a servo error, but not by motion of the command."""
+        """Return the joints, bool [D], that are displaced although their command rested.
+
+        Only displacements above a servo error count, and not joints that failed to follow a moving command.
+        """
         rested = now - self._samples[0].time >= _WINDOW_S - _EVERY_S if self._samples else False
         far = np.abs(self._error(robot, measured)) > self._settings.safety.sagged
         rests = np.ptp([sample.commanded for sample in self._samples], axis=0) <= _STILL if rested else False

@@ -45,7 +45,10 @@ class TickState:
 
 
 class LimitingMonitor:
-    """Monitor of actions limited by safety: reports the beginning, and a sum at the end, not each tick."""
+    """Monitor of actions that safety limits.
+
+    It emits one event at the beginning of a period of limiting, and a summary at its end.
+    """
 
     def __init__(self, say: Callable[[str, str], None]) -> None:
         self._say = say
@@ -53,7 +56,7 @@ class LimitingMonitor:
         self._count, self._worst, self._most = 0, 0.0, ""
 
     def update(self, sent: TickResult, now: float) -> None:
-        """Process the result of a tick."""
+        """Count the tick if its action was limited; begin or end the period of limiting."""
         if sent.change > _TOLD:
             if not self._count:
                 self._say("limited", sent.limited)
@@ -64,14 +67,17 @@ class LimitingMonitor:
             self.close()
 
     def close(self) -> None:
-        """End the period of limiting, if any, and report its sum."""
+        """End the period of limiting, if there is one, and emit its summary."""
         if self._count:
             self._say("limited_sum", _LIMITED_SUM(count=self._count, worst=self._most))
         self._count, self._worst, self._most = 0, 0.0, ""
 
 
 class ProximityMonitor:
-    """Monitor of actions that bring links near each other: reports beginning and sum, not each tick."""
+    """Monitor of actions that bring links near each other.
+
+    It emits one event at the beginning of a period, and a summary at its end.
+    """
 
     def __init__(self, say: Callable[[str, str], None]) -> None:
         self._say = say
@@ -80,7 +86,7 @@ class ProximityMonitor:
         self._nearest: Collision | None = None
 
     def update(self, sent: TickResult, now: float) -> None:
-        """Process the result of a tick."""
+        """Count the tick if its action brings links near each other; begin or end the period of proximity."""
         near = sent.near
         if near is not None:
             if self._nearest is None:
@@ -92,7 +98,7 @@ class ProximityMonitor:
             self.close()
 
     def close(self) -> None:
-        """End the period of proximity, if any, and report its sum."""
+        """End the period of proximity, if there is one, and emit its summary."""
         if self._count:
             self._say("near_sum", _NEAR_SUM(count=self._count, nearest=self._nearest))
         self._count, self._nearest = 0, None
@@ -117,7 +123,10 @@ class Telemetry:
         self.run = 0
 
     def begin_tick(self, step: int, planned: float, woke: float | None = None) -> None:
-        """Begin the tick to which later calls belong; planned for `planned`, woken at `woke`."""
+        """Begin the tick `step`, to which later calls belong.
+
+        The tick was planned for `planned`, and the loop woke at `woke`.
+        """
         self._step, self.planned, self._woke = step, planned, woke
 
     def emit(self, kind: str, text: str, data: Mapping[str, object] = MappingProxyType({})) -> None:
@@ -129,7 +138,7 @@ class Telemetry:
         self._outbox.append(merged)
 
     def add_tick(self, seen: LatestObservation, sent: TickResult, simulated: bool) -> None:
-        """Send the record of the tick, if media needs it; `simulated`: it is that of the simulated robot."""
+        """Send the record of the tick to media, if it records; `simulated`: the record is of the simulated robot."""
         self.limiting.update(sent, self.planned)
         self._note_corrected(sent)
         self.nearing.update(sent, self.planned)

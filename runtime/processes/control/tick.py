@@ -76,10 +76,10 @@ _QUIET_S = 1.0  # [s] without an implausible measurement after which the next is
 
 
 class Tick:
-    """The control loop's body, with two pipelines: the robot's and, in a simulated run, the simulated robot's.
+    """Body of the control loop, with two pipelines: the robot's and, in a simulated run, the simulated robot's.
 
-    A missed deadline is never caught up: the caller passes the step that is due now, and limits use the time since
-    the last command, capped at 1.5 periods.
+    A missed deadline is never caught up: the caller passes the step that is due now, and limits use the time since the
+    last command, capped at 1.5 periods.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class Tick:
 
     @property
     def is_handing_over(self) -> bool:
-        """Whether a control word to the node about its driving must still be repeated."""
+        """Whether the node must still be sent a repetition of the word that begins or ends its driving."""
         return self._yielding.is_repeating
 
     @property
@@ -158,7 +158,7 @@ class Tick:
 
     @property
     def _active_pipeline(self) -> CommandPipeline:
-        """The pipeline for which chunks are intended."""
+        """The pipeline that executes the chunks: of the robot, or in a simulated run of the simulated robot."""
         return self._robot if self._simulated is None else self._simulated
 
     def _make_pipeline(self, actuator: Actuator) -> CommandPipeline:
@@ -172,7 +172,7 @@ class Tick:
         return CommandPipeline(actuator, *judged, believed, known)
 
     def _tick_pipelines(self, step: int, planned: float) -> TickResult:
-        """Execute a tick of each pipeline; return the result of the active one, for the record."""
+        """Execute a tick of each pipeline; return the result of the pipeline that executes chunks, for the record."""
         sent = TickResult(planned)
         # Nothing may be sent before the guard has read its latch (UNKNOWN).
         if self._shared_state.estop is not EStop.UNKNOWN:
@@ -374,7 +374,7 @@ class Tick:
             self._stop_at(measured, stopped, now)
 
     def _shows_it_now(self, stopped: EStopHold, now: float) -> bool:
-        """Return True if the joints show where the arm is after the press.
+        """Return True if the measured joints show where the arm is after the e-stop was pressed.
 
         If the e-stop is pressed in a gap of the measurements, the last joints are older: the arm has moved on, and
         would be driven back to them.
@@ -388,7 +388,11 @@ class Tick:
         )
 
     def _stop_at(self, measured: Float64, stopped: EStopHold, now: float) -> None:
-        """Move the command to the robot: at once within the stopping distance, the rest within velocity limits."""
+        """Move the command of a robot under the e-stop to its `measured` position [D].
+
+        It moves at once within the stopping distance, and beyond that within velocity limits. Joints with a steady
+        servo error keep their command.
+        """
         actuator, limits = self._actuator, self._settings.limits
         if not actuator.engaged and (self._plausibility.dead or not self._plausibility.is_settled):
             return
@@ -425,11 +429,11 @@ class Tick:
 
     @property
     def _moving_command(self) -> Float64 | None:
-        """The command of a robot that we move, None if the measurements should not change."""
+        """Command of the robot [D] if it is being moved; None if its joints are not expected to change."""
         return self._actuator.commanded if self._robot.behaviour.moving and self._actuator.engaged else None
 
     def _check_plausibility(self, now: float) -> None:
-        """Hold, and name the joint, while measurements are implausible."""
+        """Hold while measurements are implausible, and emit which joint is."""
         doubt = self._seen.implausible_reason
         if (
             not doubt or not self._plausibility.has_known_sample
@@ -473,7 +477,10 @@ class Tick:
             self._report.emit("implausible", doubt)
 
     def _disengage(self, why: str) -> None:
-        """Stop sending: an old target would pull a node that restarted at 0, a new one a joint with a dead encoder."""
+        """Stop sending commands, and emit `why`.
+
+        An old target would pull a node that restarted at 0, a new target would pull a joint with a dead encoder.
+        """
         self._left_run = self._report.run
         self._report_displaced(why)
         if isinstance(self._robot.behaviour, EStopHold):

@@ -53,7 +53,10 @@ def assemble(
     people: Clock | None = None,
     make_policy: MakePolicy = make_policy,
 ) -> Coordinator:
-    """Return the coordinator of a station; `people` is the clock of leases and commands if it is another one."""
+    """Return the coordinator of a station.
+
+    `people` is the clock of leases and of the validity of commands; None: `clock`.
+    """
 
     # Callbacks of components to the coordinator, which does not exist yet.
     def say(event: Event) -> None:
@@ -132,7 +135,10 @@ def _inference(
     kinematics: LazyKinematics,
     make_policy: MakePolicy,
 ) -> Inference:
-    """Return the component that queries the policy, with its own action spaces: the call's thread uses them."""
+    """Return the component that queries the policy.
+
+    It has action spaces of its own, because they are used on the thread of the policy call.
+    """
     settings = spec.deployment
     ages = StalenessLimits(spec.rate, settings.safety.joint_age_s, settings.safety.picture_age_s)
     requests = PolicyRequests(

@@ -51,7 +51,7 @@ def make_policy(
         leader: replaces the builder of the deployment's leader.
 
     Raises:
-        RuntimeFault: it does not fit the robot, or cannot be built.
+        RuntimeFault: the policy does not fit the robot, or cannot be built.
     """
     if spec.collecting:
         return _leader_policy(spec, clock, leader)

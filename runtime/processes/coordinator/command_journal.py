@@ -84,7 +84,10 @@ def _row(command: Command, ack: Ack) -> dict[str, Any]:
 
 
 def _json_arguments(arguments: Mapping[str, Any]) -> object:
-    """Return the arguments as JSON values; arguments that are not were refused, and must not raise here."""
+    """Return the arguments as a dict; if they cannot be written as JSON, a sentence about that.
+
+    Such arguments were refused, but must not raise an exception here.
+    """
     try:
         json.dumps(arguments, default=str)
     except (TypeError, ValueError, RecursionError) as error:

@@ -31,7 +31,7 @@ from runtime.station.spec import StationSpec
 
 @dataclass(eq=False)
 class Components(ABC):
-    """Components of a coordinator, and where their events go."""
+    """Components of a coordinator, and its methods for events."""
 
     boot: str
     shared: SharedState
@@ -65,8 +65,8 @@ class Components(ABC):
 
     @abstractmethod
     def record_event(self, event: Event) -> None:
-        """Record an event of another process, which writes it to the episode itself."""
+        """Publish an event of another process, which writes it to the episode itself."""
 
     @abstractmethod
     def handle_event(self, happening: SessionEvent, reason: str, process: str = "") -> None:
-        """Pass an event to the session and its components; `process` is the one that was restarted."""
+        """Pass an event to the session and its components; `process` is the restarted process, "" for other events."""

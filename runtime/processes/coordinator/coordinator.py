@@ -56,7 +56,10 @@ class Coordinator(Components):
 
     @property
     def rests(self) -> bool:
-        """Whether nothing is in progress and there is no lease holder, so that messages alone need to wake it."""
+        """Whether nothing is in progress and there is no lease holder.
+
+        Then only messages need to wake the process.
+        """
         return not (
             self.session.state.meaning.at_work
             or self.setup.active
@@ -86,7 +89,7 @@ class Coordinator(Components):
         return build_snapshot(self, self.inbox)
 
     def end_source_run(self, reason: str) -> None:
-        """End the run on request of its simulator."""
+        """End the run, because the source of observations, such as a simulator, reported that it is over."""
         self.handle_event(SessionEvent.RUN_ENDED, reason)
 
     def emit(self, event: Event) -> None:
@@ -119,7 +122,10 @@ class Coordinator(Components):
         return {} if run is None or run is self.runs.open else run.never_began_data
 
     def _unlock(self) -> None:
-        """Remove all locks: a restarted control has none, and one under the e-stop may have them."""
+        """Remove all gripper locks.
+
+        A restarted control has none, and a control under the e-stop may still have them.
+        """
         try:
             self.manual.unlock()
         except RuntimeFault as error:
@@ -205,7 +211,10 @@ class Coordinator(Components):
         return Ack(command.uuid, "accepted", _ESTOP_FLAG_RAISED, boot=self.boot, kind=command.kind)
 
     def _permission_problem(self, command: Command) -> str:
-        """Return why the sender may not use these arguments; "" if it may, or if it was answered before."""
+        """Return the reason why the sender may not use these arguments.
+
+        "" if it may, or if the command is a repetition that was answered before.
+        """
         if self.session.answered(command) is not None:
             return ""
         try:

@@ -134,23 +134,26 @@ class Demonstrations:
 
     @property
     def run(self) -> Run | None:
-        """The open run if it collects."""
+        """Open run if it collects a demonstration, else None."""
         run = self._opened()
         return run if run is not None and run.mode == "collect" else None
 
     @property
     def _newest(self) -> str:
-        """The uuid of the newest demonstration since the station started, "" if there was none."""
+        """Uuid of the newest demonstration since the station started, "" if there was none."""
         return self._asked[-1] if self._asked else ""
 
     @property
     def leader_problem(self) -> str:
-        """Reason why the leader cannot be followed now; "" if it can, or if that is unknown before a request."""
+        """Reason why the leader cannot be followed now, "" if there is none.
+
+        It is also "" if that is unknown before the first request.
+        """
         relay = self._relay
         return "" if relay is None else relay.leader_problem()
 
     def begin_setup(self, collects: bool) -> None:
-        """Begin a set-up, to collect or with a policy."""
+        """Disarm, and record whether the set-up that begins is for collection or for a policy."""
         self.disarm(_SETUP_BEGUN)
         self.set_up = collects
         self.why_not = _NOT_YET if collects else _NOT_SET_UP
@@ -161,7 +164,7 @@ class Demonstrations:
         self._event("collect_armed", _ARMED)
 
     def disarm(self, why: str) -> None:
-        """Disarm; nothing if not armed."""
+        """Disarm, and emit the reason `why`; do nothing if not armed."""
         if self.armed:
             self.armed, self.why_not = False, why
             self._event("collect_disarmed", _DISARMED(why=why))
@@ -266,7 +269,7 @@ class Demonstrations:
             self._event("episode_short", text)
 
     def label(self, asked: LabelRequest, by: str) -> Mapping[str, Any]:
-        """Write the result of an episode; return the label."""
+        """Write a label with the result of an episode; return the label."""
         episode, before = self._find_episode(asked.episode)
         return self._write(
             episode, replace(before, time=time.time(), by=by, result=asked.result, note=asked.note)
@@ -293,10 +296,10 @@ class Demonstrations:
         return data
 
     def _find_episode(self, given: str | None) -> tuple[str, Label]:
-        """Return the uuid of the named episode, and its latest label.
+        """Return the uuid of the episode `given` (None: the open or the newest one), and its latest label.
 
         Raises:
-            RuntimeFault: it is no demonstration of this station, or the open one.
+            RuntimeFault: the episode is no demonstration of this station, or `given` names the open episode.
         """
         run = self.run
         if given is None:

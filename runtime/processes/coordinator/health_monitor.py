@@ -64,7 +64,7 @@ _LATCH_S = 0.2  # [s] by which the e-stop flag may precede its latch on disk
 
 
 class HealthEvent(NamedTuple):
-    """An event for the session, with its reason."""
+    """Event for the session, with its reason."""
 
     happening: SessionEvent
     reason: str
@@ -84,7 +84,10 @@ class HealthMonitor:
         reception: Callable[[], ReceptionReport],
         stoppable: Callable[[], bool],
     ) -> None:
-        """`stoppable` returns whether a person at the robot can stop it, because its panel is served."""
+        """Begin to monitor.
+
+        `stoppable` returns whether a person at the robot can stop the run, because the station's panel is served.
+        """
         self._plan = spec
         self._shared_state = shared
         self._lease = lease
@@ -101,7 +104,10 @@ class HealthMonitor:
         self._pressed: float | None = None  # when the flag was set without its latch
 
     def poll(self, state: SessionState, run: Run | None) -> Iterator[HealthEvent]:
-        """Yield events for the session, which is in `state` before the first of them."""
+        """Yield events for the session.
+
+        `state` is the session's state before the first of them, `run` the open run.
+        """
         yield from self._check_heartbeats(state)
         yield from self._estop(state)
         yield from self._leases(run if state is SessionState.RUNNING else None)
@@ -110,7 +116,10 @@ class HealthMonitor:
             yield from self._end_of(run)
 
     def silent_sibling(self) -> str:
-        """Return a process with an expired heartbeat, "" if there is none: messages to it would be lost."""
+        """Return the name of a process with an expired heartbeat, "" if there is none.
+
+        Messages to such a process would be lost.
+        """
         return next((name for name in SIBLING_PROCESSES if not self._alive(name)), "")
 
     def _alive(self, name: str) -> bool:
@@ -119,7 +128,7 @@ class HealthMonitor:
 
     @property
     def _waiting_to_record(self) -> float:
-        """Used share of the fullest ring to media."""
+        """Used share of the fullest ring to media, 0 to 1."""
         return max(self._shared_state.rings[ring].fill for ring in _TO_RECORD)
 
     def poll_recorder(self, state: SessionState) -> Iterator[Event]:
@@ -181,7 +190,10 @@ class HealthMonitor:
             yield HealthEvent(SessionEvent.RELEASED, _RELEASED)
 
     def _just_pressed(self) -> bool:
-        """Return True while the latch may still be written: control obeys the flag, but user and reason follow."""
+        """Return True for a short time after the press of an e-stop, in which its latch may still be written.
+
+        Control obeys the flag at once, but user and reason become known only with the latch.
+        """
         now = self._clock.now()
         self._pressed = now if self._pressed is None else self._pressed
         return now - self._pressed < _LATCH_S
@@ -203,9 +215,10 @@ class HealthMonitor:
         self._lease_held = held
 
     def _goes_on_to(self, going: Run | None) -> float | None:
-        """Return the duration [s] to which a run continues although its lease holder is lost; None if it is held.
+        """Return the duration [s] to which the run continues although its lease holder is lost.
 
-        Only a trial that has begun continues, if it has a limited duration and can be stopped at the station's panel.
+        None if the run is held, or has no limit of duration. Only a trial that has begun continues, and only if it can
+        be stopped at the station's panel.
         """
         if self._plan.deployment.lease.lost == "hold" or not self._lease.lost(self._people.now()):
             return None

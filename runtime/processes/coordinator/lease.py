@@ -20,7 +20,7 @@ HIGHEST_EPOCH = 2**52  # of a claim; beyond 2**53 a browser's integers are inexa
 
 @dataclass(frozen=True, slots=True)
 class LeaseState:
-    """A lease: holder, epoch, expiry on our monotonic clock; `by` is the holder's display name.
+    """Lease: holder, epoch, expiry on our monotonic clock; `by` is the holder's display name.
 
     `hidden`: since the last renewal the holder's page has reported that it is hidden.
     """
@@ -33,7 +33,10 @@ class LeaseState:
 
 
 class Lease:
-    """At most one holder; a higher epoch takes over, a lower one is refused, and without renewal it expires."""
+    """Right to command with at most one holder.
+
+    A higher epoch takes over, a lower one is refused. The lease expires without renewal.
+    """
 
     def __init__(self, ttl: float) -> None:
         self._ttl = ttl
@@ -66,7 +69,7 @@ class Lease:
     def claim(self, holder: str, epoch: int, now: float, by: str = "") -> str:
         """Claim or extend the lease; return "" if granted, else the reason.
 
-        Epoch 0 is that of a terminal: it claims a free lease with the next epoch, or extends its own.
+        A terminal passes epoch 0: it claims a free lease with the next epoch, or extends its own lease.
         """
         if not holder:
             return _NEEDS_A_HOLDER

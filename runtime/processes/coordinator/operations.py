@@ -114,10 +114,11 @@ class SessionComponents:
 
 
 class SessionActions:
-    """Operations that the session has allowed and that involve several components; `spec` is the one in force.
+    """Operations that the session has allowed and that involve several components.
 
-    `absent` returns the name of a process with an expired heartbeat. A method that refuses raises RuntimeFault and
-    has changed nothing. Return values become part of the answer.
+    `spec` is the specification of the last set-up or tuning. `absent` returns the name of a process with an expired
+    heartbeat. A method that refuses raises RuntimeFault and has changed nothing. Return values become part of the
+    answer.
     """
 
     def __init__(
@@ -171,10 +172,10 @@ class SessionActions:
         return {"bench": reset["id"]} if reset else {}
 
     def _changed_spec(self, asked: SetUpRequest) -> StationSpec:
-        """Return the specification of a set-up.
+        """Return the deployment's specification with the changes of a set-up request.
 
         Raises:
-            RuntimeFault: it is invalid, or contradicts the manifest of an open recording.
+            RuntimeFault: the result is invalid, or contradicts the manifest of an open recording.
         """
         collects = self._collects(asked)
         changes = asked.changes | ({"strategy": {"kind": "naive"}} if collects else {})
@@ -243,7 +244,10 @@ class SessionActions:
         return mode
 
     def _require_comparable(self, asked: RunRequest) -> None:
-        """Raise RuntimeFault for a trial that is not exactly the set-up: tuned, manual, or not on the robot."""
+        """Raise RuntimeFault if a trial would not be executed exactly as set up.
+
+        This is the case in a mode other than "continuous", after tuning, with a locked gripper, or without recording.
+        """
         mode = self._mode(asked)
         if mode != "continuous":
             raise RuntimeFault(_TRIAL_MODE(mode=mode))
@@ -294,7 +298,7 @@ class SessionActions:
         return {"strategy": strategy, "task": settings.task}
 
     def cancel(self) -> None:
-        """Discard the shown chunk, the rest of the executed one, or a motion; then hold."""
+        """Discard the proposal, the rest of the executed chunk, or a motion; then hold, and stop grippers."""
         self.runs.cancel()
         self.manual.stop_grippers()
 
@@ -306,7 +310,10 @@ class SessionActions:
         return self.manual.move_gripper(asked, free)
 
     def approach(self) -> None:
-        """Move to the policy's first action on a limited path: that of the set-up, or of the shown chunk."""
+        """Move on a limited path to the policy's first action.
+
+        It is that of the last set-up, or during a run that of the proposal.
+        """
         made, first = self.inference.proposal, self.setup.first_action
         if self._state() is not SessionState.READY and made is not None:
             self.runs.approach(self.manual.check_motion("approach", made.commands.intended_start))
@@ -321,7 +328,10 @@ class SessionActions:
         self.collecting.arm()
 
     def discard(self, asked: DiscardRequest) -> TransitionResult:
-        """Mark an episode as discarded; without a name the open episode, which ends as by `end_run`."""
+        """Mark an episode as discarded.
+
+        If the request names none, it is the open episode, which ends as by `end_run`, or the newest one.
+        """
         told = self.collecting.discard(asked, self.by)
         if asked.episode is None and self.collecting.run is not None:
             self.end_run("finished", DISCARDED)
@@ -352,7 +362,7 @@ class SessionActions:
         return {"episode": self.runs.start_standalone_recording(self.setup.info)}
 
     def _require_family(self) -> None:
-        """Raise RuntimeFault while a process is starting: messages to it would be lost."""
+        """Raise RuntimeFault if the heartbeat of a process is missing: messages to it would be lost."""
         absent = self._absent()
         if absent:
             raise RuntimeFault(_FAMILY_STARTING(process=absent))

@@ -37,9 +37,9 @@ class PathCheck:
         self._collisions = Collisions(spec.robot, safety.collision_margin + _SPARE)
 
     def check(self, what: str, start: Float64, goal: Float64) -> None:
-        """Raise RuntimeFault if the path from `start` to `goal` [D] leaves a box or if links collide.
+        """Raise RuntimeFault if links collide on the path from `start` to `goal` [D], or if it leaves a workspace box.
 
-        `what` begins the message. A box matters only if the path has been inside it.
+        `what` begins the message. A box is left only by a path that was inside it.
         """
         way = self._path(start, goal)
         if arm := self._workspace.arm_leaving_on(way):

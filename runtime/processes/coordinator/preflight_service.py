@@ -37,7 +37,10 @@ PREFLIGHT_QUERIES = ("preflight", "preflight_report", "policy_server")
 
 
 class PreflightService:
-    """Preflights of the coordinator: `in_force` returns the last set-up, `own` is the deployment, which is checked."""
+    """Preflights of the coordinator.
+
+    `in_force` returns the specification of the last set-up; `own` is that of the deployment, which preflights check.
+    """
 
     def __init__(
         self,
@@ -65,7 +68,7 @@ class PreflightService:
             return Ack(command.uuid, "refused", str(fault), boot=boot)
 
     def poll(self) -> None:
-        """Emit an event if a preflight has ended; cheap."""
+        """Emit an event if a preflight has ended."""
         ended = self._preflights.poll()
         if ended is not None:
             verdict = ended.finished.get("verdict") or ended.failure
@@ -87,7 +90,10 @@ class PreflightService:
         return {"id": asked.id, "longest_s": longest}
 
     def _require_free(self, asked: PreflightRequest) -> None:
-        """Raise RuntimeFault if the station is in use, or would lose its exclusive policy server."""
+        """Raise RuntimeFault if the station is at work.
+
+        Also if it is ready, and the preflight would take its exclusive policy server away.
+        """
         state = self._state()
         if state.meaning.at_work:
             raise RuntimeFault(
@@ -107,7 +113,10 @@ class PreflightService:
         return self._preflights.report(read("preflight_report", PreflightReportRequest, command.args).id)
 
     def _server(self, command: Command) -> dict[str, Any]:
-        """Return the server of the policy in force, or of a preflight with this `policy`."""
+        """Return the server's address and the session's state.
+
+        It is the server of the policy in force, or of the policy in the query, as a preflight with it would use.
+        """
         asked = read("policy_server", PolicyServerRequest, command.args)
         settings = self._in_force().deployment
         if asked.policy is not None:

@@ -1,4 +1,7 @@
-"""Coordinator process: stops at once, commands in turns; snapshots at 10 Hz (5 at rest), joints at 30 Hz."""
+"""Coordinator process: answers stops at once and commands in turns.
+
+It publishes snapshots at 10 Hz (5 Hz at rest) and joints at 30 Hz.
+"""
 
 from __future__ import annotations
 
@@ -128,7 +131,10 @@ class CommandService:
         return authenticate(command, call.payload, call.signature, call.uid, self._key)
 
     def _stop(self, stops: list[QueuedCommand]) -> list[Answered]:
-        """Answer stops without waiting for the disk; equal ones in this turn get the same answer."""
+        """Answer stops without waiting for the disk; return the new answers.
+
+        Equal stops in this turn get the same answer.
+        """
         first: dict[tuple[str, str, str, int], Ack] = {}
         fresh: list[Answered] = []
         for call, command in stops:
@@ -142,7 +148,7 @@ class CommandService:
         return fresh
 
     def _execute(self, asked: list[QueuedCommand]) -> list[Answered]:
-        """Execute commands; return the new answers, which are sent after they are on disk."""
+        """Execute commands; return the new answers, which are sent after they have been written to the disk."""
         fresh: list[Answered] = []
         for call, command in asked:
             if (first := self._coordinator.session.answered(command)) is not None:
@@ -161,7 +167,7 @@ class CommandService:
         self._server.answer(call, Ack(command.uuid, "refused", reason, kind=command.kind))
 
     def _defer(self, call: IncomingMessage, command: Command) -> None:
-        """Answer the command when its kinematics are loaded, without waiting here."""
+        """Queue a command whose kinematics are still loading, without waiting; refuse it if too many are queued."""
         if len(self._waiting) < _MOST_WAITING:
             self._waiting.append((call, command))
         else:
@@ -236,11 +242,12 @@ class CommandService:
         }
 
     def _joints(self) -> dict[str, Any]:
-        """Return one control step joint by joint, float32 [D] each; NaN in `planned` and `raw` if there is none.
+        """Return the joints of the newest control step, float32 [D] for each stage from plan to measurement.
 
         `raw` is the newest chunk's action for the step, `planned` the action of all chunks before safety, `simulated`
-        the command of the simulated robot. `chunk` has the largest weight in the step (-1: none), `chunks` is the
-        number of contributing chunks, `limited` whether safety has changed the action.
+        the command of the simulated robot; `raw` and `planned` are NaN if there is none. `chunk` has the largest weight
+        in the step (-1: none), `chunks` is the number of contributing chunks, `limited` whether safety has changed the
+        action.
         """
         status, seen = self._coordinator.shared.control.read(), self._coordinator.shared.observation.read()
         step = int(status["step"])

@@ -34,7 +34,7 @@ class Queries:
         return self._preflights.handle(command, self._boot)
 
     def is_loading(self, command: Command) -> bool:
-        """Return True if the answer needs kinematics that are still loading; ask again in a moment."""
+        """Return True if the answer needs kinematics that are still loading; the caller must ask again later."""
         return command.kind == "aim" and self._manual.is_loading(command.args)
 
     def _events_since(self, command: Command) -> Ack:

@@ -89,11 +89,11 @@ class Runs:
 
     @property
     def _requires_recording(self) -> bool:
-        """Whether a run that is not recorded must not continue."""
+        """Whether the deployment forbids a run to continue without its recording."""
         return self._plan.deployment.recording.on_failure == "hold"
 
     def _must_record(self, trial: bool, mode: str) -> bool:
-        """Return True if a run must not begin without its recording, like trials and demonstrations."""
+        """Return True if a run must not begin without its recording, for example a trial or a demonstration."""
         return self._requires_recording or trial or mode == "collect"
 
     def _require_room(self) -> None:
@@ -112,7 +112,7 @@ class Runs:
         }
 
     def update_provenance(self, **changes: Any) -> None:
-        """Change fields of Provenance (specification, checkpoint, bench) for later manifests."""
+        """Change fields of Provenance (specification, checkpoint, bench) for the manifests of later episodes."""
         self._provenance = replace(self._provenance, **changes)
 
     # --- runs ----------------------------------------------------------------------------------------------
@@ -124,9 +124,10 @@ class Runs:
         more: Mapping[str, Any] = MappingProxyType({}),
         command: str = "",
     ) -> str:
-        """Request an episode from media; return its uuid, "" without a recording. The run begins when it is open.
+        """Request an episode from media; return its uuid, "" without a recording.
 
-        `more` overrides fields of the manifest.
+        The run begins when the episode is open. `more` overrides fields of the manifest, `command` is the uuid of the
+        command that starts the run.
 
         Raises:
             RuntimeFault: a standalone recording is open, or the disk has no room for a required recording.
@@ -197,7 +198,7 @@ class Runs:
         """Resume the open run.
 
         Raises:
-            RuntimeFault: there is none, or its required recording has ended.
+            RuntimeFault: no run is open, or its required recording has ended.
         """
         run = self.open
         if run is None:
@@ -227,7 +228,10 @@ class Runs:
             self.record_event(EndEpisode(status, reason, details))  # a stop must not fail because media hangs
 
     def update_truth(self, truth: Mapping[str, Any], running: bool) -> None:
-        """Record when a simulated bench first reports a milestone as reached, in a run that is not held."""
+        """Record the time at which a simulated bench first reports each milestone as reached.
+
+        Nothing is recorded unless a run is `running`.
+        """
         run, milestones = self.open, truth.get("milestones")
         if not running or run is None or run.begun_at is None or not isinstance(milestones, Mapping):
             return
@@ -236,12 +240,12 @@ class Runs:
                 run.reached.setdefault(str(name), round(run.elapsed(self._clock.now()), 2))
 
     def poll(self) -> None:
-        """Begin a run as soon as what it waits for is loaded."""
+        """Begin a run that waits for kinematics as soon as they are loaded."""
         if self.open is not None and self.open.waiting:
             self._start(self.open)
 
     def _start(self, run: Run) -> None:
-        """Begin a run; a manual one only when jogs can be answered at once."""
+        """Begin a run; a manual run waits until jogs can be answered at once."""
         if run.mode == "manual" and not self._prepared():
             run.wait()
             return
@@ -263,7 +267,7 @@ class Runs:
     # --- motions within a run --------------------------------------------------------------------------------
 
     def move(self, goal: Float64, speed: float) -> None:
-        """Move to `goal` on a limited path, within the open run if there is one."""
+        """Move to `goal` [D] on a limited path, within the open run if there is one."""
         self._orders.send_order("motion", run=self._begun, goal=goal, speed=speed)
 
     def cancel(self) -> None:
@@ -273,7 +277,7 @@ class Runs:
             self._start_after_arrival(self.open)
 
     def approach(self, goal: Float64) -> None:
-        """Move to the start of the shown chunk."""
+        """Move to `goal` [D], the start of the proposal."""
         if self.open is not None:
             self.open.approach()
             self.move(goal, 1.0)
@@ -316,7 +320,7 @@ class Runs:
         """Close the standalone recording.
 
         Raises:
-            RuntimeFault: there is none.
+            RuntimeFault: no standalone recording is open.
         """
         if not self._alone:
             raise RuntimeFault(_NO_RECORDING_ALONE)
@@ -333,7 +337,10 @@ class Runs:
             self._alone = ""
 
     def on_process_restarted(self, process: str, reason: str) -> None:
-        """End a standalone recording if media, which had its files, or control, which had its ticks, restarted."""
+        """End a standalone recording if media or control was restarted.
+
+        Media had its open files, control its ticks.
+        """
         if process == "media":
             self._alone = ""  # repair closes it
         elif process == "control":

@@ -104,7 +104,7 @@ def station_facts(spec: StationSpec) -> dict[str, Any]:
 
 
 def _phase(of: Components) -> str:
-    """Return the phase of a running run in one word; "" if there is none, or it has not begun."""
+    """Return the phase of a run in one word; "" if no run has begun or the session is not running."""
     run, control = of.runs.open, of.shared.control.read()
     if run is None or run.begun_at is None or of.session.state is not SessionState.RUNNING:
         return ""

@@ -1,4 +1,4 @@
-"""Events about control's timing: real time not permitted, or ticks late; each once, not per tick."""
+"""Events about control's timing: real time is not permitted, or ticks are late. Each is emitted once, not per tick."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOOK_S = 1.0
 
 
 class TimingReport:
-    """Monitor of control's timing statistics, once a second; `asked`: control requests the real-time class."""
+    """Monitor of control's timing statistics, once a second; `asked`: control should run in the real-time class."""
 
     def __init__(self, shared: SharedState, rate: float, priority: int, asked: bool) -> None:
         self._shared_state = shared
@@ -28,7 +28,7 @@ class TimingReport:
         self._late = False
 
     def poll(self, now: float) -> list[Event]:
-        """Return new events about control's timing; none before control has ticked for a while."""
+        """Return new events about control's timing; [] until control has ticked for a while."""
         if now < self._next:
             return []
         self._next = now + _LOOK_S

@@ -43,7 +43,10 @@ _REMEMBERED = 10_000  # most remembered presses of one e-stop
 
 
 class Guard:
-    """E-stop presses and releases, in this order: flag, disk, answer, log. No step delays an earlier one."""
+    """E-stop presses and releases.
+
+    A press is handled in the order flag, disk, answer, log, so that no step delays an earlier one.
+    """
 
     def __init__(
         self, shared: SharedState, latch: Latch, clock: Clock, period: float, station: str = ""
@@ -65,14 +68,14 @@ class Guard:
             log.warning("e-stop is latched since before this start, by %s: %s", latched.by, latched.why)
 
     def raise_flag(self) -> None:
-        """Stop the robot, before the sender is authenticated."""
+        """Set the e-stop flag, which stops the robot, even before the sender is authenticated."""
         self._shared_state.set_estop(EStop.LATCHED)
         self._releases = (
             self._shared_state.releases
         )  # a release requested before this press does not release it
 
     def press(self, by: str, why: str) -> str:
-        """Set the flag, then latch on disk; return "" or why the latch will not survive a restart.
+        """Set the flag, then write the latch to disk; return "", or the reason why it will not survive a restart.
 
         A latch by the same user for the same reason is not written again.
         """
@@ -179,7 +182,7 @@ class EStopServer:
         self._endpoints.write("guard", {"estop": self._server.endpoint})
 
     def serve(self, timeout: float) -> None:
-        """Wait up to `timeout` [s] for a message or the bell, then answer all that waits."""
+        """Wait up to `timeout` [s] for a message or the bell, then answer all waiting messages."""
         if not self._turns.has_waiting:
             self._poller.poll(int(timeout * 1000))
         if self._bell is not None:
@@ -222,7 +225,10 @@ class EStopServer:
 
 
 def _arguments() -> argparse.Namespace:
-    """Parse the supervisor's arguments: plain values, so that no module that a deployment names is loaded here."""
+    """Parse the supervisor's arguments, which are plain values.
+
+    So the guard does not load any module that is named in a deployment.
+    """
     parser = argparse.ArgumentParser(prog="runtime.guard", description="started by the supervisor")
     parser.add_argument("--station", required=True)
     parser.add_argument("--folder", required=True, type=Path, help="of the station: latch, key, endpoints")
@@ -237,7 +243,7 @@ def _arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Guard until the supervisor has ended and control has stopped ticking."""
+    """Guard the station until the supervisor has ended and control has stopped ticking."""
     descriptors.raise_file_limit()
     given = _arguments()
     logs.configure_logging("guard")

@@ -60,7 +60,7 @@ class LockstepEnvironment:
 
 @dataclass(frozen=True, slots=True)
 class Peers:
-    """Constructors of a station's peers; by default those that its deployment names."""
+    """Constructors of a station's source, sink and policy; by default those that its deployment names."""
 
     source: Callable[[StationSpec, Clock], Source] = make_source
     sink: Callable[[StationSpec, Clock], Sink] = make_sink
@@ -70,7 +70,7 @@ class Peers:
 class Lockstep:
     """Station without processes; each `tick` runs reception, media, coordinator and control in that order.
 
-    `clock`, `around` and `peers` are passed if other code takes part.
+    Other code that takes part passes `clock`, its environment `around`, and `peers`.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Lockstep:
         self.clock.sleep_until(self.step / self.spec.rate)
 
     def command(self, kind: str, **arguments: Any) -> Ack:
-        """Execute a command under a lease of lockstep's own. Raises SetupError if it is refused."""
+        """Execute a command under a lease of lockstep's own. Raises SetupError if the command is refused."""
         self._handle("lease_claim")
         ack = self._handle(kind, arguments)
         if ack.status == "refused":
@@ -146,7 +146,10 @@ class Lockstep:
         )
 
     def until(self, reached: Callable[[], bool], seconds: float, what: str) -> SessionState:
-        """Tick until `reached()`, return the state then. Raises SetupError after `seconds` [s] of virtual time."""
+        """Tick until `reached()` returns True; return the session's state then.
+
+        Raises SetupError, which names `what`, after `seconds` [s] of virtual time.
+        """
         end = self.clock.now() + seconds
         while not reached():
             if self.clock.now() > end:
@@ -182,7 +185,7 @@ def check(spec: StationSpec) -> None:
 
 
 def run(spec: StationSpec, longest: float = 3600.0, peers: Peers | None = None) -> LockstepRun:
-    """Set up, run to the end of the source or run.duration_s, and close. Raises RuntimeFault.
+    """Set up, run until the source's end or for run.duration_s, and close. Raises RuntimeFault.
 
     `longest` bounds the virtual time of the run [s]; `peers` as in `Lockstep`.
     """

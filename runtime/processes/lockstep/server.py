@@ -122,13 +122,13 @@ class ServedLockstep(Lockstep):
         self._again_at = self._next_at = 0.0  # on the clients' clock [s]
 
     def serve(self, ended: Callable[[], bool]) -> None:
-        """Tick when time passes, answer commands and publish, until `ended()`."""
+        """Tick while time is not paused, answer commands and publish, until `ended` returns True."""
         self.connect()
         while not ended():
             self.poll()
 
     def poll(self) -> None:
-        """Run one tick if time passes, then handle all commands that wait."""
+        """Run one tick if time is not paused, then handle all waiting commands."""
         wait = _POLL_S
         if not self._is_paused():
             now = self._people.now()
@@ -144,7 +144,7 @@ class ServedLockstep(Lockstep):
         self._estops.serve(0.0)
 
     def tick(self) -> None:
-        """Run one control period; a run that is over ends within it."""
+        """Run one control period; if the source's run is over, the station's run ends within this period."""
         super()._advance_clock()
         if why := self._over(self.coordinator.session.state is SessionState.RUNNING):
             self.coordinator.end_source_run(why)
@@ -154,7 +154,7 @@ class ServedLockstep(Lockstep):
             self._figures.write()
 
     def _tick_ahead(self) -> None:
-        """Run a tick while an e-stop press waits; later ticks are delayed by as much, or time would run faster."""
+        """Run a tick early because an e-stop press waits; later ticks are delayed as much, or time would run faster."""
         self._next_at = max(self._next_at, self._people.now()) + 1.0 / self.spec.rate
         self.tick()
 
@@ -182,7 +182,7 @@ class ServedLockstep(Lockstep):
         return state is SessionState.SETTING_UP
 
     def _poll_paused(self) -> None:
-        """Handle messages while time is paused; anything that begins, begins with a tick."""
+        """Handle messages while time is paused; whatever they begin starts with the next tick."""
         self.guard.poll()
         closing, rests = (
             self.media.closing,

@@ -37,18 +37,18 @@ class _Camera:
     spoken: float = -math.inf  # time of the last report [s]
 
     def set_silent(self, silent: bool, row: int) -> None:
-        """Record that it stops at row `row`, or is back."""
+        """Record that the camera stops at row `row`, or returns if not `silent`."""
         self.silent, self.row = silent, row
         if silent:
             self.unsaid_from = self.unsaid_from if self.unsaid else row
             self.unsaid += 1
 
     def is_due(self, now: float) -> bool:
-        """Return True if an event is due."""
+        """Return True if an event about the camera is due at time `now` [s]."""
         return (self.said and not self.silent) or (self.unsaid > 0 and now - self.spoken >= QUIET_S)
 
     def to_event(self, name: str, now: float, age: float | None) -> Event:
-        """Return the event about its present state; `age` is that of its last picture [s]."""
+        """Return the event about the camera's present state; `age` is the age of its last picture [s]."""
         data: dict[str, object] = {"camera": name, "row": self.row}
         if self.silent:
             stopped = {"camera": name, "row": self.row}
@@ -67,8 +67,8 @@ class _Camera:
 class DropoutLog:
     """Dropouts of the cameras of one episode, updated row by row.
 
-    A stop and a return are each reported at most once in QUIET_S. Changes meanwhile are counted, and reported with
-    their number when that time is over, as the state at that time.
+    For each camera at most one stop and one return are reported within QUIET_S. Changes meanwhile are counted, and
+    reported with their number when that time is over, with the state at that time.
     """
 
     def __init__(self, cameras: Iterable[str]) -> None:
@@ -105,7 +105,7 @@ class CameraRows:
         self.lost: frozenset[str] = frozenset()  # cameras whose new picture for the newest row is gone
 
     def sizes(self, seen: Observation) -> dict[str, dict[str, int]]:
-        """Return the size of each video, and of the camera's pictures if they are scaled for it."""
+        """Return width and height of each video, and of the camera's pictures if these are scaled for the video."""
         pictures = {camera: seen.pictures[camera] for camera in self._cameras}
         given = {camera: (picture.shape[0], picture.shape[1]) for camera, picture in pictures.items()}
         sizes = {}

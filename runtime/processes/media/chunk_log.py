@@ -12,7 +12,10 @@ _KEPT = 256  # most entries of either half that wait for the other
 
 
 class ChunkLog:
-    """Writer of each chunk of one episode when both halves are known, in either order. Raises RecordingError."""
+    """Writer of each chunk of one episode, when the policy's response and its placement are both known.
+
+    They may come in either order. Methods raise RecordingError.
+    """
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
@@ -71,9 +74,10 @@ class ChunkLog:
 
 
 def _met(answer: PolicyAnswer) -> tuple[Float32 | None, Float32 | None, UInt8 | None]:
-    """Return the IK errors [m], [rad] and flags of each policy row [H, arms], the worst of its steps.
+    """Return the IK errors [m], [rad] and flags of each policy row [H, arms].
 
-    A row without steps has NaN and no flags; None for a chunk of joints.
+    Each is the worst of the row's control steps. A row without steps has NaN and no flags. For a chunk of joints all
+    three are None.
     """
     errors, flags = (answer.position_error, answer.rotation_error), answer.ik_flags
     if errors[0] is None or errors[1] is None or flags is None:

@@ -15,9 +15,9 @@ _LOOK_S = 0.02
 
 
 class ExportQueue:
-    """Queue of exports into one data folder, one at a time; the child process ends with this one.
+    """Queue of exports into one data folder, one at a time; its child process ends with this process.
 
-    Without `wanted` it does nothing.
+    If `wanted` is False it does nothing.
     """
 
     def __init__(self, data: Path, wanted: bool = True) -> None:
@@ -36,7 +36,10 @@ class ExportQueue:
             self._thread.start()
 
     def finish(self, seconds: float) -> None:
-        """Wait for the queued exports, at most `seconds` [s]; the others are made when they are requested again."""
+        """Wait for the queued exports, at most `seconds` [s].
+
+        Exports that remain are made when they are requested again.
+        """
         deadline = time.monotonic() + seconds
         while self._waiting.unfinished_tasks and time.monotonic() < deadline:
             time.sleep(_LOOK_S)

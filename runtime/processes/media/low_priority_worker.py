@@ -17,7 +17,7 @@ NICE = 5  # the same as the web's, which shows the pictures
 
 
 class Work(Protocol):
-    """Work that only some clients want; all methods are called by one thread."""
+    """Protocol of work on observations that only some clients want; all methods are called by one thread."""
 
     @property
     def socket(self) -> zmq.Socket[Any]:
@@ -56,7 +56,7 @@ class LowPriorityWorker:
             self._bell.ring()
 
     def close(self) -> None:
-        """End after the present observation."""
+        """End the thread after the present observation."""
         self._closed = True
         self._bell.ring()
         self._thread.join()

@@ -124,7 +124,7 @@ class Media:
 
     @property
     def rests(self) -> bool:
-        """True while nothing is recorded, begun or closed; then messages wake the process."""
+        """True while no episode is open, requested or being closed; then only messages wake the process."""
         going_on = self.recording, self.closing, self._waiting is not None, self._opened is not None
         return not any(going_on)
 
@@ -151,7 +151,10 @@ class Media:
             self.report()
 
     def _end_orphaned_episode(self) -> None:
-        """End the episode of a coordinator that has died, after its last messages; its successor does not know it."""
+        """End the episode of a coordinator that has died, after the ticks that are still waiting.
+
+        The coordinator's successor does not know the episode.
+        """
         generation = self._shared_state.generation("coordinator")
         if generation != self._generation:
             self._drain("ticks")
@@ -169,7 +172,10 @@ class Media:
                 return  # later messages belong to an episode that has not begun
 
     def _ready_to_begin(self) -> bool:
-        """Begin a request that has waited long enough; return False if it must continue to wait."""
+        """Begin an episode whose request waits for the previous one to be closed, if that is done or takes too long.
+
+        Return False if it must continue to wait.
+        """
         waiting = self._waiting
         if waiting is None:
             return True
@@ -250,7 +256,10 @@ class Media:
         return EpisodeOpened(run, identity, str(path))
 
     def _run_begun(self, message: RunBegun) -> None:
-        """Report the open episode: the source has begun, and its first frame is in the run's first tick."""
+        """Report to the coordinator that the episode is open.
+
+        The source's run has begun, and its first frame is in the run's first tick.
+        """
         opened = self._opened
         if opened is not None and message == RunBegun(opened.run, self._generation):
             self._send(opened)
@@ -331,7 +340,7 @@ class Media:
 
 
 def make_recorder(spec: StationSpec, now: Callable[[], float], patient: bool = False) -> Recorder:
-    """Create the recorder of a deployment; `patient` waits for encoders, for lockstep."""
+    """Create the recorder of a deployment; if `patient`, as for lockstep, it waits for the video encoders."""
     robot = spec.robot
     described = {
         "name": robot.name,

@@ -50,7 +50,7 @@ class DatasetGrid:
 
 @dataclass(frozen=True, slots=True)
 class ClosedEpisode:
-    """Finished episode."""
+    """Result of closing an episode."""
 
     uuid: str
     path: Path
@@ -239,7 +239,7 @@ class Recorder:
         return replace(tick, executed=self._applied, source="none" if reported is None else "teleop")
 
     def _target(self, row: int) -> int:
-        """Return the step at or before which row `row` was sampled."""
+        """Return the step of row `row`: the row is the last tick not later than it."""
         assert self._first_step is not None
         # The tolerance prevents that rounding moves a row which falls exactly on a tick to the previous tick.
         return self._first_step + math.floor(row * self._grid.control_rate / self._grid.fps + 1e-9)
@@ -297,7 +297,7 @@ class Recorder:
         return said
 
     def _eef(self, told: Float32 | None, joints: Float32) -> Float32:
-        """Return the reported poses, else those of forward kinematics."""
+        """Return the reported poses `told`; if None, the poses of `joints` by forward kinematics."""
         return self._grid.eef_of(joints) if told is None else told
 
 

@@ -1,4 +1,4 @@
-"""Episodes whose end did not fit on the disk: closed again and again until there is room."""
+"""Episodes whose end did not fit on the disk: closing them is retried until there is room."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _FIRST_S, _MOST_S = 1.0, 30.0  # pauses between attempts [s], doubled each time
 
 
 class UnclosedEpisodes:
-    """Queue of episodes to close, oldest first; after a success the next one is tried at once.
+    """Queue of episodes whose closing is retried, oldest first.
 
-    Call `poll` regularly.
+    After a success the next episode is tried at once. Call `poll` regularly.
     """
 
     def __init__(self, closer: Callable[[Close], Future[ClosedEpisode]], now: Callable[[], float]) -> None:
@@ -79,7 +79,10 @@ class UnclosedEpisodes:
         return None
 
     def finish(self, seconds: float) -> ClosedEpisode | None:
-        """Try once more and wait at most `seconds` [s]; return as `poll`. Repair completes the others later."""
+        """Try once more, waiting at most `seconds` [s]; return the episode that is closed now, or None.
+
+        Repair completes the remaining episodes later.
+        """
         self._back_off.reset()
         closed = self.poll()
         if closed is None and self._attempt is not None:

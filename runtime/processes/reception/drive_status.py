@@ -26,10 +26,10 @@ class DriveStatus:
         self._told = -math.inf
 
     def update(self, said: Mapping[str, Any] | None, now: float) -> str:
-        """Store the state of one observation; return a sentence about its changes, or "".
+        """Store the drive state `said` of one observation; return a sentence about its changes, "" if there are none.
 
-        An observation without a drive state is no change; its state may have been unreadable. A change within 0.2 s
-        of the last sentence is reported later, if it persists.
+        An observation without a drive state does not count as a change, because its state may have been unreadable. A
+        change within 0.2 s of the last sentence is reported later, if it persists.
         """
         self.newest = said or {}
         if said is None or now - self._told < _QUIET_S:

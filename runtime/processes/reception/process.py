@@ -58,7 +58,7 @@ class CpuShare:
 
 
 class Reception:
-    """Reception of one station; `poll` handles all that waits. Lockstep calls it tick by tick."""
+    """Reception of one station; `poll` handles all waiting messages. Lockstep calls it tick by tick."""
 
     def __init__(self, shared: SharedState, source: Source, clock: Clock, scheduling: str = "") -> None:
         self._shared_state = shared
@@ -78,7 +78,7 @@ class Reception:
         self._report_in_time()
 
     def poll_disconnected(self) -> None:
-        """Do the same without an observation, because the source is not connected."""
+        """Handle media's commands, and send a report if it is due, while the source is not connected."""
         self.poll_commands()
         self._report_in_time()
 
@@ -116,7 +116,10 @@ class Reception:
         self._send(ReceptionReport(now, rates, faults, *told))
 
     def _hand_on(self, observation: Observation, numbers: Mapping[str, int]) -> None:
-        """Send an observation to media before other processes can read it, so that media has those of all ticks."""
+        """Send an observation to media.
+
+        This precedes its publication, so that media has the observation of every tick that uses it.
+        """
         if self._record(as_message(observation, numbers)):
             self._missed = 0
             return
@@ -143,8 +146,8 @@ def make_source(
 ) -> Source:
     """Create the source, not yet connected: the transport's, with the deployment's own cameras added.
 
-    The transport gets a robot without these cameras, because it must not wait for them. Cameras that it omits by
-    itself stay. `build` replaces the constructor of the transport's kind.
+    The transport gets a robot without these cameras, because it must not wait for them. Cameras that the transport
+    leaves out anyway remain in that robot. `build` replaces the constructor of the transport's kind.
     """
     settings = spec.deployment
     own = settings.cameras.keys() & set(delivered_cameras(settings, spec.robot))
@@ -159,7 +162,7 @@ def make_source(
 
 
 def main() -> None:
-    """Receive until the supervisor has ended, and control with it."""
+    """Receive until the supervisor and control have ended."""
     heap.keep_freed_memory()
     member = join_station("reception", unread=_UNREAD)
     shared, clock = member.shared, MonotonicClock()

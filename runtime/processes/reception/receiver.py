@@ -32,8 +32,9 @@ _STANDING = "_unusable"  # suffix of faults that occur in every message of a nod
 
 
 class ObservationReceiver:
-    """Path of an observation: pictures into shared slots, `hand_on` with their numbers, then publication.
+    """Receiver of a source's observations.
 
+    It writes pictures into shared slots, calls `hand_on` with the slots' numbers, then publishes the observation.
     Numbers of observations and pictures continue those of a predecessor in the same shared state. `truth` is the last
     reported ground truth of a simulated bench. Events are passed to `say`.
     """
@@ -92,7 +93,7 @@ class ObservationReceiver:
     def faults(self) -> dict[str, int]:
         """Return the counts of faults; emit an event for each count that has grown, at most every 5 s per fault.
 
-        A fault of every message of a node is an event once per run.
+        A fault that every message of a node has is emitted once per run.
         """
         for event in self._source.pop_events():
             self._say(event)
@@ -112,12 +113,12 @@ class ObservationReceiver:
         return faults
 
     def rates(self) -> dict[str, float]:
-        """Return the arrival rate of each stream over the newest 40 [Hz]; 0 after 2 s of silence."""
+        """Return the arrival rate of each stream [Hz] over its newest 40 arrivals; 0 after 2 s of silence."""
         now = self._clock.now()
         return {stream: _rate(times, now) for stream, times in self._arrivals.items()}
 
     def age_ms(self) -> dict[str, float]:
-        """Return the age of joints when published: p50, p99 and max of the newest 2000 [ms]."""
+        """Return p50, p99 and maximum of the age of joints at publication [ms], over the newest 2000 observations."""
         if not self._aged:
             return {}
         ages = self._ages[: min(self._aged, _AGES_KEPT)]
@@ -160,7 +161,10 @@ class ObservationReceiver:
         self._aged += 1
 
     def _drop_unknown_images(self, observation: Observation) -> Observation:
-        """Return it numbered for shared state, without pictures of unknown cameras and those that are too large."""
+        """Return the observation with its number in shared state.
+
+        Pictures of unknown cameras, and pictures that are too large, are removed.
+        """
         most = self._shared_state.layout.picture_bytes
         ours = {camera: seen for camera, seen in observation.pictures.items() if camera in self._numbers}
         large = {camera for camera, picture in ours.items() if picture.nbytes > most}

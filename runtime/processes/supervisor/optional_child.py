@@ -33,7 +33,7 @@ class OptionalChild:
         self.process, self._begun, self._due = self._start(), self._now(), None
 
     def poll(self) -> None:
-        """Check whether it runs; restart it when its pause is over."""
+        """Check whether the child runs; restart it when its back-off is over."""
         if self._due is not None:
             if self._now() >= self._due:
                 self._begin()

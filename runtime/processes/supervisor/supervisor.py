@@ -46,7 +46,7 @@ _LOOK_S = 0.2  # period of checks for companions [s]
 
 
 class Supervisor:
-    """Supervisor of one station; everything that it starts ends with it, however it ends."""
+    """Supervisor of one station; every process that it starts ends with it, however it ends."""
 
     def __init__(self, spec: StationSpec, lifeline: Lifeline | None = None) -> None:
         self._plan = spec
@@ -134,7 +134,10 @@ class Supervisor:
         )
 
     def _guard_arguments(self) -> tuple[str, ...]:
-        """Return plain values: the guard reads no deployment, because that may name modules that fail to load."""
+        """Return the guard's arguments as plain values.
+
+        The guard reads no deployment, because that may name modules that fail to load.
+        """
         spec, control = self._plan, self._plan.deployment.control
         punctual = control.realtime == "auto" and spec.capabilities.moves_robot
         return (
@@ -197,10 +200,10 @@ class Supervisor:
         self._signalled.ring()
 
     def _end(self) -> None:
-        """End all children: first the driver, which commands the others, then the rest by cutting the lifeline.
+        """End all children.
 
-        Each child then closes its files, and control holds for its orphan time. Children that do not end in time are
-        killed.
+        The driver, which commands the station, ends first; then the lifeline is cut, which ends the rest. Each child
+        then closes its files, and control holds for its orphan time. Children that do not end in time are killed.
         """
         if self._driver is not None and self._driver.poll() is None:
             self._driver.terminate()

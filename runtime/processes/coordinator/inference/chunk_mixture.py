@@ -32,10 +32,10 @@ class MixtureParts(NamedTuple):
 
 
 class Mixture:
-    """Mixing of rows in the same way as control mixes plans; `dims` are joints that are not mixed linearly.
+    """Mixer of chunks' rows, in the same way as control mixes plans.
 
-    Joints are mixed directly; poses are those of the mixed joints, because control mixes joints. Binary grippers are
-    those of the newest row, as received.
+    `dims` names the joints that are not mixed linearly. Joints are mixed directly. Poses are computed from mixed
+    joints, because control mixes joints. Binary grippers are taken from the newest row, as received.
     """
 
     def __init__(self, dims: DimensionKinds | None = None, robot: Robot | None = None) -> None:
@@ -48,11 +48,14 @@ class Mixture:
         return _mixed(parts, self._dims.switched, self._dims.wrapping)
 
     def numbers(self, parts: MixtureParts, like: ActionChunk) -> Float64:
-        """Mix rows [N, W] linearly, for example in model space, in the column order of the actions of `like`."""
+        """Mix rows [N, W] linearly, for example in model space; `like` is a chunk with the same columns."""
         return _mixed(parts, self._switched(like), ())
 
     def poses(self, joints: Float64, newest: Float64, like: ActionChunk) -> Float64:
-        """Return the poses [N, W] of joints [N, D] in the format of `like`, as close to `newest` as possible."""
+        """Return the poses [N, W] of joints [N, D] in the format of `like`.
+
+        Where a format is ambiguous, the numbers are as close to those of `newest` as possible.
+        """
         layout = self._layout_of(like)
         made = layout.encode(self._end_effectors.vectors(joints), joints, newest)
         switched = self._switched(like)
@@ -64,7 +67,7 @@ class Mixture:
     ) -> Float64:
         """Return joints [N, D] of successive rows as rows [N, W] in the format of `like`, relative to `observation`.
 
-        The inverse of the conversion of such a chunk to joints. Binary grippers are those of `newest`.
+        This inverts the conversion of a chunk of relative rows to joints. Binary grippers are those of `newest`.
         """
         robot, qpos = self._loaded_robot, np.asarray(observation.qpos, np.float64)
         before = qpos if like.mode == "relative" else np.concatenate([qpos[None], joints[:-1]])
@@ -86,7 +89,10 @@ class Mixture:
         return made
 
     def mixes_linearly(self, straight: Float64, meant: Float64, like: ActionChunk) -> bool:
-        """Return True if the linear mixture `straight` equals `meant` within tolerance; angles that wrap differ."""
+        """Return True if the linear mixture `straight` equals `meant` within tolerance.
+
+        `meant` is the mixture as control makes it. The two differ if angles wrap.
+        """
         if like.space == "joint":
             return bool(np.abs(straight - meant).max(initial=0.0) <= _ROUND)
         try:
@@ -97,7 +103,7 @@ class Mixture:
         return bool(2.0 * np.arccos(np.clip(cosines, 0.0, 1.0)).max(initial=0.0) <= _ROUND)
 
     def _switched(self, like: ActionChunk) -> list[int]:
-        """Return the columns of binary grippers in a row."""
+        """Return the columns of binary grippers in the rows of `like`."""
         if like.space == "joint":
             return list(self._dims.switched)
         binary = self._loaded_robot.binary_dims
@@ -120,7 +126,7 @@ class Mixture:
 
 
 def _mixed(parts: MixtureParts, switched: Sequence[int], wrapping: Sequence[int]) -> Float64:
-    """Mix rows as newest + weighted differences, so that equal rows stay equal to the last bit."""
+    """Mix rows as the newest row plus weighted differences, so that equal rows stay equal to the last bit."""
     apart = difference(parts.rows, parts.newest, wrapping)
     made: Float64 = parts.newest + (parts.weights[..., None] * apart).sum(axis=0)
     made[:, list(switched)] = parts.newest[:, list(switched)]

@@ -37,7 +37,7 @@ ON_DEMAND: tuple[Mode, ...] = ("step", "preview")  # modes in which a person req
 
 @dataclass(frozen=True, slots=True)
 class FaultTimeouts:
-    """Times for which a run continues without its inputs [s]."""
+    """Times for which a run continues without responses or fresh observations [s]."""
 
     stale: float  # without a fresh observation, until that is an error
     lost: float  # without a response, until a retried policy is given up
@@ -45,7 +45,7 @@ class FaultTimeouts:
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """The query half of a strategy, with its parameters."""
+    """Query half of a strategy, with its parameters."""
 
     query: Query
     parameters: StrategyParameters
@@ -53,7 +53,10 @@ class Strategy:
 
 @dataclass(frozen=True, slots=True)
 class DisplayedChunk:
-    """The newest chunk for pages: `state` is "proposed", "merged" or "dropped"; targets as in MergeResult."""
+    """Newest chunk for pages.
+
+    `state` is "proposed", "merged" or "dropped"; `targets` are steps as in MergeResult.
+    """
 
     number: int
     run: int
@@ -108,7 +111,7 @@ class Inference:
 
     @property
     def pending_notes(self) -> list[Event]:
-        """Events that the coordinator must emit and clear."""
+        """Events that the coordinator must emit and then remove."""
         return self.requests.notes
 
     def status(self) -> dict[str, Any]:
@@ -156,7 +159,7 @@ class Inference:
         return self._strategy.query.uses_rtc
 
     def set_policy(self, policy: Policy, task: str) -> None:
-        """Use `policy` with the instruction `task` from now on; metrics restart."""
+        """Use `policy` with the instruction `task` from now on, and reset the metrics."""
         self.pause()
         self.requests.set_policy(policy, task)
         self.metrics.reset()
@@ -175,7 +178,7 @@ class Inference:
     # --- a run ---------------------------------------------------------------------------------------------
 
     def begin(self, run: int, fresh: bool, mode: Mode = "continuous") -> None:
-        """Begin to query for this run; `fresh`: the policy forgets the previous episode."""
+        """Begin to query the policy for this run; `fresh`: the policy must forget the previous episode."""
         self._run, self._mode = run, mode
         if fresh:
             self.requests.reset_episode()
@@ -203,7 +206,7 @@ class Inference:
         self._wanted = True
 
     def commit(self) -> None:
-        """Send the proposal to control; the robot was at rest during the review, so no row is stale."""
+        """Send the proposal to control; no row is stale, because the robot was at rest during the review."""
         if self.proposal is not None:
             answered, self.proposal = self.proposal, None
             self._post(answered)
@@ -280,7 +283,7 @@ class Inference:
         return None
 
     def should_retry(self, error: RuntimeFault) -> bool:
-        """Record a failure; return True if the policy will be retried, False if the time for that is over."""
+        """Record a failure; return True if the policy will be retried, False if the time for retries is over."""
         if isinstance(error, PolicyLostError):
             self.metrics.count_lost()
         if not self.retry.record_failure(error):
@@ -302,8 +305,8 @@ class Inference:
     def _try_request(self) -> bool:
         """Send a request; return True if its response is available at once.
 
-        Control judges gaps in the observations action by action. But while a strategy waits for this response there
-        are no actions, so a lasting gap is an error here too.
+        Control judges gaps in the observations action by action. But while a strategy waits for this response there are
+        no actions, so a lasting gap is an error here too.
         """
         now = self._clock.now()
         waited = self._mode in ON_DEMAND or self._strategy.query.requests_while_stopped

@@ -22,7 +22,7 @@ Number = TypeVar("Number", int, float)
 def quantile(values: Sequence[float], percent: float) -> float:
     """Return the percentile of `values`, interpolated linearly; NaN if there are none.
 
-    Without numpy, which is slower for the few hundred values of a call, ten times a second.
+    It is computed without numpy, which is slower for the few hundred values of a call, ten times a second.
     """
     if not values:
         return math.nan

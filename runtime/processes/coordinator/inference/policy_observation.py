@@ -21,11 +21,11 @@ _NO_PICTURE = Pattern("observation.no_picture", "no picture has arrived from {ca
 
 
 class StaleObservationError(PolicyError):
-    """The newest observation is too old for a request."""
+    """Error that the newest observation is too old for a request."""
 
 
 class ObservationProvider(Protocol):
-    """Source of a policy's observations; `simulated`: with the joints of the simulated robot."""
+    """Source of a policy's observations; `simulated`: they contain the joints of the simulated robot."""
 
     @property
     def simulated(self) -> bool: ...
@@ -34,10 +34,10 @@ class ObservationProvider(Protocol):
         """Select the joints of the simulated robot, or those of the real one."""
 
     def latest(self, prompt: str, pictures: bool = True) -> Observation:
-        """Return the newest observation; `pictures` False: joints only, without pictures.
+        """Return the newest observation; if `pictures` is False, without pictures.
 
         Raises:
-            PolicyError: there is none, or it is too old.
+            PolicyError: there is no observation, or it is too old.
         """
 
     def commanded(self) -> tuple[int, Float64] | None:
@@ -67,10 +67,10 @@ class PolicyObservation:
         self.simulated = simulated
 
     def latest(self, prompt: str, pictures: bool = True) -> Observation:
-        """Return the newest observation; `pictures` False: joints only, without pictures.
+        """Return the newest observation; if `pictures` is False, without pictures.
 
         Raises:
-            PolicyError: there is none, or it is too old.
+            PolicyError: there is no observation, or it is too old.
         """
         cameras = self._shared_state.layout.cameras if pictures else ()
         seen = self._shared_state.read_observation(cameras)
@@ -107,9 +107,10 @@ class PolicyObservation:
         return int(status["step"]), np.array(status["commanded"], np.float64)
 
     def _step_of(self, seen: Observation) -> int:
-        """Return the control step of an observation: the tick that used it, or the next one.
+        """Return the control step of an observation: that of the tick that used it, or of the next tick.
 
-        If control stalls, that is more than one step ahead: steps follow the clock, and missed ticks are skipped.
+        If control stalls, the step is more than one ahead of the newest tick: steps follow the clock, and missed ticks
+        are skipped.
         """
         status = self._shared_state.control.read()
         step, planned = int(status["step"]), float(status["planned"])

@@ -50,14 +50,18 @@ Committed = Callable[[Observation], Conditioning | None]
 
 @dataclass(frozen=True, slots=True)
 class MissBound:
-    """Largest permitted pose errors of a policy's pose [m, rad], and lag of joints behind it [rad]."""
+    """Greatest permitted errors of solved poses.
+
+    These are the error of position [m] and of rotation [rad], and `jump`, the greatest lag of the joints behind a pose
+    [rad].
+    """
 
     position: float
     rotation: float
     jump: float
 
     def misses(self, solved: IkResult) -> NDArray[np.bool_]:
-        """Return which poses are missed by more, bool [T, arms]."""
+        """Return which poses have a larger position or rotation error, bool [T, arms]."""
         over: NDArray[np.bool_] = (solved.position_error > self.position) | (
             solved.rotation_error > self.rotation
         )
@@ -66,11 +70,11 @@ class MissBound:
 
 @dataclass(frozen=True, slots=True)
 class PolicyResponse:
-    """A completed inference: chunk, duration [s], observation, and joint commands.
+    """Result of a completed inference: chunk, duration [s], observation, and joint commands.
 
-    `commands` are its rows in command space, up to the first refused row; `refused` is the reason. If
-    `requested_while_stopped`, the robot was at rest meanwhile. `eef` is the origin of the observation's poses:
-    "measured" by the robot, or "fk" from its joints.
+    `commands` are its rows in command space, up to the first refused row, and `refused` is the reason of the refusal.
+    If `requested_while_stopped`, the robot was at rest until the response. `eef` is the origin of the observation's
+    poses: "measured" by the robot, or "fk" from its joints.
     """
 
     chunk: ActionChunk
@@ -91,7 +95,7 @@ class PolicyResponse:
 
 
 class PolicyRequests:
-    """Sender of requests to a policy; calls are executed one after the other, without waiting.
+    """Sender of requests to a policy; calls are queued and executed one after the other, so that no method waits.
 
     Kinematics are part of the call: for a chunk of poses they take as long as a small model, too long for the
     coordinator.
@@ -107,7 +111,10 @@ class PolicyRequests:
         clock: Clock,
         bound: MissBound | None = None,
     ) -> None:
-        """`bound`: poses with larger errors are refused; None: they are only flagged."""
+        """Prepare requests to `policy`.
+
+        Poses with errors larger than `bound` are refused; if it is None, they are only flagged.
+        """
         self.policy = policy
         self._bound = bound
         self.task = task
@@ -174,7 +181,7 @@ class PolicyRequests:
         """Return the current observation for the policy.
 
         Raises:
-            PolicyError: there is none, or it is too old.
+            PolicyError: there is no observation, or it is too old.
         """
         return self.policy_observation.latest(self.task, self.policy.uses_images)
 
@@ -244,9 +251,9 @@ class PolicyRequests:
     def _within(self, made: CommandRows, first: int, begins: bool) -> tuple[CommandRows, str]:
         """Return the rows before the first refused pose from row `first` on, and the reason, "" if none is refused.
 
-        A pose is refused if it is out of reach, or farther than a jump from where the joints can be by then: a smaller
-        lag is the same as that of joint rows that the safety filter limits. If a run `begins` with such a distant
-        pose, that row is kept, so that control reports the distance.
+        A pose is refused if it is out of reach, or if the joints would lag behind it by more than a jump. A smaller lag
+        is permitted, as for joint rows that the safety filter limits. If a run `begins` with such a distant pose, that
+        row is kept, so that control reports the distance.
 
         Raises:
             PolicyError: no row remains.
@@ -270,7 +277,7 @@ class PolicyRequests:
         return cut, _ROWS_REFUSED(wrong=wrong, kept=kept - first)
 
     def _refused(self, made: CommandRows, row: int, bound: MissBound) -> tuple[str, bool]:
-        """Return why that row is refused, "" if it is not, and whether its pose is within reach."""
+        """Return the reason why row `row` is refused, "" if it is not, and whether its pose is within reach."""
         free, distance = self._spaces.meet(made, row)
         over = bound.misses(free)[0]
         if over.any():
@@ -288,9 +295,9 @@ class PolicyRequests:
         return "", True
 
     def check_measured_poses(self, answered: PolicyResponse) -> None:
-        """Compare measured poses with those of the joints: they may be in another frame.
+        """Compare measured poses with those computed from the joints: they may be in another frame.
 
-        A difference is an event, unless the policy uses the poses.
+        If they differ and the policy does not use the poses, an event is queued.
 
         Raises:
             SetupError: they differ, and the policy uses them.

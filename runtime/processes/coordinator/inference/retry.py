@@ -36,7 +36,7 @@ class Retry:
         return self._back_off.remaining_delay(self._clock.now())
 
     def record_failure(self, error: RuntimeFault) -> bool:
-        """Record a failure; return True if the policy will be retried, False if the time for that is over."""
+        """Record a failure; return True if the policy will be retried, False if the time for retries is over."""
         first, self.failure = self._back_off.since is None, str(error)
         self._back_off.record_failure(self._clock.now())
         if self.lost_for > self._patience:

@@ -33,7 +33,7 @@ Shares = dict[int, float]  # by chunk: its weight in a step; they sum to 1
 
 @dataclass(frozen=True, slots=True)
 class _PendingChunk:
-    """A chunk that was sent to control, and is not merged yet."""
+    """Chunk that was sent to control, and is not merged yet."""
 
     chunk: ActionChunk
     observation_step: int
@@ -44,10 +44,10 @@ class _PendingChunk:
 
 @dataclass(frozen=True, slots=True)
 class _CommittedChunk:
-    """A chunk on the timeline: `rows` as received, row 0 for control step `anchor`.
+    """Chunk on the timeline: `rows` as received, with row 0 for control step `anchor`.
 
-    From control step `first` on it is the plan, except for the steps in `contributions`, which other chunks
-    contribute to; None if the contributions are unknown.
+    The plan from control step `first` on consists of this chunk alone, except for the steps in `contributions`, to
+    which other chunks contribute; `contributions` is None if that is unknown.
     """
 
     chunk: ActionChunk
@@ -63,20 +63,20 @@ class _CommittedChunk:
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """Format of its numbers: space, mode, pose format, widths."""
+        """Format of the chunk's numbers: space, mode, pose format, widths."""
         chunk = self.chunk
         return chunk.space, chunk.mode, chunk.pose, chunk.actions.shape[1], self.rows.shape[1]
 
 
 class RtcPrefix:
-    """The plan from a new observation on, in the format of the newest merged chunk.
+    """Plan from a new observation on, in the format of the newest merged chunk.
 
-    The rows are used as received, and not the joint rows derived from them: these are solved, snapped and resampled,
-    so the policy has never seen them. If control has blended chunks, their rows are mixed with the same weights; if
-    it fades over from a held target, or the contributions are unknown, there is no conditioning. The place of a chunk
-    is the one that control assigned: its observation step, shifted if it was mistimed, or the step of its arrival if
-    the robot was waiting for it. Method: Black et al., Real-Time Execution of Action Chunking Flow Policies, arXiv
-    2506.07339. It uses no clock and no thread: time is counted in steps.
+    Rows are used as the policy returned them. The joint rows derived from them would not do: these are solved, snapped
+    and resampled, so the policy has never seen them. If control has blended chunks, their rows are mixed with the same
+    weights. If control fades over from a held target, or the contributions are unknown, there is no conditioning. The
+    position of a chunk on the timeline is that assigned by control: its observation step, shifted if the chunk was
+    mistimed, or the step of its arrival if the robot was waiting for it. Method: Black et al., Real-Time Execution of
+    Action Chunking Flow Policies, arXiv 2506.07339. Time is counted in steps; neither a clock nor a thread is used.
 
     `clear` increments `generation`: a response requested in an earlier generation is ignored.
     """
@@ -109,8 +109,8 @@ class RtcPrefix:
     ) -> None:
         """Add a response for `observation_step`; it counts when control has merged it.
 
-        `commands` [N, D] are its joint rows at control rate; None: its actions are that. `generation` is that of the
-        request; without it the caller guarantees that `clear` was not called since.
+        `commands` [N, D] are its joint rows at control rate; if None, its actions are joint rows already. `generation`
+        is that of the request; if None, the caller guarantees that `clear` was not called since the request.
         """
         if generation is None or generation == self.generation:
             rows = chunk.actions.astype(np.float64) if commands is None else commands
@@ -150,19 +150,19 @@ class RtcPrefix:
         execution_horizon: int | None,
         observation: Observation | None = None,
     ) -> Conditioning | None:
-        """Return the conditioning of a request about `observation_step`; None if no row is left, or none is merged.
+        """Return the conditioning of a request about `observation_step`; None if no row is left, or no chunk is merged.
 
-        Sets `warning` if the response is expected after the last planned step; then only planned rows count as
-        consumed until it arrives. A chunk with a rate of its own has no row exactly at the observation: the remaining
-        rows are resampled.
+        Sets `warning` if the response is expected after the last planned step; then only planned rows count as consumed
+        until it arrives. A chunk with a rate of its own has no row exactly at the observation: the remaining rows are
+        resampled.
 
         Args:
             observation_step: control step of the new observation.
-            delays: recent measured delays [control steps]; if empty, that of the chunk itself.
+            delays: recent measured delays [control steps]; if empty, the delay of the newest chunk is used.
             quantile: quantile of `delays` that is predicted, in rows, rounded up.
-            execution_horizon: that of the response [control steps]; None: the whole chunk. The present plan does not
-                depend on it.
-            observation: reference of rows that are not absolute, like that of the response; required for those.
+            execution_horizon: number of steps [control steps] of the response that will be executed; None: the whole
+                chunk. The present plan does not depend on it.
+            observation: reference of rows that are not absolute, as for the response; required for such rows.
         """
         self.warning, self.predicted_delay = "", 0
         if not self._merged:
@@ -194,10 +194,10 @@ class RtcPrefix:
     def _planned(
         self, held: _CommittedChunk, steps: Float64, passed: int, observation: Observation | None
     ) -> Float32 | None:
-        """Return the rows of `held`, with those for control `steps` as planned; None if the plan is unknown.
+        """Return the rows of `held`, with the plan in place of its rows for `steps`; None if the plan is unknown.
 
-        `passed` is the row nearest to the first step. Rows that are not absolute are not mixed: their joints are
-        mixed, and converted back to such rows.
+        `passed` is the row nearest to the first step. Rows that are not absolute are not mixed themselves: their joints
+        are mixed, and converted back to such rows.
         """
         made = [self._contributions_at(at) for at in steps.tolist()]
         if held.chunk.mode != "absolute":
@@ -226,7 +226,11 @@ class RtcPrefix:
         passed: int,
         observation: Observation | None,
     ) -> Float32 | None:
-        """Return the rows of `held`, with those for `steps` as planned, relative to `observation`."""
+        """Return the rows of `held`, which are not absolute, with the plan for `steps` relative to `observation`.
+
+        `made` are the contributions to each step, `passed` is the row nearest to the first step. None if a contribution
+        is unknown.
+        """
         assert observation is not None, (
             "rows that are not absolute need the observation that they are relative to"
         )
@@ -241,7 +245,7 @@ class RtcPrefix:
         return _repeat_last_row(rows, int(places[-1]) + 1)
 
     def _same_kind(self, held: _CommittedChunk, shares: Shares) -> bool:
-        """Return True if all these chunks have the number format of `held`."""
+        """Return True if all chunks in `shares` are merged and have the number format of `held`."""
         others = [self._merged.get(number) for number in shares]
         return all(other is not None and other.kind == held.kind for other in others)
 
@@ -267,7 +271,10 @@ class RtcPrefix:
         return held.contributions.get(step, {number: 1.0})
 
     def _mixed(self, steps: Float64, made: Sequence[Shares]) -> Float64 | None:
-        """Return rows for these control steps, mixed by weights; None if model rows cannot be mixed linearly."""
+        """Return the rows for these control steps, mixed by the weights `made`.
+
+        None if rows in model space cannot be mixed linearly.
+        """
         like, mixture = self._merged[max(self._merged)].chunk, self._mixture
         actions = self._parts(steps, made, lambda held: (held.chunk.actions, held.pace))
         if like.space == "joint":
@@ -287,7 +294,10 @@ class RtcPrefix:
         made: Sequence[Shares],
         table: Callable[[_CommittedChunk], tuple[Numbers, float]],
     ) -> MixtureParts:
-        """Return the components of the rows for these steps, from a `table` of each chunk and its rows per step."""
+        """Return the components from which the rows for these steps are mixed, by the weights `made`.
+
+        `table` returns for a chunk the rows to use, and their number per control step.
+        """
         numbers: list[Numbers] = []
         weights: list[Float64] = []
         newest = np.zeros(len(steps), np.int64)
@@ -305,18 +315,21 @@ class RtcPrefix:
         return MixtureParts(every, np.array(weights), every[newest, np.arange(len(steps))])
 
     def _judge(self, delay: float, left: int) -> None:
-        """Set the warning if the plan ends before the response is expected."""
+        """Set the warning if the `left` remaining planned steps are fewer than the expected delay."""
         if delay > left:
             self.warning = _DELAY_BEYOND_PLAN(steps=delay, left=left)
 
 
 def _source_row_count(commands: int, pace: float) -> int:
-    """Return the number of a policy's rows from which so many commands were made."""
+    """Return the number of a policy's rows from which this number of commands was resampled."""
     return math.ceil((commands - 1) * pace - _HAIR) + 1
 
 
 def _repeat_last_row(rows: Float32, count: int) -> Float32:
-    """Return the first `count` rows [T, W], the last repeated to the original length, which servers may require."""
+    """Return the first `count` rows [T, W], the last of them repeated up to the original length.
+
+    Servers may require that length.
+    """
     return (
         rows
         if count >= len(rows)
@@ -325,12 +338,12 @@ def _repeat_last_row(rows: Float32, count: int) -> Float32:
 
 
 def _expected(delays: Sequence[int], quantile: float) -> float:
-    """Return the quantile of the delays [control steps], one that was measured."""
+    """Return the quantile of the delays [control steps], rounded up to a measured delay."""
     return float(np.quantile(np.asarray(delays, np.float64), quantile, method="higher"))
 
 
 def _shares(merged: MergeResult) -> dict[int, Shares] | None:
-    """Return weights by step for steps that other chunks contribute to; None if unknown."""
+    """Return the weights of chunks at each step to which several chunks contribute; None if they are unknown."""
     if merged.contributions is None:
         return None
     shares: dict[int, Shares] = {}

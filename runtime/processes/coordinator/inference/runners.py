@@ -26,14 +26,17 @@ class Runner(ABC):
 
     @abstractmethod
     def submit(self, call: Callable[[], Result]) -> Future[Result]:
-        """Start `call`; its result or RuntimeFault is in the future when `ready` returns True."""
+        """Start `call`, and return its future.
+
+        When `ready` returns True, the future contains the result, or the RuntimeFault that the call raised.
+        """
 
     @abstractmethod
     def ready(self, future: Future[Result]) -> bool: ...
 
     @abstractmethod
     def run_in_background(self, call: Callable[[], Result]) -> Future[Result]:
-        """Start `call`, which is independent of the policy, without queueing."""
+        """Start `call`, which does not use the policy, without waiting for earlier calls."""
 
     @property
     @abstractmethod
@@ -49,7 +52,10 @@ class Runner(ABC):
 
 @contextmanager
 def as_policy_errors(what: str) -> Iterator[None]:
-    """Convert exceptions within to PolicyError and log the traceback: no response may end the coordinator."""
+    """Convert exceptions within the context to a PolicyError that begins with `what`, and log the traceback.
+
+    So no response of a policy may end the coordinator. A RuntimeFault is passed on.
+    """
     try:
         yield
     except RuntimeFault:
@@ -106,9 +112,9 @@ class ThreadRunner(Runner):
 class DeclaredRunner(Runner):
     """Runner that executes calls between two ticks; a result is ready after the number of ticks `declared` for it.
 
-    Calls wait for `start_waiting`. They run on a thread, so that the ticking thread can answer commands meanwhile; no
-    tick may pass while a call is running. So the step at which a result is ready does not depend on the real
-    duration.
+    Calls start at `start_waiting`. They run on a thread, so that the ticking thread can answer commands meanwhile; no
+    tick may pass while a call is running. Therefore the step at which a result is ready does not depend on the call's
+    real duration.
     """
 
     def __init__(self, declared: Callable[[Any], tuple[Any, int]]) -> None:

@@ -22,9 +22,9 @@ _REACHED = 1e-3  # share of its travel within which a gripper has reached its lo
 
 @dataclass(frozen=True, slots=True)
 class GripperPlan:
-    """Result of a request: locks float64 [D] (NaN: unlocked), and the goal of a motion or None.
+    """Result of a request: locks float64 [D] (NaN: unlocked), and the goal of a motion, or None.
 
-    A goal float64 [D] is NaN for dimensions that do not move.
+    A goal is float64 [D], NaN for dimensions that do not move.
     """
 
     locks: Float64
@@ -44,8 +44,8 @@ class Grippers:
     def plan_request(self, request: GripperRequest, commanded: Float64, free: bool) -> GripperPlan:
         """Return new locks and motion for a request; `commanded` [D] is the commanded position.
 
-        `free`: nothing else moves the arms, so that a gripper can be moved; otherwise opening and closing lock it
-        there.
+        `free`: nothing else moves the arms, so that opening and closing is a motion. Otherwise they lock the gripper at
+        its open or closed position.
 
         Raises:
             RuntimeFault: the robot has no such gripper.

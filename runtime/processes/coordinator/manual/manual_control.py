@@ -45,13 +45,16 @@ class ManualControl:
         self._targets.prepare()
 
     def require_robot(self, what: str) -> None:
-        """Raise RuntimeFault if the transport moves no robot."""
+        """Raise RuntimeFault if the transport moves no robot; `what` names the request in the message."""
         if not self._plan.capabilities.moves_robot:
             kind = self._plan.deployment.transport.kind
             raise RuntimeFault(_MOVES_NO_ROBOT(what=what, transport=kind))
 
     def is_loading(self, arguments: Mapping[str, Any]) -> bool:
-        """Return True if this aim needs kinematics that are still loading; starts to load them."""
+        """Return True if a target with these arguments needs kinematics that are still loading.
+
+        The first call starts to load them.
+        """
         ready = self._targets.prepare()
         return not ready and arguments.get("jog") is not None
 
@@ -70,7 +73,9 @@ class ManualControl:
         return {"duration_s": self._targets.duration(start, goal, asked.speed)}
 
     def check_motion(self, what: str, goal: Float64) -> Float64:
-        """Return `goal` [D], a policy's action, if the path to it is allowed; grippers clipped to their travel.
+        """Return `goal` [D], a policy's action, with grippers clipped to their travel, if the path to it is allowed.
+
+        `what` names the motion in messages.
 
         Raises:
             RuntimeFault: the path is not allowed.

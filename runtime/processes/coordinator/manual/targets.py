@@ -41,9 +41,9 @@ _TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class TargetPreview:
-    """A target float64 [D] within limits, its poses float32 [8 * arms], and its deviations.
+    """Target float64 [D] within limits, its poses float32 [8 * arms], and its deviations from the request.
 
-    `clipped` names joints that were clipped to a limit; errors are those of a jog's pose, 0 without a jog.
+    `clipped` names joints that were clipped to a limit. The errors are those of a jog's pose, 0 without a jog.
     """
 
     joints: Float64
@@ -64,7 +64,7 @@ class Targets:
         self._ways = PathCheck(spec)
 
     def prepare(self) -> bool:
-        """Start to load what a jog needs; return True if it is loaded."""
+        """Start to load the kinematics that a jog needs; return True if they are loaded."""
         return self._kinematics.prepare()
 
     def aim(self, asked: AimRequest, commanded: Float64) -> TargetPreview:
@@ -182,7 +182,7 @@ def _apply_jog(pose: Float64, jog: Jog) -> Float64:
 
 
 def aim_to_dict(aim: TargetPreview, spec: StationSpec, distance: float, duration: float) -> dict[str, Any]:
-    """Return the aim as an answer for a client: joints, poses, errors in mm and degrees."""
+    """Return the preview `aim` as an answer for a client: joints, poses, errors in mm and degrees."""
     return {
         "joints": aim.joints.tolist(),
         "poses": aim.poses.tolist(),

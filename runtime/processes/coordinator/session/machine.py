@@ -62,7 +62,7 @@ _OF_THE_LINK = (SessionEvent.CONNECTED, SessionEvent.INCOMPLETE, SessionEvent.LI
 
 
 class SessionMachine:
-    """The session's state; only `handle` and `handle_event` change it."""
+    """State machine of the session, whose state only `handle` and `handle_event` change."""
 
     def __init__(self, effects: SessionActions, lease: Lease, boot: str, now: Callable[[], float]) -> None:
         self._effects = effects
@@ -141,12 +141,15 @@ class SessionMachine:
         return ack
 
     def answered(self, command: Command) -> Ack | None:
-        """Return the first answer if the command is a repetition, else None."""
+        """Return the first answer if the command is a repetition (same uuid and kind), else None."""
         first = self._answers.get(command.uuid)
         return first if first is not None and first.kind in ("", command.kind) else None
 
     def state_meaning(self) -> dict[str, Any]:
-        """Return the state's meaning for a snapshot; not connected while observations are missing."""
+        """Return the meaning of the state for a snapshot.
+
+        While observations are missing, the state does not count as connected.
+        """
         row = self.state.meaning
         return replace(row, connected=row.connected and self._connected).to_dict()
 
@@ -201,7 +204,10 @@ class SessionMachine:
         return self._not_now(command.kind)
 
     def _stops_without(self, command: Command) -> bool:
-        """Return True if it is a stop that needs no lease: from the station's panel, or of an unattended run."""
+        """Return True if the command is a stop that needs no lease.
+
+        Such a stop comes from the station's panel, or the run is unattended.
+        """
         if command.kind not in STOPPING:
             return False
         return self._unattended or at_the_panel(command)

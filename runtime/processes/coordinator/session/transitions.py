@@ -124,7 +124,10 @@ def _always(state: SessionState, situation: GuardFacts) -> str:
 
 
 def _placed(guard: Guard = _always) -> Guard:
-    """Return `guard` extended for commands that begin a motion: joints must be plausible and where they are held."""
+    """Return `guard` extended for commands that begin a motion.
+
+    The joints must also be plausible, and be at their held position.
+    """
     return lambda state, situation: guard(state, situation) or situation.doubt
 
 

@@ -32,7 +32,7 @@ def apply_tuning(spec: StationSpec, asked: TuneRequest, info: PolicyInfo | None)
     `info` is the connected policy's description, None if there is none.
 
     Raises:
-        RuntimeFault: nothing to change, an invalid value, or a policy without RTC.
+        RuntimeFault: the request changes nothing, a value is invalid, or the policy does not support RTC.
     """
     if asked.strategy is None and asked.task is None:
         raise RuntimeFault(_NOTHING_TO_CHANGE)

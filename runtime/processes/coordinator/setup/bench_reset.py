@@ -35,7 +35,7 @@ _REPEAT_S = 0.2  # [s] a control word may be lost
 
 
 class BenchReset:
-    """One reset at a time of a node that simulates a bench."""
+    """Reset of a simulated bench by its node; one reset at a time."""
 
     def __init__(
         self, spec: StationSpec, orders: ControlQueue, clock: Clock, reception: Callable[[], ReceptionReport]
@@ -47,10 +47,10 @@ class BenchReset:
         self._refused = ""
 
     def from_request(self, bench: BenchRequest | None) -> dict[str, Any] | None:
-        """Return the reset to send to the node, None without a request.
+        """Return the reset to send to the node; None if `bench` is None.
 
         Raises:
-            SetupError: the transport simulates no bench, or this reset was done already.
+            SetupError: the transport simulates no bench, or a reset with this id was done already.
         """
         if bench is None:
             return None
@@ -69,15 +69,15 @@ class BenchReset:
         self._refused_before = self._refused_by_node()
 
     def on_event(self, event: Event) -> None:
-        """Process an event of control: the control word could not be sent."""
+        """Process an event of control; it may report that the control word of the reset could not be sent."""
         if event.kind == "word_refused":
             self._refused = event.text
 
     def is_done(self) -> bool:
-        """Return True if the bench was reset; repeats the request if due.
+        """Return True if the bench was reset; repeat the request if that is due.
 
         Raises:
-            SetupError: it was refused, or did not happen in time.
+            SetupError: the reset was refused, or did not happen in time.
         """
         if self._reception().truth.get("reset") == self._reset["id"]:
             return True

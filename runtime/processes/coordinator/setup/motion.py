@@ -1,4 +1,4 @@
-"""Generated motion of a set-up: sent to control, awaited there, then until the arm has arrived."""
+"""Generated motion of a set-up: it is sent to control, which reports its end; then the arm must arrive."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ARRIVED_RAD = 0.1
 
 
 class SetupMotion:
-    """One motion at a time; `where` names its goal in messages."""
+    """Generated motion of a set-up, one at a time; messages name its goal by the argument `where`."""
 
     def __init__(self, spec: StationSpec, orders: ControlQueue, shared: SharedState, clock: Clock) -> None:
         self._plan = spec
@@ -56,7 +56,10 @@ class SetupMotion:
             raise SetupError(_NOT_COME(where=self._where, seconds=self._allowed))
 
     def is_sent(self, event: Event) -> bool:
-        """Return True if `event` reports that control has sent the end of this motion; then wait for the arm."""
+        """Return True if `event` reports that control has sent the whole motion.
+
+        The time in which the arm must arrive then begins.
+        """
         over = event.kind == "motion_done" and event.data.get("order") == self._order
         if over:
             self._since = self._clock.now()
@@ -66,7 +69,7 @@ class SetupMotion:
         """Return True if the arm has arrived.
 
         Raises:
-            SetupError: it has not arrived in time; names the joint.
+            SetupError: the arm has not arrived in time; the message names the joint.
         """
         measured = np.array(self._shared_state.observation.read()["qpos"], np.float64)
         limits = self._plan.limits

@@ -83,7 +83,7 @@ class Stage(StrEnum):
 
     @property
     def sentence(self) -> Sentence:
-        """Name of the stage, with an id."""
+        """Name of the stage as a text with an id."""
         return _STAGES[self]
 
 
@@ -99,11 +99,11 @@ _ALL = (
 
 
 class DrivesDisabledError(SetupError):
-    """The robot is observed, but its drives are disabled."""
+    """Error that the robot's drives are disabled, although the robot is observed."""
 
 
 class SetUp:
-    """A set-up in progress; `poll` advances it and is cheap."""
+    """Set-up in progress; call `poll` often, it is cheap."""
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class SetUp:
 
     @property
     def _stages(self) -> tuple[Stage, ...]:
-        """Stages of the newest set-up in order; of a motion alone, those that were entered."""
+        """Stages of the newest set-up in order; if it is a motion alone, the stages that were entered."""
         whole = Stage.CONNECT in self.stages or not self.stages
         if not whole or Stage.COMPILE not in self.stages:
             return _ALL if whole else tuple(self.stages)
@@ -189,7 +189,10 @@ class SetUp:
         return {"name": stage.sentence, "state": state, "seconds": seconds}
 
     def begin(self, reset: dict[str, Any] | None, least: LeastTimes | None = None) -> None:
-        """Begin with the first stage; `reset` as from `BenchReset.from_request`."""
+        """Begin with the first stage.
+
+        `reset` is the result of `BenchReset.from_request`, `least` are least durations of stages.
+        """
         self._reset = reset
         self._least = least or LeastTimes()
         self.took = {}
@@ -200,7 +203,7 @@ class SetUp:
         self._enter(Stage.CONNECT)
 
     def begin_homing(self) -> None:
-        """Only move to the pose.
+        """Begin a motion to the deployment's pose, without the other stages.
 
         Raises:
             RuntimeFault: the path is not free; nothing has changed.
@@ -210,7 +213,7 @@ class SetUp:
         self._begin_motion_only(self._plan.robot.poses[pose], where, Stage.HOME)
 
     def begin_approach(self, first_action: Float64) -> None:
-        """Only move to the policy's first action [D], which must be allowed.
+        """Begin a motion to the policy's first action [D], which must be allowed, without the other stages.
 
         Raises:
             RuntimeFault: the path is not free.
@@ -219,7 +222,7 @@ class SetUp:
         self._begin_motion_only(first_action, _THE_FIRST_ACTION, Stage.APPROACH)
 
     def set_first_action(self, first_action: Float64 | None) -> None:
-        """Set the first action [D] of what drives the robot; None if unknown."""
+        """Set the first action [D] of the policy or leader; None if unknown."""
         self.first_action = first_action
 
     def _begin_motion_only(self, goal: Float64, where: str, stage: Stage) -> None:
@@ -243,16 +246,16 @@ class SetUp:
         self.stage = Stage.IDLE
 
     def on_event(self, event: Event) -> None:
-        """Process an event of control: the motion is done, or a control word was refused."""
+        """Process an event of control; it may report that a motion is done, or that a control word was refused."""
         if self.stage in (Stage.HOME, Stage.APPROACH) and self._going.is_sent(event):
             self._enter(Stage.SETTLE)
         self.bench.on_event(event)
 
     def poll(self) -> bool:
-        """Advance; return True when done.
+        """Advance the set-up; return True when it is done.
 
         Raises:
-            RuntimeFault: it cannot continue.
+            RuntimeFault: the set-up cannot continue.
         """
         if self.stage is Stage.CONNECT:
             ready = self._inference.runner.ready(self._connection)
@@ -295,9 +298,9 @@ class SetUp:
         raise SetupError(doubt)
 
     def _report_zero_joints(self) -> None:
-        """Emit an event about joints at exactly 0: a dead encoder looks the same from the first sample on.
+        """Emit an event about joints that read exactly 0.
 
-        Only the operator can distinguish them.
+        A dead encoder reads 0 from the first sample on, so that only the operator can distinguish the two cases.
         """
         limits = self._plan.limits
         joints = self._shared_state.observation.read()["qpos"]
@@ -340,7 +343,10 @@ class SetUp:
         return self._start_reset()
 
     def _require_family(self) -> None:
-        """Raise SetupError if a process is silent: orders to control would be lost, and without the guard it holds."""
+        """Raise SetupError if a process has an expired heartbeat.
+
+        Orders to a silent control would be lost, and control holds without the guard.
+        """
         within = self._plan.deployment.heartbeat_timeout_s
         for process in SIBLING_PROCESSES:
             if not self._shared_state.alive(process, self._clock.now(), within(process)):
@@ -360,7 +366,10 @@ class SetUp:
         return self._start_reset()
 
     def _start_reset(self) -> bool:
-        """Reset the bench, if requested, now that the arms are out of the way; return True if all is done."""
+        """Start the reset of the bench, now that the arms are out of the way; without one, start the warm-up.
+
+        Return True if nothing is left to do.
+        """
         if self._reset is None:
             return self._start_warm_up()
         self.bench.start(self._reset)
@@ -368,7 +377,7 @@ class SetUp:
         return False
 
     def _start_warm_up(self) -> bool:
-        """Begin to query the policy; return True if there is none to query, so that all is done."""
+        """Begin to query the policy; return True if it is never queried, which ends the set-up."""
         if not self._inference.policy.is_queried:
             self.validated = _DRIVES_ROBOT(who=self.info.name if self.info else "the node")
             self.stage = Stage.IDLE
@@ -387,7 +396,7 @@ class SetUp:
         return True
 
     def _answered(self) -> bool:
-        """Send a request, or validate its response; return True if a response was validated."""
+        """Send a request, or validate the response to it; return True if a response was validated."""
         if self._asked is None:
             self._asked = self._inference.requests.send()
             return False
@@ -425,7 +434,7 @@ def check_info(info: PolicyInfo, spec: StationSpec, continues: bool) -> None:
     `continues`: the strategy's requests carry committed rows.
 
     Raises:
-        SetupError: they contradict each other; names both sides.
+        SetupError: description and strategy contradict each other; the message names both.
     """
     # A server that ignores the conditioning silently appears to work, but executes another method.
     if continues and info.supports_rtc is False:
