@@ -66,11 +66,11 @@ def cached_runs(plan: Plan, at: Hashable = None) -> Runs:
     )
 
 
-def corrected_of(plan: Plan, only: TrialFilter) -> dict[str, Proportion]:
+def corrected_of(plan: Plan, only: TrialFilter, at: Hashable = None) -> dict[str, Proportion]:
     """Return the current successes by checkpoint, for checkpoints with scores corrected since the reveal; else {}."""
     if not plan.at_reveal:
         return {}
-    at = fingerprint(plan)
+    at = at or fingerprint(plan)
     now = _corrected.get((plan.pk, plan.digest), at, lambda: load_plan_outcomes(plan, corrected=True))
     found = {}
     before = by_checkpoint(only.apply(cached_runs(plan, at).outcomes))

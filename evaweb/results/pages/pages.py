@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from evaweb.core.errors import EvaError
 from evaweb.plans.counting import declared_failures
-from evaweb.plans.design import frozen_design
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
@@ -22,10 +21,8 @@ from evaweb.results.presentation.drawings.svg import Drawing
 from evaweb.results.presentation.facts import (
     comparison_facts,
     comparison_sentence,
-    primaries_of,
     undetectable_text,
 )
-from evaweb.results.presentation.headline import headline, with_planned_letters
 from evaweb.results.presentation.listings import (
     MOST_PAIRS,
     arm_rows,
@@ -34,6 +31,7 @@ from evaweb.results.presentation.listings import (
     pair_rows,
     scene_rows,
 )
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.wording import anytime_text, evidence_text
 from evaweb.statistics.designs import Design
 from evaweb.trials.failures import ordered_terms
@@ -52,24 +50,21 @@ _VIEW_ALLOWED = Pattern("results.pages.pages.view_allowed", "view = {view!r:.80}
 VIEWS = ("table", "grid")
 
 
-def summary_page(plan: Plan, only: TrialFilter) -> dict[str, Any]:
+def summary_page(result: PlanResult) -> dict[str, Any]:
     """Return the contents of the plan's page."""
-    at, order = caching.fingerprint(plan), ordered_terms()
+    order = ordered_terms()
     name = (
         "summary",
-        only,
+        result.only,
         *order.values(),
     )  # the lab's order of failure terms is not part of the trials' fingerprint
-    return caching.cached_page(plan, name, at, lambda: _summary(plan, only, at, order))
+    return caching.cached_page(result.plan, name, result.at, lambda: _summary(result, order))
 
 
-def _summary(
-    plan: Plan, only: TrialFilter, at: Hashable, order: Mapping[str, tuple[str, ...]]
-) -> dict[str, Any]:
-    outcomes = caching.cached_runs(plan, at).outcomes
-    analysis = with_planned_letters(plan, caching.cached_analysis(plan, only, at))
-    primaries = primaries_of(plan, analysis)
-    facts = [comparison_facts(plan, analysis, found) for found in primaries]
+def _summary(result: PlanResult, order: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    plan, only, analysis = result.plan, result.only, result.analysis
+    outcomes, primaries = result.runs.outcomes, result.primaries
+    facts = [comparison_facts(result, found) for found in primaries]
     scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
     return {
         "analysis": analysis,
@@ -77,7 +72,7 @@ def _summary(
         "choices": filter_choices(outcomes),
         "headline": facts[0]["headline"] if facts else None,
         "primaries": facts,
-        "table": arm_rows(plan, analysis, only),
+        "table": arm_rows(result),
         "intervals": _intervals(plan, "Success rates", analysis, only),
         "violins": rates.draw_violins(analysis.arms, analysis.letters) if analysis.arms else None,
         "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
@@ -85,7 +80,7 @@ def _summary(
         "grid": conditions.draw_grid(analysis.arms, _grid_links(plan, analysis, only)),
         "declared": declared_failures(plan).keys() & {row.trial for row in only.apply(outcomes)},
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
-        "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
+        "scenes": [(scene, scene_rows(result, scene)) for scene in scenes],
         "others": [
             (found, comparison_sentence(analysis, found), compare_address(plan, found, only))
             for found in analysis.comparisons
@@ -96,22 +91,20 @@ def _summary(
     }
 
 
-def comparison_page(plan: Plan, only: TrialFilter, first: str, second: str) -> dict[str, Any]:
+def comparison_page(result: PlanResult, first: str, second: str) -> dict[str, Any]:
     """Return the comparison of two checkpoints, condition by condition.
 
     Raises:
         EvaError: If there is no such comparison; the message names the checkpoints.
     """
-    at = caching.fingerprint(plan)
-    return caching.cached_page(
-        plan, ("comparison", only, first, second), at, lambda: _compared(plan, only, first, second, at)
-    )
+    name = ("comparison", result.only, first, second)
+    return caching.cached_page(result.plan, name, result.at, lambda: _compared(result, first, second))
 
 
-def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashable) -> dict[str, Any]:
-    analysis = with_planned_letters(plan, caching.cached_analysis(plan, only, at))
+def _compared(result: PlanResult, first: str, second: str) -> dict[str, Any]:
+    plan, only, analysis = result.plan, result.only, result.analysis
     names = [arm.checkpoint for arm in analysis.arms]
-    primaries = primaries_of(plan, analysis)
+    primaries = result.primaries
     if not first and not second and primaries:
         first, second = primaries[0].first, primaries[0].second
     found = analysis.comparison_of(first, second)
@@ -120,13 +113,13 @@ def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashab
             _NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=", ".join(names) or "none")
         )
     arms = (analysis.arm(found.first), analysis.arm(found.second))
-    runs = by_checkpoint(only.apply(caching.cached_runs(plan, at).outcomes))
+    runs = by_checkpoint(only.apply(result.runs.outcomes))
     return {
         "analysis": analysis,
         "only": only,
         "found": found,
         "names": names,
-        "facts": comparison_facts(plan, analysis, found),
+        "facts": comparison_facts(result, found),
         "difference": rates.draw_difference(found),
         "intervals": rates.draw_intervals(
             "Success rates",
@@ -186,19 +179,17 @@ def pairs_shown(page: Mapping[str, Any], how: PairView) -> dict[str, Any]:
     }
 
 
-def evidence_page(plan: Plan) -> dict[str, Any]:
+def evidence_page(result: PlanResult) -> dict[str, Any]:
     """Return the evidence of the plan's comparisons, whether it suffices to stop, and what the trials cannot detect."""
-    at = caching.fingerprint(plan)
-    return caching.cached_page(plan, "evidence", at, lambda: _evidence(plan, at))
+    return caching.cached_page(result.plan, "evidence", result.at, lambda: _evidence(result))
 
 
-def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
-    analysis = caching.cached_analysis(plan, None, at)
-    found, design = primaries_of(plan, analysis), frozen_design(plan.document) if plan.document else None
+def _evidence(result: PlanResult) -> dict[str, Any]:
+    analysis, found, design = result.analysis, result.primaries, result.design
     if not found or design is None:
         return {"meters": [], "compared": design is not None}
     return {
-        "headline": headline(plan),
+        "headline": result.headline,
         "meters": [_meter(analysis, one, design) for one in found],
         "missed": undetectable_text(analysis),
     }

@@ -12,7 +12,7 @@ from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
-from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.wording import (
     anytime_text,
     difference_sentence,
@@ -40,22 +40,17 @@ class ComparisonFact:
     own: bool = False
 
 
-def primaries_of(plan: Plan, analysis: Analysis) -> list[Comparison]:
-    """Return the planned comparisons for which both checkpoints have trials."""
-    found = (analysis.comparison_of(*names) for names in compared(plan.document or {}))
-    return [one for one in found if one is not None]
-
-
 def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
     """Return the comparison as one sentence."""
     one, other = analysis.arm(found.first).success, analysis.arm(found.second).success
     return difference_sentence(found, one, other, analysis.alpha)
 
 
-def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
+def comparison_facts(result: PlanResult, found: Comparison) -> dict[str, Any]:
     """Return sentence and facts of a comparison; the sentence of a planned one comes from its design."""
+    plan, analysis = result.plan, result.analysis
     names = compared(plan.document or {})
-    planned = headline(plan) if (found.first, found.second) in names else None
+    planned = result.headline if (found.first, found.second) in names else None
     own = _own_interval(plan) if planned else ""
     return {
         "sentence": planned.sentences[names.index((found.first, found.second))]

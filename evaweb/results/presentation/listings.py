@@ -9,13 +9,13 @@ from typing import Any
 from django.urls import reverse
 
 from evaweb.episodes.models import Episode
-from evaweb.plans.models import Plan, PlanState
-from evaweb.results.analysis import caching
+from evaweb.plans.models import PlanState
 from evaweb.results.analysis.analysis import Analysis, Arm
-from evaweb.results.analysis.filters import TrialFilter, filter_choices
+from evaweb.results.analysis.filters import filter_choices
 from evaweb.results.analysis.outcomes import Outcome, Pair
 from evaweb.results.presentation.addresses import side_by_side_url, trials_address
 from evaweb.results.presentation.drawings import conditions
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.wording import format_interval
 from evaweb.results.ratings.footage import is_watchable
 from evaweb.results.selectors import TrialQuery
@@ -44,13 +44,13 @@ class Row:
     address: str
 
 
-def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str, Any]]:
+def arm_rows(result: PlanResult) -> list[dict[str, Any]]:
     """Return the table of checkpoints, best first, each with its result after later corrections of scores."""
-    corrected = caching.corrected_of(plan, only)
+    plan, only, analysis = result.plan, result.only, result.analysis
     return [
         {
             "arm": arm,
-            "corrected": corrected.get(arm.checkpoint),
+            "corrected": result.corrected.get(arm.checkpoint),
             "letters": analysis.letters.get(arm.checkpoint, ""),
             "address": trials_address(plan, only, checkpoint=arm.checkpoint),
             "successes": trials_address(plan, only, checkpoint=arm.checkpoint, success="yes"),
@@ -68,15 +68,15 @@ def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str
     ]
 
 
-def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> list[Row]:
+def scene_rows(result: PlanResult, scene: str) -> list[Row]:
     """Return the rows of the checkpoints on one scene."""
     return [
         Row(
             arm.checkpoint,
             arm.scenes[scene],
-            trials_address(plan, only, checkpoint=arm.checkpoint, scene=scene),
+            trials_address(result.plan, result.only, checkpoint=arm.checkpoint, scene=scene),
         )
-        for arm in analysis.arms
+        for arm in result.analysis.arms
         if scene in arm.scenes
     ]
 
@@ -184,9 +184,8 @@ def trial_row(trial: Trial) -> dict[str, Any]:
     }
 
 
-def trial_filters(plan: Plan) -> list[Filter]:
-    """Return the filters of the list of trials; `TrialQuery` rejects unknown values."""
-    runs = caching.cached_runs(plan).outcomes
+def trial_filters(runs: Sequence[Outcome]) -> list[Filter]:
+    """Return the filters of the list of these trials; `TrialQuery` rejects unknown values."""
     failed = [run for run in runs if not run.success]
     values = {
         **filter_choices(runs),
