@@ -18,18 +18,13 @@ from evaweb.core.errors import NotFound
 from evaweb.core.tabular_export import in_pages
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.json_forms import write_proportion
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.analysis.simulated import compare_with_real, simulated_plans
 from evaweb.results.models import Judgement, Preference, Rating
 from evaweb.results.presentation.citation import citation
 from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings.result_visibility import require_visible_results, sealed_reason
-from evaweb.results.reports.document import (
-    analysis_document,
-    arm_document,
-    comparison_document,
-    proportion_document,
-)
 from evaweb.results.reports.reporting import planned_document
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
 from evaweb.results.selectors import plan_at_reveal, plan_get
@@ -210,8 +205,8 @@ def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilt
         "headline": headline and headline.document,
         "planned": planned_document(result),
         "caveats": result.caveats,
-        **analysis_document(result.analysis),
-        "corrected": {name: proportion_document(found) for name, found in result.corrected.items()},
+        **result.analysis.document,
+        "corrected": {name: write_proportion(found) for name, found in result.corrected.items()},
         "notes": list(result.analysis.notes),
         "agreement": result.agreement,
         "judges": result.judges,
@@ -252,7 +247,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
             "plan": one["plan"].name,
             "version": one["plan"].version,
             "checkpoints": {
-                checkpoint: {"real": proportion_document(real), "simulated": proportion_document(played)}
+                checkpoint: {"real": write_proportion(real), "simulated": write_proportion(played)}
                 for checkpoint, real, played in one["rates"]
             },
             "rank_correlation": one["rank_correlation"],
@@ -301,7 +296,7 @@ def checkpoint(
     found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
     if found is None:
         raise NotFound(_NO_TRIAL_COUNTS_THERE_TRIALS(checkpoint=checkpoint, names=_names(analysis)))
-    return arm_document(found)
+    return found.document
 
 
 @router.get(
@@ -320,7 +315,7 @@ def comparison(
     found = analysis.comparison_of(first, second)
     if found is None:
         raise NotFound(_NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=_names(analysis)))
-    return comparison_document(found)
+    return found.document
 
 
 @router.get(

@@ -16,7 +16,8 @@ from django.db.models import Count, Max, Q, Sum
 from evaweb.core.fingerprint_cache import FingerprintCache, rounded_sum
 from evaweb.plans.design import compared, findings_of, frozen_design, planned
 from evaweb.plans.models import Allocation, Plan
-from evaweb.results.analysis.analysis import Analysis, Verdict, analyse
+from evaweb.results.analysis.analysis import Analysis, analyse
+from evaweb.results.analysis.comparison import Verdict
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.analysis.load_outcomes import load_plan_interruptions, load_plan_outcomes
 from evaweb.results.analysis.outcomes import Interruption, Outcome, by_checkpoint

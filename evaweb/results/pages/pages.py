@@ -11,10 +11,13 @@ from evaweb.core.errors import EvaError
 from evaweb.plans.counting import declared_failures
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.arm import COLUMNS
+from evaweb.results.analysis.comparison import Comparison, Standing
 from evaweb.results.analysis.filters import TrialFilter, filter_choices
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.analysis.outcomes import by_checkpoint, pair_by_block
+from evaweb.results.analysis.wording import anytime_text, evidence_text
 from evaweb.results.presentation.addresses import compare_address, trials_address
 from evaweb.results.presentation.drawings import conditions, rates, time_courses
 from evaweb.results.presentation.drawings.svg import Drawing
@@ -32,7 +35,6 @@ from evaweb.results.presentation.listings import (
     scene_rows,
 )
 from evaweb.results.presentation.plan_result import PlanResult
-from evaweb.results.presentation.wording import anytime_text, evidence_text
 from evaweb.statistics.designs import Design
 from evaweb.trials.failures import ordered_terms
 from runtime.core.sentences import Pattern
@@ -72,6 +74,7 @@ def _summary(result: PlanResult, order: Mapping[str, tuple[str, ...]]) -> dict[s
         "choices": filter_choices(outcomes),
         "headline": facts[0]["headline"] if facts else None,
         "primaries": facts,
+        "columns": COLUMNS,
         "table": arm_rows(result),
         "intervals": _intervals(plan, "Success rates", analysis, only),
         "violins": rates.draw_violins(analysis.arms, analysis.letters) if analysis.arms else None,

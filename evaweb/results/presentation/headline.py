@@ -17,8 +17,8 @@ from evaweb.plans.design import (
     visible_close_reason,
 )
 from evaweb.plans.models import Plan, PlanState
+from evaweb.results.analysis.wording import format_points, p_words
 from evaweb.results.presentation.setting import setting_of
-from evaweb.results.presentation.wording import format_points, p_words
 from evaweb.statistics.designs import (
     FIXED,
     SUCCESS,

@@ -10,7 +10,8 @@ from typing import Any
 from evaweb.plans.design import Tried, compared, current_pairs, frozen_design, stored_blocks
 from evaweb.plans.models import Plan
 from evaweb.results.analysis import agreement, caching
-from evaweb.results.analysis.analysis import Analysis, Comparison
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.comparison import Comparison
 from evaweb.results.analysis.filters import TrialFilter, parse_filter
 from evaweb.results.presentation.headline import Headline, conclude, letters_of
 from evaweb.results.presentation.integrity import delays_banner, integrity_document

@@ -19,6 +19,7 @@ from evaweb.core.tabular_export import iter_csv
 from evaweb.plans.counting import ENDS, declared_failures
 from evaweb.plans.design import compared
 from evaweb.plans.models import CountsAs, Plan, PlanState
+from evaweb.results.analysis.arm import COLUMNS as ARM_COLUMNS
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation import facts, listings
 from evaweb.results.presentation.drawings import conditions, rates, time_courses
@@ -27,7 +28,6 @@ from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.setting import setting_of
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
-from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.tables import COLUMNS, JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.statistics.designs import estimated, findings
 from evaweb.statistics.difference import Difference
@@ -103,7 +103,7 @@ def report_numbers(result: PlanResult) -> dict[str, Any]:
     preferred = result.preferences
     words = ("reason", "groups")
     return {
-        **analysis_document(result.analysis),
+        **result.analysis.document,
         "planned": planned_document(result),
         "agreement": result.agreement,
         "judges": result.judges,
@@ -165,6 +165,7 @@ def report_context(result: PlanResult) -> dict[str, Any]:
         "changes": checkpoint_changes(plan),
         "headline": result.headline,
         "primaries": [facts.comparison_facts(result, found) for found in primaries],
+        "columns": ARM_COLUMNS,
         "table": listings.arm_rows(result),
         "others": [
             (found, facts.comparison_sentence(analysis, found))
