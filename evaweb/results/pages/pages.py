@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from evaweb.core.errors import EvaError
 from evaweb.plans.counting import declared_failures
-from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.arm import COLUMNS
 from evaweb.results.analysis.comparison import Comparison, Standing
-from evaweb.results.analysis.filters import TrialFilter, filter_choices
+from evaweb.results.analysis.filters import filter_choices
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.analysis.outcomes import by_checkpoint, pair_by_block
 from evaweb.results.analysis.wording import anytime_text, evidence_text
 from evaweb.results.presentation.addresses import compare_address, trials_address
-from evaweb.results.presentation.drawings import conditions, rates, time_courses
-from evaweb.results.presentation.drawings.svg import Drawing
+from evaweb.results.presentation.drawings import rates, time_courses
 from evaweb.results.presentation.facts import (
     comparison_facts,
     comparison_sentence,
     undetectable_text,
 )
+from evaweb.results.presentation.figures import draw_arms
 from evaweb.results.presentation.listings import (
     MOST_PAIRS,
     arm_rows,
@@ -76,11 +75,7 @@ def _summary(result: PlanResult, order: Mapping[str, tuple[str, ...]]) -> dict[s
         "primaries": facts,
         "columns": COLUMNS,
         "table": arm_rows(result),
-        "intervals": _intervals(plan, "Success rates", analysis, only),
-        "violins": rates.draw_violins(analysis.arms, analysis.letters) if analysis.arms else None,
-        "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
-        "success_times": time_courses.draw_success_times(analysis.arms),
-        "grid": conditions.draw_grid(analysis.arms, _grid_links(plan, analysis, only)),
+        **draw_arms(analysis.arms, analysis.letters, partial(trials_address, plan, only)),
         "declared": declared_failures(plan).keys() & {row.trial for row in only.apply(outcomes)},
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
         "scenes": [(scene, scene_rows(result, scene)) for scene in scenes],
@@ -124,21 +119,7 @@ def _compared(result: PlanResult, first: str, second: str) -> dict[str, Any]:
         "names": names,
         "facts": comparison_facts(result, found),
         "difference": rates.draw_difference(found),
-        "intervals": rates.draw_intervals(
-            "Success rates",
-            [
-                (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
-                for arm in arms
-            ],
-            {arm.checkpoint: arm.series for arm in arms},
-        ),
-        "violins": rates.draw_violins(arms, analysis.letters),
-        "funnels": [
-            drawn
-            for scene in sorted({*arms[0].scenes, *arms[1].scenes})
-            if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
-        ],
-        "success_times": time_courses.draw_success_times(arms),
+        **draw_arms(arms, analysis.letters, partial(trials_address, plan, only)),
         "evidence": found.evidence
         and time_courses.draw_evidence(
             found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
@@ -222,40 +203,3 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
         "level": 100 * (1 - design.share),
         "wanted": 2 / design.share,
     }
-
-
-def _intervals(plan: Plan, title: str, analysis: Analysis, only: TrialFilter) -> Drawing | None:
-    rows = [
-        (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
-        for arm in analysis.arms
-    ]
-    order = {arm.checkpoint: arm.series for arm in analysis.arms}
-    return rates.draw_intervals(title, rows, order) if rows else None
-
-
-def _funnel(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> Drawing | None:
-    found = [
-        (arm.series, arm.checkpoint, funnel)
-        for arm in analysis.arms
-        for funnel in arm.funnels
-        if funnel.scene == scene
-    ]
-    if not found or len({funnel.labels for _, _, funnel in found}) > 1:
-        return None
-    links = {
-        (name, at): trials_address(plan, only, checkpoint=name, scene=scene, missed=label)
-        for _, name, funnel in found
-        for at, label in enumerate(funnel.labels)
-    }
-    return time_courses.draw_funnel(scene, found, links)
-
-
-def _grid_links(plan: Plan, analysis: Analysis, only: TrialFilter) -> dict[tuple[str, str], str]:
-    links = {}
-    for arm in analysis.arms:
-        for condition in arm.cells:
-            scene, _, position = condition.rpartition("/")
-            links[arm.checkpoint, condition] = trials_address(
-                plan, only, checkpoint=arm.checkpoint, scene=scene, position=position
-            )
-    return links

@@ -22,7 +22,8 @@ from evaweb.plans.models import CountsAs, Plan, PlanState
 from evaweb.results.analysis.arm import COLUMNS as ARM_COLUMNS
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation import facts, listings
-from evaweb.results.presentation.drawings import conditions, rates, time_courses
+from evaweb.results.presentation.drawings import time_courses
+from evaweb.results.presentation.figures import draw_arms
 from evaweb.results.presentation.integrity import delays_banner
 from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.setting import setting_of
@@ -150,9 +151,7 @@ def plan_seal(plan: Plan) -> dict[str, Any]:
 def report_context(result: PlanResult) -> dict[str, Any]:
     """Return the context of the report's page; its figures have no links, because the report has no other pages."""
     plan, analysis = result.plan, result.analysis
-    arms, primaries = analysis.arms, result.primaries
-    order = {arm.checkpoint: arm.series for arm in arms}
-    scenes = sorted({name for arm in arms for name in arm.scenes})
+    primaries, order = result.primaries, {arm.checkpoint: arm.series for arm in analysis.arms}
     return {
         "plan": plan,
         "document": plan.document,
@@ -172,23 +171,7 @@ def report_context(result: PlanResult) -> dict[str, Any]:
             for found in analysis.comparisons
             if found not in primaries
         ],
-        "intervals": rates.draw_intervals(
-            "Success rates", [(a.checkpoint, a.success, "") for a in arms], order
-        )
-        if arms
-        else None,
-        "violins": rates.draw_violins(arms, analysis.letters) if arms else None,
-        "funnels": [
-            time_courses.draw_funnel(
-                scene,
-                [(a.series, a.checkpoint, f) for a in arms for f in a.funnels if f.scene == scene],
-                {},
-            )
-            for scene in scenes
-            if any(f.scene == scene for a in arms for f in a.funnels)
-        ],
-        "success_times": time_courses.draw_success_times(arms),
-        "grid": conditions.draw_grid(arms, {}),
+        **draw_arms(analysis.arms, analysis.letters, lambda **named: "", mixed=True),
         "failures": listings.failure_tables(analysis, ordered_terms(), lambda **named: ""),
         "evidence": [
             time_courses.draw_evidence(
