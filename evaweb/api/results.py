@@ -17,24 +17,14 @@ from evaweb.api.tables import Format, table_response
 from evaweb.core.errors import NotFound
 from evaweb.core.tabular_export import in_pages
 from evaweb.plans.models import Plan
-from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
 from evaweb.results.analysis.analysis import Analysis
-from evaweb.results.analysis.filters import TrialFilter, parse_filter
+from evaweb.results.analysis.json_forms import write_proportion
 from evaweb.results.analysis.planner import Question, question_of, table_of
 from evaweb.results.analysis.simulated import compare_with_real, simulated_plans
 from evaweb.results.models import Judgement, Preference, Rating
-from evaweb.results.presentation.caveats import caveats_of
 from evaweb.results.presentation.citation import citation
-from evaweb.results.presentation.headline import headline_document, with_planned_letters
-from evaweb.results.presentation.integrity import integrity_document
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings.result_visibility import require_visible_results, sealed_reason
-from evaweb.results.reports.document import (
-    analysis_document,
-    arm_document,
-    comparison_document,
-    proportion_document,
-)
 from evaweb.results.reports.reporting import planned_document
 from evaweb.results.reports.tables import COLUMNS, outcome_page, outcome_pages
 from evaweb.results.selectors import plan_at_reveal, plan_get
@@ -207,24 +197,22 @@ def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilt
     design has not ended (`standing` is "open") has neither test nor evidence. For a revealed plan the figures are
     of the scores at the reveal; `corrected` has the rates with the current scores, if they differ.
     """
-    plan, which = _seen(request, name, version, only)
-    analysis = with_planned_letters(plan, caching.cached_analysis(plan, which))
+    result = _seen(request, name, version, only)
+    plan, headline = result.plan, result.headline
     return {
         "plan": plan.name,
         "version": plan.version,
         "digest": plan.digest,
         "only": {name: value for name, value in only.model_dump().items() if value},
-        "headline": headline_document(plan),
-        "planned": planned_document(plan),
-        "caveats": caveats_of(plan),
-        **analysis_document(analysis),
-        "corrected": {
-            name: proportion_document(found) for name, found in caching.corrected_of(plan, which).items()
-        },
-        "notes": list(analysis.notes),
-        "agreement": rater_agreement(plan),
-        "judges": judge_agreement(plan),
-        "preferences": preference_ranking(plan),
+        "headline": headline and headline.document,
+        "planned": planned_document(result),
+        "caveats": result.caveats,
+        **result.analysis.document,
+        "corrected": {name: write_proportion(found) for name, found in result.corrected.items()},
+        "notes": list(result.analysis.notes),
+        "agreement": result.agreement,
+        "judges": result.judges,
+        "preferences": result.preferences,
     }
 
 
@@ -236,8 +224,9 @@ def results(request: HttpRequest, name: str, version: int, only: Query[TrialFilt
 )
 def integrity(request: HttpRequest, name: str, version: int) -> Any:
     """Return looks, voids, corrections, amendments, deviations, delays, and the headline without doubtful trials."""
-    plan, _ = _seen(request, name, version, TrialFilters())
-    return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **integrity_document(plan)}
+    result = _seen(request, name, version)
+    plan = result.plan
+    return {"plan": plan.name, "version": plan.version, "digest": plan.digest, **result.conduct}
 
 
 @router.get(
@@ -252,7 +241,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
     It has rates, rank correlation, mean maximum rank violation, and prediction-powered differences (null with fewer
     than eight matched trials).
     """
-    plan, _ = _seen(request, name, version, TrialFilters())
+    plan = _seen(request, name, version).plan
     user: Any = request.auth  # type: ignore[attr-defined]
     found = (compare_with_real(plan, row) for row in simulated_plans(plan) if not sealed_reason(row, user))
     return [
@@ -260,7 +249,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> Any:
             "plan": one["plan"].name,
             "version": one["plan"].version,
             "checkpoints": {
-                checkpoint: {"real": proportion_document(real), "simulated": proportion_document(played)}
+                checkpoint: {"real": write_proportion(real), "simulated": write_proportion(played)}
                 for checkpoint, real, played in one["rates"]
             },
             "rank_correlation": one["rank_correlation"],
@@ -305,12 +294,11 @@ def checkpoint(
     request: HttpRequest, name: str, version: int, checkpoint: str, only: Query[TrialFilters]
 ) -> Any:
     """Return the rates, scores, milestones and times of a checkpoint."""
-    plan, which = _seen(request, name, version, only)
-    analysis = caching.cached_analysis(plan, which)
+    analysis = _seen(request, name, version, only).analysis
     found = next((arm for arm in analysis.arms if arm.checkpoint == checkpoint), None)
     if found is None:
         raise NotFound(_NO_TRIAL_COUNTS_THERE_TRIALS(checkpoint=checkpoint, names=_names(analysis)))
-    return arm_document(found)
+    return found.document
 
 
 @router.get(
@@ -323,12 +311,11 @@ def comparison(
     request: HttpRequest, name: str, version: int, first: str, second: str, only: Query[TrialFilters]
 ) -> Any:
     """Return difference, tests and evidence of the first checkpoint minus the second."""
-    plan, which = _seen(request, name, version, only)
-    analysis = caching.cached_analysis(plan, which)
+    analysis = _seen(request, name, version, only).analysis
     found = analysis.comparison_of(first, second)
     if found is None:
         raise NotFound(_NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=_names(analysis)))
-    return comparison_document(found)
+    return found.document
 
 
 @router.get(
@@ -349,11 +336,11 @@ def outcomes(
 
     CSV and Parquet have all of them, without pages.
     """
-    plan, which = _seen(request, name, version, only)
+    result = _seen(request, name, version, only)
     if format != "json":
-        name = f"{plan.name}-v{plan.version}-trials"
-        return table_response(request, name, COLUMNS, outcome_pages(plan, which), format)
-    return outcome_page(plan, which, paging.offset, paging.limit)
+        name = f"{result.plan.name}-v{result.plan.version}-trials"
+        return table_response(request, name, COLUMNS, outcome_pages(result), format)
+    return outcome_page(result, paging.offset, paging.limit)
 
 
 @router.get(
@@ -366,7 +353,7 @@ def scores(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Return all scores, including those that were corrected later."""
-    plan, _ = _seen(request, name, version, TrialFilters())
+    plan = _seen(request, name, version).plan
     rows = Score.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "scores", rows, ScoreRow, paging, format)
 
@@ -381,7 +368,7 @@ def ratings(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Return the ratings of users other than the trial's operator; they never change its score."""
-    plan, _ = _seen(request, name, version, TrialFilters())
+    plan = _seen(request, name, version).plan
     rows = Rating.objects.filter(trial__evaluation=plan.evaluation_id).select_related("rater").order_by("pk")
     return _rows(request, plan, "ratings", rows, RatingOut, paging, format)
 
@@ -399,7 +386,7 @@ def judgements(
 
     They never change its score and are not ratings.
     """
-    plan, _ = _seen(request, name, version, TrialFilters())
+    plan = _seen(request, name, version).plan
     rows = Judgement.objects.filter(trial__evaluation=plan.evaluation_id).order_by("pk")
     return _rows(request, plan, "judgements", rows, JudgementOut, paging, format)
 
@@ -414,7 +401,7 @@ def preferences(
     request: HttpRequest, name: str, version: int, paging: Query[Paging], format: Format = "json"
 ) -> Any:
     """Return the raters' preferences between two trials at the same initial condition."""
-    plan, _ = _seen(request, name, version, TrialFilters())
+    plan = _seen(request, name, version).plan
     rows = plan.preferences.select_related("rater", "first__checkpoint", "second__checkpoint").order_by("pk")
     return _rows(request, plan, "preferences", rows, PreferenceOut, paging, format)
 
@@ -429,14 +416,12 @@ def planner(request: HttpRequest, asked: Query[PlannerIn]) -> Any:
     return {"question": asked.model_dump(), **table_of(question, user.pk)}
 
 
-def _seen(request: Any, name: str, version: int, only: TrialFilters) -> tuple[Plan, TrialFilter]:
-    """Return the plan, if the user may see its results, and the filter of its trials."""
+def _seen(request: Any, name: str, version: int, only: TrialFilters | None = None) -> PlanResult:
+    """Return the result of the plan's selected trials, if the user may see it."""
     plan = plan_get(name=name, version=version)
     require_visible_results(plan, request.auth)
-    given = only.model_dump()
-    return plan, parse_filter(given, caching.cached_runs(plan).outcomes) if any(
-        given.values()
-    ) else TrialFilter()
+    given = only.model_dump() if only else {}
+    return PlanResult(plan).select(given) if any(given.values()) else PlanResult(plan)
 
 
 def _rows(

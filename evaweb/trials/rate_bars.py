@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 
-from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials.models import Scene
 from evaweb.trials.selectors import StatisticsRow
@@ -71,20 +70,6 @@ def format_interval(found: Proportion) -> str:
     if found.interval is None:
         return ""
     return f"{100 * found.interval.low:.0f} to {100 * found.interval.high:.0f}"
-
-
-def average_text(found: Average | None, of: int) -> str:
-    """Return a mean such as "−5.21 [−5.60, −4.82], 14 of 16 trials"; "" if no trial has a value."""
-    if found is None:
-        return ""
-    n = f"n {found.n}" if found.n == of else f"{found.n} of {of} trials"
-    if found.interval is None:
-        return f"{_decimal(found.value)}, {n}: no interval"
-    return f"{_decimal(found.value)} [{_decimal(found.interval.low)}, {_decimal(found.interval.high)}], {n}"
-
-
-def _decimal(value: float) -> str:
-    return f"{value:.2f}".replace("-", "−")
 
 
 def _x(share: float) -> float:

@@ -16,7 +16,8 @@ from django.db.models import Count, Max, Q, Sum
 from evaweb.core.fingerprint_cache import FingerprintCache, rounded_sum
 from evaweb.plans.design import compared, findings_of, frozen_design, planned
 from evaweb.plans.models import Allocation, Plan
-from evaweb.results.analysis.analysis import Analysis, Verdict, analyse
+from evaweb.results.analysis.analysis import Analysis, analyse
+from evaweb.results.analysis.comparison import Verdict
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.analysis.load_outcomes import load_plan_interruptions, load_plan_outcomes
 from evaweb.results.analysis.outcomes import Interruption, Outcome, by_checkpoint
@@ -66,11 +67,11 @@ def cached_runs(plan: Plan, at: Hashable = None) -> Runs:
     )
 
 
-def corrected_of(plan: Plan, only: TrialFilter) -> dict[str, Proportion]:
+def corrected_of(plan: Plan, only: TrialFilter, at: Hashable = None) -> dict[str, Proportion]:
     """Return the current successes by checkpoint, for checkpoints with scores corrected since the reveal; else {}."""
     if not plan.at_reveal:
         return {}
-    at = fingerprint(plan)
+    at = at or fingerprint(plan)
     now = _corrected.get((plan.pk, plan.digest), at, lambda: load_plan_outcomes(plan, corrected=True))
     found = {}
     before = by_checkpoint(only.apply(cached_runs(plan, at).outcomes))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from evaweb.trials.failure_text import failure_text
@@ -97,3 +97,47 @@ def _place(pair: Pair) -> int:
     """
     block = pair.first.block
     return int(block) if block.isdecimal() else max(pair.first.order, pair.second.order)
+
+
+def count_successes(trials: Sequence[Outcome]) -> tuple[int, int]:
+    """Return the number of successes and of trials."""
+    return sum(outcome.success for outcome in trials), len(trials)
+
+
+def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[str, list[Outcome]]:
+    """Return the trials by key, sorted by it."""
+    found: dict[str, list[Outcome]] = defaultdict(list)
+    for outcome in trials:
+        found[key(outcome)].append(outcome)
+    return dict(sorted(found.items()))
+
+
+@dataclass(frozen=True, slots=True)
+class TimeHorizon:
+    """Horizon of times to success [s], 0 without any duration, and the time limits of scenes [s]."""
+
+    until: float
+    limits: Mapping[str, float]
+
+    @classmethod
+    def of(cls, outcomes: Sequence[Outcome], limits: Mapping[str, float]) -> TimeHorizon:
+        """Return the smallest limit, or the longest run without one."""
+        longest = max((o.duration for o in outcomes if o.duration is not None), default=0.0)
+        return cls(min(limits.values(), default=longest), limits)
+
+    def known(self, outcome: Outcome) -> bool:
+        """Return True if the trial's duration is known."""
+        return outcome.duration is not None and self.until > 0
+
+    def time(self, outcome: Outcome) -> float | None:
+        """Return the time to success [s], None for a failure; capped at the scene's limit, because a run ends
+        shortly after it.
+        """
+        if not outcome.success or outcome.duration is None:
+            return None
+        return min(outcome.duration, self.limits.get(outcome.scene, outcome.duration))
+
+    def time_within_horizon(self, outcome: Outcome) -> float:
+        """Return the time to success within the horizon; a failure counts as the horizon."""
+        time = self.time(outcome)
+        return self.until if time is None else min(time, self.until)

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from evaweb.core.errors import EvaError
 from evaweb.plans.counting import declared_failures
-from evaweb.plans.design import frozen_design
-from evaweb.plans.models import Plan
 from evaweb.results.analysis import caching
-from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
-from evaweb.results.analysis.filters import TrialFilter, filter_choices
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.arm import COLUMNS
+from evaweb.results.analysis.comparison import Comparison, Standing
+from evaweb.results.analysis.filters import filter_choices
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.analysis.outcomes import by_checkpoint, pair_by_block
+from evaweb.results.analysis.wording import anytime_text, evidence_text
 from evaweb.results.presentation.addresses import compare_address, trials_address
-from evaweb.results.presentation.drawings import conditions, rates, time_courses
-from evaweb.results.presentation.drawings.svg import Drawing
+from evaweb.results.presentation.drawings import rates, time_courses
 from evaweb.results.presentation.facts import (
     comparison_facts,
     comparison_sentence,
-    primaries_of,
     undetectable_text,
 )
-from evaweb.results.presentation.headline import headline, with_planned_letters
+from evaweb.results.presentation.figures import draw_arms
 from evaweb.results.presentation.listings import (
     MOST_PAIRS,
     arm_rows,
@@ -34,7 +33,7 @@ from evaweb.results.presentation.listings import (
     pair_rows,
     scene_rows,
 )
-from evaweb.results.presentation.wording import anytime_text, evidence_text
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.statistics.designs import Design
 from evaweb.trials.failures import ordered_terms
 from runtime.core.sentences import Pattern
@@ -52,24 +51,21 @@ _VIEW_ALLOWED = Pattern("results.pages.pages.view_allowed", "view = {view!r:.80}
 VIEWS = ("table", "grid")
 
 
-def summary_page(plan: Plan, only: TrialFilter) -> dict[str, Any]:
+def summary_page(result: PlanResult) -> dict[str, Any]:
     """Return the contents of the plan's page."""
-    at, order = caching.fingerprint(plan), ordered_terms()
+    order = ordered_terms()
     name = (
         "summary",
-        only,
+        result.only,
         *order.values(),
     )  # the lab's order of failure terms is not part of the trials' fingerprint
-    return caching.cached_page(plan, name, at, lambda: _summary(plan, only, at, order))
+    return caching.cached_page(result.plan, name, result.at, lambda: _summary(result, order))
 
 
-def _summary(
-    plan: Plan, only: TrialFilter, at: Hashable, order: Mapping[str, tuple[str, ...]]
-) -> dict[str, Any]:
-    outcomes = caching.cached_runs(plan, at).outcomes
-    analysis = with_planned_letters(plan, caching.cached_analysis(plan, only, at))
-    primaries = primaries_of(plan, analysis)
-    facts = [comparison_facts(plan, analysis, found) for found in primaries]
+def _summary(result: PlanResult, order: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    plan, only, analysis = result.plan, result.only, result.analysis
+    outcomes, primaries = result.runs.outcomes, result.primaries
+    facts = [comparison_facts(result, found) for found in primaries]
     scenes = sorted({name for arm in analysis.arms for name in arm.scenes})
     return {
         "analysis": analysis,
@@ -77,15 +73,12 @@ def _summary(
         "choices": filter_choices(outcomes),
         "headline": facts[0]["headline"] if facts else None,
         "primaries": facts,
-        "table": arm_rows(plan, analysis, only),
-        "intervals": _intervals(plan, "Success rates", analysis, only),
-        "violins": rates.draw_violins(analysis.arms, analysis.letters) if analysis.arms else None,
-        "funnels": [drawn for scene in scenes if (drawn := _funnel(plan, analysis, scene, only))],
-        "success_times": time_courses.draw_success_times(analysis.arms),
-        "grid": conditions.draw_grid(analysis.arms, _grid_links(plan, analysis, only)),
+        "columns": COLUMNS,
+        "table": arm_rows(result),
+        **draw_arms(analysis.arms, analysis.letters, partial(trials_address, plan, only)),
         "declared": declared_failures(plan).keys() & {row.trial for row in only.apply(outcomes)},
         "failures": failure_tables(analysis, order, partial(trials_address, plan, only, success="no")),
-        "scenes": [(scene, scene_rows(plan, analysis, scene, only)) for scene in scenes],
+        "scenes": [(scene, scene_rows(result, scene)) for scene in scenes],
         "others": [
             (found, comparison_sentence(analysis, found), compare_address(plan, found, only))
             for found in analysis.comparisons
@@ -96,22 +89,20 @@ def _summary(
     }
 
 
-def comparison_page(plan: Plan, only: TrialFilter, first: str, second: str) -> dict[str, Any]:
+def comparison_page(result: PlanResult, first: str, second: str) -> dict[str, Any]:
     """Return the comparison of two checkpoints, condition by condition.
 
     Raises:
         EvaError: If there is no such comparison; the message names the checkpoints.
     """
-    at = caching.fingerprint(plan)
-    return caching.cached_page(
-        plan, ("comparison", only, first, second), at, lambda: _compared(plan, only, first, second, at)
-    )
+    name = ("comparison", result.only, first, second)
+    return caching.cached_page(result.plan, name, result.at, lambda: _compared(result, first, second))
 
 
-def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashable) -> dict[str, Any]:
-    analysis = with_planned_letters(plan, caching.cached_analysis(plan, only, at))
+def _compared(result: PlanResult, first: str, second: str) -> dict[str, Any]:
+    plan, only, analysis = result.plan, result.only, result.analysis
     names = [arm.checkpoint for arm in analysis.arms]
-    primaries = primaries_of(plan, analysis)
+    primaries = result.primaries
     if not first and not second and primaries:
         first, second = primaries[0].first, primaries[0].second
     found = analysis.comparison_of(first, second)
@@ -120,29 +111,15 @@ def _compared(plan: Plan, only: TrialFilter, first: str, second: str, at: Hashab
             _NO_COMPARISON_THERE_TRIALS(first=first, second=second, names=", ".join(names) or "none")
         )
     arms = (analysis.arm(found.first), analysis.arm(found.second))
-    runs = by_checkpoint(only.apply(caching.cached_runs(plan, at).outcomes))
+    runs = by_checkpoint(only.apply(result.runs.outcomes))
     return {
         "analysis": analysis,
         "only": only,
         "found": found,
         "names": names,
-        "facts": comparison_facts(plan, analysis, found),
+        "facts": comparison_facts(result, found),
         "difference": rates.draw_difference(found),
-        "intervals": rates.draw_intervals(
-            "Success rates",
-            [
-                (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
-                for arm in arms
-            ],
-            {arm.checkpoint: arm.series for arm in arms},
-        ),
-        "violins": rates.draw_violins(arms, analysis.letters),
-        "funnels": [
-            drawn
-            for scene in sorted({*arms[0].scenes, *arms[1].scenes})
-            if (drawn := _funnel(plan, replace(analysis, arms=arms), scene, only))
-        ],
-        "success_times": time_courses.draw_success_times(arms),
+        **draw_arms(arms, analysis.letters, partial(trials_address, plan, only)),
         "evidence": found.evidence
         and time_courses.draw_evidence(
             found.evidence, found.first, found.second, drawn=(arms[0].series, arms[1].series)
@@ -186,19 +163,17 @@ def pairs_shown(page: Mapping[str, Any], how: PairView) -> dict[str, Any]:
     }
 
 
-def evidence_page(plan: Plan) -> dict[str, Any]:
+def evidence_page(result: PlanResult) -> dict[str, Any]:
     """Return the evidence of the plan's comparisons, whether it suffices to stop, and what the trials cannot detect."""
-    at = caching.fingerprint(plan)
-    return caching.cached_page(plan, "evidence", at, lambda: _evidence(plan, at))
+    return caching.cached_page(result.plan, "evidence", result.at, lambda: _evidence(result))
 
 
-def _evidence(plan: Plan, at: Hashable) -> dict[str, Any]:
-    analysis = caching.cached_analysis(plan, None, at)
-    found, design = primaries_of(plan, analysis), frozen_design(plan.document) if plan.document else None
+def _evidence(result: PlanResult) -> dict[str, Any]:
+    analysis, found, design = result.analysis, result.primaries, result.design
     if not found or design is None:
         return {"meters": [], "compared": design is not None}
     return {
-        "headline": headline(plan),
+        "headline": result.headline,
         "meters": [_meter(analysis, one, design) for one in found],
         "missed": undetectable_text(analysis),
     }
@@ -228,40 +203,3 @@ def _meter(analysis: Analysis, found: Comparison, design: Design) -> dict[str, A
         "level": 100 * (1 - design.share),
         "wanted": 2 / design.share,
     }
-
-
-def _intervals(plan: Plan, title: str, analysis: Analysis, only: TrialFilter) -> Drawing | None:
-    rows = [
-        (arm.checkpoint, arm.success, trials_address(plan, only, checkpoint=arm.checkpoint))
-        for arm in analysis.arms
-    ]
-    order = {arm.checkpoint: arm.series for arm in analysis.arms}
-    return rates.draw_intervals(title, rows, order) if rows else None
-
-
-def _funnel(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> Drawing | None:
-    found = [
-        (arm.series, arm.checkpoint, funnel)
-        for arm in analysis.arms
-        for funnel in arm.funnels
-        if funnel.scene == scene
-    ]
-    if not found or len({funnel.labels for _, _, funnel in found}) > 1:
-        return None
-    links = {
-        (name, at): trials_address(plan, only, checkpoint=name, scene=scene, missed=label)
-        for _, name, funnel in found
-        for at, label in enumerate(funnel.labels)
-    }
-    return time_courses.draw_funnel(scene, found, links)
-
-
-def _grid_links(plan: Plan, analysis: Analysis, only: TrialFilter) -> dict[tuple[str, str], str]:
-    links = {}
-    for arm in analysis.arms:
-        for condition in arm.cells:
-            scene, _, position = condition.rpartition("/")
-            links[arm.checkpoint, condition] = trials_address(
-                plan, only, checkpoint=arm.checkpoint, scene=scene, position=position
-            )
-    return links

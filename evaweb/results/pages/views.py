@@ -23,14 +23,12 @@ from evaweb.plans.counting import declared_failures
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PlanState
 from evaweb.results import selectors
-from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
-from evaweb.results.analysis.filters import parse_filter
 from evaweb.results.analysis.simulated import compare_with_real, is_simulated, simulated_plans
 from evaweb.results.pages import pages
 from evaweb.results.presentation import listings
 from evaweb.results.presentation.citation import HEAD, Citation, citation
 from evaweb.results.presentation.integrity import delays_banner, integrity_document, too_few_text
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings.automatic import judges_ready, request_judging
 from evaweb.results.ratings.result_visibility import (
     has_results,
@@ -84,10 +82,8 @@ def compare(request: HttpRequest, name: str, version: int) -> HttpResponse:
     if sealed:
         return sealed
     try:
-        only = parse_filter(request.GET, caching.cached_runs(found).outcomes)
-        context = pages.comparison_page(
-            found, only, request.GET.get("first", ""), request.GET.get("second", "")
-        )
+        result = PlanResult(found).select(request.GET)
+        context = pages.comparison_page(result, request.GET.get("first", ""), request.GET.get("second", ""))
         context |= pages.pairs_shown(context, pages.pair_view(request.GET))
     except EvaError as fault:
         return _plan_page(request, found, fault)
@@ -101,7 +97,7 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
-    context = {**pages.evidence_page(found), **_common(request, found)}
+    context = {**pages.evidence_page(PlanResult(found)), **_common(request, found)}
     fragment = bool(request.headers.get("HX-Request"))
     return render(request, "results/meter.html" if fragment else "results/evidence.html", context)
 
@@ -113,7 +109,9 @@ def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
     sealed = _sealed_page(request, found)
     if sealed:
         return sealed
-    listing = Listing(request.GET, listings.TRIAL_COLUMNS, listings.trial_filters(found))
+    listing = Listing(
+        request.GET, listings.TRIAL_COLUMNS, listings.trial_filters(PlanResult(found).runs.outcomes)
+    )
     try:
         rows = selectors.trials_of_plan(found, listings.question_of(listing.chosen))
     except EvaError as fault:
@@ -273,21 +271,18 @@ def _plan_page(
     sealed = _sealed_page(request, found, fault, typed)
     if sealed:
         return sealed
+    result = PlanResult(found)
     try:
-        only = parse_filter(request.GET, caching.cached_runs(found).outcomes)
+        result = result.select(request.GET)
     except EvaError as problem:
-        only, fault = parse_filter({}, ()), fault or problem
-    judged = {
-        "agreement": rater_agreement(found),
-        "judges": judge_agreement(found),
-        "preferences": preference_ranking(found),
-    }
-    record = integrity_document(found)
+        fault = fault or problem
     context = {
-        **pages.summary_page(found, only),
-        "banner": delays_banner(record),
-        "remarks": record["remarks"],
-        **judged,
+        **pages.summary_page(result),
+        "banner": delays_banner(result.conduct),
+        "remarks": result.conduct["remarks"],
+        "agreement": result.agreement,
+        "judges": result.judges,
+        "preferences": result.preferences,
         **_common(request, found),
         "fault": fault,
         "typed": typed,

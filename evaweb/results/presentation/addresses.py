@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 from django.urls import reverse
 
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.analysis import Comparison
+from evaweb.results.analysis.comparison import Comparison
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.selectors import TrialQuery
 

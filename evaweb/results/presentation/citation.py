@@ -21,12 +21,12 @@ from evaweb.plans.design import (
     same_blocks,
 )
 from evaweb.plans.models import Plan, PlanState
+from evaweb.results.analysis.wording import format_interval, rate_words
 from evaweb.results.presentation.drawings import rates
 from evaweb.results.presentation.drawings.svg import Drawing, printable
 from evaweb.results.presentation.headline import alpha_text, letters_of, rule_text, sentence_of
 from evaweb.results.presentation.latex import escaped, foreign
 from evaweb.results.presentation.setting import setting_now
-from evaweb.results.presentation.wording import format_interval, rate_words
 from evaweb.statistics.designs import ANYTIME, FIXED, SUCCESS, Block, Design, look_schedule
 from evaweb.statistics.proportions import Proportion, proportion
 from runtime.core.sentences import Pattern

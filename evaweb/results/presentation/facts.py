@@ -3,31 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from evaweb.plans.design import compared
 from evaweb.plans.models import Plan, PrimaryOutcome, StoppingRule
-from evaweb.results.analysis.analysis import Analysis, Comparison, Standing
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.comparison import AnswerContext, Comparison
 from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.analysis.statistic import answer_all
+from evaweb.results.analysis.wording import format_points, undetectable_gain_sentence
 from evaweb.results.presentation.addresses import compare_address
 from evaweb.results.presentation.drawings import rates
-from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.wording import (
-    anytime_text,
-    difference_sentence,
-    evidence_text,
-    format_points,
-    p_words,
-    probability,
-    undetectable_gain_sentence,
-)
-
-_DIFFERENCE = "How much better?"
-_ANYTIME = "How much better, at any time?"
-_SCORE_ANYTIME = "With partial credit, how much at any time?"
-# A small p may also come from different spreads around the same mean.
-_EXCHANGEABLE = "sign flips within pairs, exact: are both exchangeable?"
+from evaweb.results.presentation.plan_result import PlanResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,37 +28,39 @@ class ComparisonFact:
     own: bool = False
 
 
-def primaries_of(plan: Plan, analysis: Analysis) -> list[Comparison]:
-    """Return the planned comparisons for which both checkpoints have trials."""
-    found = (analysis.comparison_of(*names) for names in compared(plan.document or {}))
-    return [one for one in found if one is not None]
-
-
 def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
-    """Return the comparison as one sentence."""
-    one, other = analysis.arm(found.first).success, analysis.arm(found.second).success
-    return difference_sentence(found, one, other, analysis.alpha)
+    """Return the comparison as one sentence that states only the result of the corrected exact test.
+
+    Raises:
+        ValueError: If the comparison is planned and still open: its design decides.
+    """
+    if found.corrected is None:
+        raise ValueError(f"{found.first} and {found.second}: their design decides, which has not ended")
+    better, worse, difference = found.first, found.second, found.difference
+    differs = found.corrected <= analysis.alpha
+    if differs and difference.value < 0:
+        better, worse, difference = worse, better, difference.swapped
+    one, other = analysis.arm(better).success, analysis.arm(worse).success
+    counts = (
+        f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {format_points(difference)}"
+    )
+    if differs:
+        return f"{better} succeeded more often than {worse}: {counts}"
+    return f"No significant difference between {better} and {worse}: {counts}"
 
 
-def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[str, Any]:
+def comparison_facts(result: PlanResult, found: Comparison) -> dict[str, Any]:
     """Return sentence and facts of a comparison; the sentence of a planned one comes from its design."""
+    plan, analysis = result.plan, result.analysis
     names = compared(plan.document or {})
-    planned = headline(plan) if (found.first, found.second) in names else None
-    own = _own_interval(plan) if planned else ""
+    planned = result.headline if (found.first, found.second) in names else None
     return {
         "sentence": planned.sentences[names.index((found.first, found.second))]
         if planned
         else comparison_sentence(analysis, found),
         "headline": planned,
         "names": f"{found.first} and {found.second}",
-        "facts": [
-            replace(fact, own=fact.question == own)
-            for fact in (
-                *_of_the_rates(plan, analysis, found),
-                *_of_the_evidence(found),
-                *_later_facts(found),
-            )
-        ],
+        "facts": list(_facts(result, found, _own_interval(plan) if planned else "")),
         "standing": found.standing.name.lower(),
         "notes": found.notes,
         "reversed": bool(found.stratified and found.stratified.reversed),
@@ -80,92 +70,22 @@ def comparison_facts(plan: Plan, analysis: Analysis, found: Comparison) -> dict[
     }
 
 
+def _facts(result: PlanResult, found: Comparison, own: str) -> Iterator[ComparisonFact]:
+    context = AnswerContext(
+        fixed=result.plan.stopping == StoppingRule.NONE, several=len(result.analysis.comparisons) > 1
+    )
+    for name, answer in answer_all(found, context):
+        yield ComparisonFact(*answer, name == own)
+
+
 def _own_interval(plan: Plan) -> str:
-    """Return the question that the interval of the plan's design answers; a boundary's is shown below the
-    headline instead.
+    """Return the statistic that is the interval of the plan's design; a boundary's is shown below the headline
+    instead.
     """
     by_score = (plan.document or {}).get("stopping", {}).get("outcome") == PrimaryOutcome.SCORE
     if plan.stopping == StoppingRule.EVIDENCE:
-        return _SCORE_ANYTIME if by_score else _ANYTIME
-    return _DIFFERENCE if plan.stopping == StoppingRule.NONE and not by_score else ""
-
-
-def _of_the_rates(plan: Plan, analysis: Analysis, found: Comparison) -> Iterator[ComparisonFact]:
-    fixed = "n as planned" if plan.stopping == StoppingRule.NONE else "as if n had been fixed"
-    yield ComparisonFact(_DIFFERENCE, "Newcombe, 95 %", format_points(found.difference))
-    if found.test and found.corrected is not None:
-        corrected = f", Holm {probability(found.corrected)}" if len(analysis.comparisons) > 1 else ""
-        chance = f"{p_words(found.test.p)}{corrected}"
-        yield ComparisonFact("Could it be chance?", f"Barnard, two-sided, {fixed}", chance)
-    if found.paired:
-        split = (
-            f"only {found.first} {found.paired.first_only}, only {found.second} {found.paired.second_only}"
-        )
-        of_pairs = f"{p_words(found.paired.p)} of {found.pairs} pairs ({split})"
-        yield ComparisonFact("The same, pair by pair?", "McNemar, exact", of_pairs)
-    if found.scored:
-        gain = f"{100 * found.scored.value:+.0f} points".replace("-", "−")
-        of_scores = f"{gain} of the score, {p_words(found.scored.p)} of {found.pairs} pairs"
-        yield ComparisonFact("With partial credit, n as planned?", _EXCHANGEABLE, of_scores)
-    if found.clustered:
-        yield ComparisonFact(
-            "Other initial conditions?",
-            "conditions as a sample, Gaffke, 95 %",
-            format_points(found.clustered),
-        )
-
-
-def _of_the_evidence(found: Comparison) -> Iterator[ComparisonFact]:
-    if found.evidence:
-        yield ComparisonFact(
-            "Enough evidence to stop?", f"e-process, alpha {found.alpha:.2g}", evidence_text(found.evidence)
-        )
-    if found.score_evidence:
-        yield ComparisonFact(
-            "With partial credit, at any time?",
-            "betting e-process on scores",
-            evidence_text(found.score_evidence),
-        )
-    for question, interval in (
-        ()
-        if found.standing is Standing.OPEN
-        else (
-            (_ANYTIME, found.anytime),
-            (_SCORE_ANYTIME, found.score_anytime),
-        )
-    ):
-        how = f"confidence sequence, {100 * (1 - found.alpha):.3g} %"
-        yield ComparisonFact(question, how, anytime_text(interval, found.pairs))
-
-
-def _later_facts(found: Comparison) -> Iterator[ComparisonFact]:
-    if found.stratified:
-        odds = found.stratified.odds_ratio
-        ratio = "without bound" if odds is None else f"{odds:.2g}"
-        points_over = f"{100 * found.stratified.stratified:+.0f} points".replace("-", "−")
-        chance = probability(found.stratified.p)
-        yield ComparisonFact(
-            "Over scenes?", "Mantel-Haenszel", f"{points_over}, odds ratio {ratio}, p = {chance}"
-        )
-    for name, within in found.within.items():
-        over = f"{p_words(within.p)} over {within.strata} {name}s"
-        yield ComparisonFact(f"The same within {name}s?", "exact, conditional", over)
-    if found.scenes:
-        by_scene = "; ".join(
-            f"{name} {format_points(difference)}" for name, difference in found.scenes.items()
-        )
-        chance = "too many ways to count" if found.interaction is None else p_words(found.interaction)
-        told = by_scene if found.standing is Standing.OPEN else f"{chance}: {by_scene}"
-        yield ComparisonFact("Does it depend on the scene?", "interaction, Zelen, exact", told)
-    if found.time_test:
-        ahead = found.first if found.time_test.value < 0 else found.second
-        by = f"{abs(found.time_test.value):.1f} s"
-        lead = f"{ahead} by {by}, failures counted in full" if found.time_test.value else "neither"
-        of_times = f"{lead}, {p_words(found.time_test.p)} of {found.time_test.pairs} pairs"
-        yield ComparisonFact("Which is faster?", _EXCHANGEABLE, of_times)
-    if found.better is not None:
-        believed = f"{found.first} is better with probability {_chance(found.better)}"
-        yield ComparisonFact("Bayesian view", "uniform priors", believed)
+        return "score_anytime" if by_score else "anytime"
+    return "difference" if plan.stopping == StoppingRule.NONE and not by_score else ""
 
 
 def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> str:
@@ -175,7 +95,3 @@ def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> st
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)
     compared = analysis.comparisons if found is None else (found,)
     return undetectable_gain_sentence(n, rate, max((one.alpha for one in compared), default=analysis.alpha))
-
-
-def _chance(p: float) -> str:
-    return "above 0.999" if p > 0.999 else "below 0.001" if p < 0.001 else f"{p:.3f}"

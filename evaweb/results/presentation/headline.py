@@ -10,17 +10,15 @@ from evaweb.plans.design import (
     Names,
     Tried,
     arms_of,
+    blocks_that_count,
     compared,
-    current_pairs,
     frozen_design,
     same_blocks,
-    stored_blocks,
     visible_close_reason,
 )
 from evaweb.plans.models import Plan, PlanState
-from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.wording import format_points, p_words
 from evaweb.results.presentation.setting import setting_of
-from evaweb.results.presentation.wording import format_points, p_words
 from evaweb.statistics.designs import (
     FIXED,
     SUCCESS,
@@ -103,33 +101,26 @@ class Headline:
             )
         return tuple(found)
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """Headline as JSON."""
+        return {**asdict(self), "letters": dict(self.letters), "caveats": list(self.caveats)}
 
-def headline(plan: Plan) -> Headline | None:
-    """Return the headline of a frozen plan; None if it has no comparison."""
-    found = frozen_design(plan.document) if plan.document else None
-    if found is None:
-        return None
-    now = current_pairs(plan)
-    kept = stored_blocks(plan)
-    at_reveal = now.counted if kept is None else kept
+
+def conclude(plan: Plan, found: Design, now: Tried, decided: Sequence[Block]) -> Headline:
+    """Return the headline of a plan with the design `found` from the blocks that count, `decided`."""
     return Headline(
-        sentences_of(plan, found, at_reveal),
+        sentences_of(plan, found, decided),
         f"{rule_text(plan)}, {alpha_text(found)}",
-        _other(plan, found, now.counted, at_reveal),
-        _other(plan, found, now.at_first, at_reveal),
-        ". ".join(told.sentence for told in in_the_worst_case(plan, found, at_reveal, now)),
-        tuple(_estimates(plan, found, at_reveal)),
+        _other(plan, found, now.counted, decided),
+        _other(plan, found, now.at_first, decided),
+        ". ".join(told.sentence for told in in_the_worst_case(plan, found, decided, now)),
+        tuple(_estimates(plan, found, decided)),
         _versions(plan),
-        letters_of(plan, found, at_reveal),
-        best_of(plan, found, at_reveal),
+        letters_of(plan, found, decided),
+        best_of(plan, found, decided),
         setting_of(plan),
     )
-
-
-def headline_document(plan: Plan) -> dict[str, Any] | None:
-    """Return the headline as JSON; None if the plan has no comparison."""
-    said = headline(plan)
-    return said and {**asdict(said), "letters": dict(said.letters), "caveats": list(said.caveats)}
 
 
 def alpha_text(found: Design) -> str:
@@ -137,18 +128,6 @@ def alpha_text(found: Design) -> str:
     several = len(found.comparisons)
     how = "Holm over" if found.holm and found.rule == FIXED and found.margin is None else "shared by"
     return f"alpha {found.alpha:g}" + (f", {how} {several} comparisons" if several > 1 else "")
-
-
-def with_planned_letters(plan: Plan, analysis: Analysis) -> Analysis:
-    """Return the analysis with the letters of the plan's design, if it compared all checkpoints with each other.
-
-    Letters of checkpoints whose trials are filtered out are omitted.
-    """
-    said = headline(plan) if len(compared(plan.document or {})) > 2 else None
-    if said is None or not said.letters:
-        return analysis
-    there = {arm.checkpoint for arm in analysis.arms}
-    return replace(analysis, letters={name: letter for name, letter in said.letters if name in there})
 
 
 def rule_text(plan: Plan) -> str:
@@ -277,9 +256,9 @@ def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Seque
     return f"{words}, after {one.ended_at_pair} of {found.blocks} {found.unit}"
 
 
-def _other(plan: Plan, found: Design, blocks: Sequence[Block], at_reveal: Sequence[Block]) -> str:
+def _other(plan: Plan, found: Design, blocks: Sequence[Block], decided: Sequence[Block]) -> str:
     """Return the sentence from these blocks; "" if they are the same."""
-    return "" if same_blocks(blocks, at_reveal) else sentence_of(plan, found, blocks)
+    return "" if same_blocks(blocks, decided) else sentence_of(plan, found, blocks)
 
 
 def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[str]:
@@ -359,8 +338,7 @@ def _versions(plan: Plan) -> tuple[str, ...]:
     while version is not None:
         found = frozen_design(version.document) if version.document else None
         if found is not None:
-            kept = stored_blocks(version)
-            sentence = sentence_of(version, found, current_pairs(version).counted if kept is None else kept)
+            sentence = sentence_of(version, found, blocks_that_count(version))
             told.append(f"Version {version.version}: {sentence}. Amended because: {_amended(version)}")
         version = version.amends
     return tuple(told)

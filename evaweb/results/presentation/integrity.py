@@ -9,8 +9,8 @@ from typing import Any
 from evaweb.plans.models import Plan
 from evaweb.results.analysis.conduct import all_attempts, bench_images, plan_conduct
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT
+from evaweb.results.analysis.wording import p_words
 from evaweb.results.presentation.alternatives import headline_alternatives
-from evaweb.results.presentation.wording import p_words
 from evaweb.trials.endings import ENDINGS, ESTOP, INTERRUPTION
 
 _RARE = 0.05  # probability at or below which an anchor counts as drifting

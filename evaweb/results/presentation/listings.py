@@ -9,14 +9,14 @@ from typing import Any
 from django.urls import reverse
 
 from evaweb.episodes.models import Episode
-from evaweb.plans.models import Plan, PlanState
-from evaweb.results.analysis import caching
-from evaweb.results.analysis.analysis import Analysis, Arm
-from evaweb.results.analysis.filters import TrialFilter, filter_choices
+from evaweb.plans.models import PlanState
+from evaweb.results.analysis.analysis import Analysis
+from evaweb.results.analysis.arm import COLUMNS, Arm
+from evaweb.results.analysis.filters import filter_choices
 from evaweb.results.analysis.outcomes import Outcome, Pair
 from evaweb.results.presentation.addresses import side_by_side_url, trials_address
 from evaweb.results.presentation.drawings import conditions
-from evaweb.results.presentation.wording import format_interval
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings.footage import is_watchable
 from evaweb.results.selectors import TrialQuery
 from evaweb.serving.lists import (
@@ -25,12 +25,10 @@ from evaweb.serving.lists import (
     Column,
     Filter,
 )
-from evaweb.statistics.bounded import BoundedMean
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials.failure_text import UNSPECIFIED
 from evaweb.trials.failures import FIELDS
 from evaweb.trials.models import Trial, TrialStatus
-from evaweb.trials.rate_bars import average_text
 
 MOST_PAIRS = 200
 
@@ -44,39 +42,32 @@ class Row:
     address: str
 
 
-def arm_rows(plan: Plan, analysis: Analysis, only: TrialFilter) -> list[dict[str, Any]]:
+def arm_rows(result: PlanResult) -> list[dict[str, Any]]:
     """Return the table of checkpoints, best first, each with its result after later corrections of scores."""
-    corrected = caching.corrected_of(plan, only)
+    plan, only, analysis = result.plan, result.only, result.analysis
     return [
         {
             "arm": arm,
-            "corrected": corrected.get(arm.checkpoint),
+            "corrected": result.corrected.get(arm.checkpoint),
             "letters": analysis.letters.get(arm.checkpoint, ""),
             "address": trials_address(plan, only, checkpoint=arm.checkpoint),
             "successes": trials_address(plan, only, checkpoint=arm.checkpoint, success="yes"),
-            "exact": format_interval(arm.exact) if arm.exact else "",
-            "score": _mean(arm.score),
-            "macro": _mean(arm.macro),
-            "time": _time(arm),
-            "speed": arm.speed
-            and f"{arm.speed.per_hour:.1f} [{arm.speed.interval.low:.1f}, {arm.speed.interval.high:.1f}]",
-            "between": _between(arm),
-            "smoothness": average_text(arm.smoothness, arm.success.n),
-            "commanded": average_text(arm.commanded, arm.success.n),
+            "cells": [(name, column, column.text(arm, name)) for name, column in COLUMNS.items()],
+            "commanded": COLUMNS["commanded"].text(arm, "commanded"),
         }
         for arm in analysis.arms
     ]
 
 
-def scene_rows(plan: Plan, analysis: Analysis, scene: str, only: TrialFilter) -> list[Row]:
+def scene_rows(result: PlanResult, scene: str) -> list[Row]:
     """Return the rows of the checkpoints on one scene."""
     return [
         Row(
             arm.checkpoint,
             arm.scenes[scene],
-            trials_address(plan, only, checkpoint=arm.checkpoint, scene=scene),
+            trials_address(result.plan, result.only, checkpoint=arm.checkpoint, scene=scene),
         )
-        for arm in analysis.arms
+        for arm in result.analysis.arms
         if scene in arm.scenes
     ]
 
@@ -184,9 +175,8 @@ def trial_row(trial: Trial) -> dict[str, Any]:
     }
 
 
-def trial_filters(plan: Plan) -> list[Filter]:
-    """Return the filters of the list of trials; `TrialQuery` rejects unknown values."""
-    runs = caching.cached_runs(plan).outcomes
+def trial_filters(runs: Sequence[Outcome]) -> list[Filter]:
+    """Return the filters of the list of these trials; `TrialQuery` rejects unknown values."""
     failed = [run for run in runs if not run.success]
     values = {
         **filter_choices(runs),
@@ -277,25 +267,3 @@ PLAN_COLUMNS = (
     Column("owner", "Owner", ("owner__username",), lambda row: row.plan.owner.get_username()),
     Column("frozen", "Frozen", ("frozen_at",), lambda row: row.plan.frozen_at, down=True),
 )
-
-
-def _mean(found: BoundedMean) -> str:
-    return f"{100 * found.value:.0f} % [{format_interval(found.interval)}]"
-
-
-def _time(arm: Arm) -> str:
-    if arm.mean_time is None:
-        return ""
-    mean = arm.mean_time
-    return f"{mean.value:.1f} s [{mean.interval.low:.1f}, {mean.interval.high:.1f}], up to {mean.until:.0f} s"
-
-
-def _between(arm: Arm) -> str:
-    found = arm.interventions
-    if found is None:
-        return ""
-    low = f"{found.mean_time_interval.low / 60:.0f}"
-    if found.mean_time is None:
-        return f"none in {found.exposure / 3600:.1f} h, at least {low} min"
-    high = found.mean_time_interval.high
-    return f"{found.mean_time / 60:.0f} min [{low}, {high / 60:.0f}]"

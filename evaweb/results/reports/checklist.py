@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 from django.db.models import Count, F, Min
 
-from evaweb.plans.design import compared, findings_of
+from evaweb.plans.design import compared
 from evaweb.plans.models import Allocation, Plan
 from evaweb.plans.schedule import IMBALANCE
 from evaweb.results.analysis.analysis import Analysis
 from evaweb.results.analysis.conduct import looked_behind
 from evaweb.results.analysis.integrity import CATEGORY, VERDICT, with_changes
 from evaweb.results.models import Rating
+from evaweb.results.presentation.plan_result import PlanResult
+from evaweb.statistics.designs import findings
 from evaweb.trials.models import Score, Trial, TrialStatus
 
 
@@ -26,8 +28,9 @@ class Item:
     record: str
 
 
-def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
+def checklist(result: PlanResult) -> list[Item]:
     """Return all items of the checklist."""
+    plan, analysis = result.plan, result.analysis
     trials = Trial.objects.filter(evaluation=plan.evaluation_id)
     return [
         _preregistration(plan, trials),
@@ -35,7 +38,7 @@ def checklist(plan: Plan, analysis: Analysis) -> list[Item]:
         _versions(plan),
         _order(plan),
         _blind(plan),
-        _complete(plan, trials),
+        _complete(result, trials),
         _voids(plan, trials),
         _corrections(plan),
         _second_rater(plan, trials),
@@ -112,11 +115,12 @@ def _blind(plan: Plan) -> Item:
     return Item("Operators blind", "partly" if looked else "yes", f"a fresh code for every trial; {words}")
 
 
-def _complete(plan: Plan, trials) -> Item:  # type: ignore[no-untyped-def]
+def _complete(result: PlanResult, trials) -> Item:  # type: ignore[no-untyped-def]
+    plan = result.plan
     foreseen, counted = plan.slots.count(), trials.filter(status=TrialStatus.SCORED).count()
     rule = plan.get_stopping_display()
-    conclusion = findings_of(plan)
-    kept = "yes" if counted == foreseen or (conclusion is not None and conclusion.ended) else "partly"
+    ended = result.design is not None and findings(result.design, result.blocks).ended
+    kept = "yes" if counted == foreseen or ended else "partly"
     closed = f"; closed because: {plan.closed_because}" if plan.closed_because else ""
     return Item(
         "As many trials as planned, or a rule to stop",

@@ -17,21 +17,18 @@ from django.utils import timezone
 from evaweb.core.errors import EvaError
 from evaweb.core.tabular_export import iter_csv
 from evaweb.plans.counting import ENDS, declared_failures
-from evaweb.plans.design import blocks_that_count, compared, frozen_design
+from evaweb.plans.design import compared
 from evaweb.plans.models import CountsAs, Plan, PlanState
-from evaweb.results.analysis import caching
-from evaweb.results.analysis.agreement import judge_agreement, preference_ranking, rater_agreement
-from evaweb.results.analysis.analysis import Analysis
-from evaweb.results.analysis.filters import TrialFilter
+from evaweb.results.analysis.arm import COLUMNS as ARM_COLUMNS
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.presentation import facts, listings
-from evaweb.results.presentation.drawings import conditions, rates, time_courses
-from evaweb.results.presentation.headline import headline, with_planned_letters
-from evaweb.results.presentation.integrity import delays_banner, integrity_document
+from evaweb.results.presentation.drawings import time_courses
+from evaweb.results.presentation.figures import draw_arms
+from evaweb.results.presentation.integrity import delays_banner
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.setting import setting_of
 from evaweb.results.reports import bench_photos as laid_out
 from evaweb.results.reports.checklist import checklist
-from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.tables import COLUMNS, JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.statistics.designs import estimated, findings
 from evaweb.statistics.difference import Difference
@@ -74,15 +71,14 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
         raise EvaError(_NOT_EMPTY_NAME_NEW_FOLDER(out=out))
     if plan.state == PlanState.DRAFT:
         raise EvaError(_DRAFT_THERE_NOTHING_REPORT_BEFORE(plan=plan))
-    analysis = with_planned_letters(plan, caching.cached_analysis(plan))
+    result = PlanResult(plan)
     data = out / "data"
     data.mkdir(parents=True, exist_ok=True)
     _json(data / "plan.json", plan.document or {})
     _json(data / "seal.json", plan_seal(plan))
-    _json(data / "numbers.json", report_numbers(plan, analysis))
-    record = integrity_document(plan)
-    _json(data / "integrity.json", record)
-    _csv(data / "trials.csv", list(COLUMNS), outcome_pages(plan))
+    _json(data / "numbers.json", report_numbers(result))
+    _json(data / "integrity.json", result.conduct)
+    _csv(data / "trials.csv", list(COLUMNS), outcome_pages(result))
     _csv(data / "scores.csv", SCORE_COLUMNS, score_pages(plan))
     for name, (columns, rows) in JUDGED.items():
         _csv(data / f"{name}.csv", columns, iter([rows(plan)]))
@@ -91,10 +87,11 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     shutil.copytree(_PROGRAM, out / "recompute", ignore=shutil.ignore_patterns("__pycache__"))
     (out / "recompute" / "page.css").write_text(_styles(), "utf-8")
     page = out / "index.html"
-    told = {"record": record, "banner": delays_banner(record), "most": MOST_LINES}
     context = {
-        **report_context(plan, analysis),
-        **told,
+        **report_context(result),
+        "record": result.conduct,
+        "banner": delays_banner(result.conduct),
+        "most": MOST_LINES,
         "benches": _bench_images(plan, data / "pictures"),
         "left": left,
     }
@@ -102,25 +99,24 @@ def write_report(plan: Plan, out: Path, *, most_pictures: int | None = None) -> 
     return page
 
 
-def report_numbers(plan: Plan, analysis: Analysis) -> dict[str, Any]:
+def report_numbers(result: PlanResult) -> dict[str, Any]:
     """Return every number of the report that the program recomputes."""
-    preferred = preference_ranking(plan)
+    preferred = result.preferences
     words = ("reason", "groups")
     return {
-        **analysis_document(analysis),
-        "planned": planned_document(plan),
-        "agreement": rater_agreement(plan),
-        "judges": judge_agreement(plan),
+        **result.analysis.document,
+        "planned": planned_document(result),
+        "agreement": result.agreement,
+        "judges": result.judges,
         "preferences": preferred and {name: value for name, value in preferred.items() if name not in words},
     }
 
 
-def planned_document(plan: Plan) -> list[dict[str, Any]]:
+def planned_document(result: PlanResult) -> list[dict[str, Any]]:
     """Return the conclusion of the plan's design for each comparison."""
-    found = frozen_design(plan.document) if plan.document else None
+    found, blocks = result.design, result.blocks
     if found is None:
         return []
-    blocks = blocks_that_count(plan)
     return [
         {
             "first": names[0],
@@ -132,7 +128,7 @@ def planned_document(plan: Plan) -> list[dict[str, Any]]:
             "estimate": _estimate(estimated(found, blocks, pair, one)),
         }
         for names, pair, one in zip(
-            compared(plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True
+            compared(result.plan.document or {}), found.comparisons, findings(found, blocks).each, strict=True
         )
     ]
 
@@ -152,13 +148,10 @@ def plan_seal(plan: Plan) -> dict[str, Any]:
     }
 
 
-def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
+def report_context(result: PlanResult) -> dict[str, Any]:
     """Return the context of the report's page; its figures have no links, because the report has no other pages."""
-    arms = analysis.arms
-    order = {arm.checkpoint: arm.series for arm in arms}
-    primaries = facts.primaries_of(plan, analysis)
-    scenes = sorted({name for arm in arms for name in arm.scenes})
-    runs = caching.cached_runs(plan)
+    plan, analysis = result.plan, result.analysis
+    primaries, order = result.primaries, {arm.checkpoint: arm.series for arm in analysis.arms}
     return {
         "plan": plan,
         "document": plan.document,
@@ -169,31 +162,16 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
         "setting": setting_of(plan),
         "ends": _ends(plan.document or {}),
         "changes": checkpoint_changes(plan),
-        "headline": headline(plan),
-        "primaries": [facts.comparison_facts(plan, analysis, found) for found in primaries],
-        "table": listings.arm_rows(plan, analysis, TrialFilter()),
+        "headline": result.headline,
+        "primaries": [facts.comparison_facts(result, found) for found in primaries],
+        "columns": ARM_COLUMNS,
+        "table": listings.arm_rows(result),
         "others": [
             (found, facts.comparison_sentence(analysis, found))
             for found in analysis.comparisons
             if found not in primaries
         ],
-        "intervals": rates.draw_intervals(
-            "Success rates", [(a.checkpoint, a.success, "") for a in arms], order
-        )
-        if arms
-        else None,
-        "violins": rates.draw_violins(arms, analysis.letters) if arms else None,
-        "funnels": [
-            time_courses.draw_funnel(
-                scene,
-                [(a.series, a.checkpoint, f) for a in arms for f in a.funnels if f.scene == scene],
-                {},
-            )
-            for scene in scenes
-            if any(f.scene == scene for a in arms for f in a.funnels)
-        ],
-        "success_times": time_courses.draw_success_times(arms),
-        "grid": conditions.draw_grid(arms, {}),
+        **draw_arms(analysis.arms, analysis.letters, lambda **named: "", mixed=True),
         "failures": listings.failure_tables(analysis, ordered_terms(), lambda **named: ""),
         "evidence": [
             time_courses.draw_evidence(
@@ -205,11 +183,11 @@ def report_context(plan: Plan, analysis: Analysis) -> dict[str, Any]:
             for found in primaries
             if found.pairs and found.evidence
         ],
-        "agreement": rater_agreement(plan),
-        "judges": judge_agreement(plan),
-        "preferences": preference_ranking(plan),
-        "checklist": checklist(plan, analysis),
-        "runs": runs.outcomes,
+        "agreement": result.agreement,
+        "judges": result.judges,
+        "preferences": result.preferences,
+        "checklist": checklist(result),
+        "runs": result.runs.outcomes,
         "declared": declared_failures(plan),
     }
 

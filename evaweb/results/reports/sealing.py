@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -11,9 +11,7 @@ from evaweb.core.canonical_json import digest
 from evaweb.core.tabular_export import plain
 from evaweb.plans.design import register_reveal_data
 from evaweb.plans.models import Plan
-from evaweb.results.presentation.caveats import caveats_of
-from evaweb.results.presentation.headline import headline
-from evaweb.results.presentation.integrity import integrity_document
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.presentation.setting import setting_now
 from evaweb.results.reports.tables import JUDGED, SCORE_COLUMNS, outcome_pages, score_pages
 from evaweb.trials.models import TrialStatus
@@ -30,21 +28,21 @@ LOOKED_AT = ("smoothness", "smoothness_commanded")  # computed from a recording 
 
 def record_to_seal(plan: Plan) -> dict[str, Any]:
     """Return headline, setting and caveats as texts, and digests of attempts, scores, measurements and judgements."""
-    said = headline(plan)
+    result = PlanResult(plan)
+    rows = [row for page in outcome_pages(result) for row in page]
     return {
-        "headline": list(said.all_sentences) if said else [],
-        "caveats": caveats_of(plan),
+        "headline": list(result.headline.all_sentences) if result.headline else [],
+        "caveats": result.caveats,
         "setting": setting_now(plan),
-        "record": digest({"attempts": list(_attempts(plan)), "scores": list(_scores(plan))}),
-        "measured": _measured(plan),
+        "record": digest({"attempts": list(_attempts(rows)), "scores": list(_scores(plan))}),
+        "measured": _measured(rows),
         "judged": digest(_judged(plan)),
-        "conduct": digest(_conduct(plan)),
+        "conduct": digest(_conduct(result)),
     }
 
 
-def _measured(plan: Plan) -> dict[str, Any]:
+def _measured(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the digest of each run's measurements; `later` are trials whose recording has not been analysed yet."""
-    rows = [row for page in outcome_pages(plan) for row in page]
     later = [row["trial"] for row in rows if any(row[name] is None for name in LOOKED_AT)]
     values = [
         [
@@ -63,21 +61,19 @@ def _judged(plan: Plan) -> dict[str, list[list[str]]]:
     }
 
 
-def _conduct(plan: Plan) -> dict[str, Any]:
+def _conduct(result: PlanResult) -> dict[str, Any]:
     """Return the parts of the integrity document that later corrections do not change, as JSON."""
-    record = integrity_document(plan)
     found: dict[str, Any] = json.loads(
-        json.dumps({name: record[name] for name in STAYS}, default=datetime.isoformat)
+        json.dumps({name: result.conduct[name] for name in STAYS}, default=datetime.isoformat)
     )
     return found
 
 
-def _attempts(plan: Plan) -> Iterator[list[str]]:
+def _attempts(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
     """Yield the attempts with the reasons of voids; other reasons may change when an attempt is scored later."""
-    for page in outcome_pages(plan):
-        for row in page:
-            voided = row["status"] == TrialStatus.VOIDED
-            yield [*(plain(row[name]) for name in ATTEMPT), row["reason"] if voided else ""]
+    for row in rows:
+        voided = row["status"] == TrialStatus.VOIDED
+        yield [*(plain(row[name]) for name in ATTEMPT), row["reason"] if voided else ""]
 
 
 def _scores(plan: Plan) -> Iterator[list[str]]:

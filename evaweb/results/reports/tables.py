@@ -13,9 +13,8 @@ from django.db.models import QuerySet
 from evaweb.core.tabular_export import in_pages
 from evaweb.plans.counting import end_of
 from evaweb.plans.models import Plan
-from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.models import Judgement, Rating
-from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.trials.models import MilestoneOutcome, Score, Trial, TrialStatus
 from evaweb.trials.record import COLUMNS as RECORDED
 from evaweb.trials.record import HINTS, TrialRecord
@@ -74,46 +73,39 @@ SCORE_COLUMNS = (
 PAGE = 1000
 
 
-def outcome_pages(
-    plan: Plan, which: TrialFilter | None = None, size: int = PAGE
-) -> Iterator[list[dict[str, Any]]]:
+def outcome_pages(result: PlanResult, size: int = PAGE) -> Iterator[list[dict[str, Any]]]:
     """Yield the selected attempts in order of allocation, in pages."""
-    rows, last, said = _attempts(plan, which), 0, _headline(plan)
-    while page := _rows(said, rows.filter(handout__number__gt=last)[:size]):
+    rows, last = _attempts(result), 0
+    while page := _rows(result, rows.filter(handout__number__gt=last)[:size]):
         yield page
         last = page[-1]["order"]
 
 
-def outcome_page(plan: Plan, which: TrialFilter | None, offset: int, limit: int) -> dict[str, Any]:
-    """Return one page of the attempts, and their total number."""
-    rows = _attempts(plan, which)
+def outcome_page(result: PlanResult, offset: int, limit: int) -> dict[str, Any]:
+    """Return one page of the selected attempts, and their total number."""
+    rows = _attempts(result)
     return {
         "total": rows.count(),
         "limit": limit,
         "offset": offset,
-        "items": _rows(_headline(plan), rows[offset : offset + limit]),
+        "items": _rows(result, rows[offset : offset + limit]),
     }
 
 
-def _attempts(plan: Plan, which: TrialFilter | None) -> QuerySet[Trial]:
-    only = which or TrialFilter()
+def _attempts(result: PlanResult) -> QuerySet[Trial]:
+    only = result.only
     wanted = {
         "scene__name": only.scene,
         "position__number": only.position,
         "station__name": only.station,
         "operator__username": only.operator,
     }
-    rows = Trial.objects.filter(evaluation=plan.evaluation_id, handout__isnull=False)
+    rows = Trial.objects.filter(evaluation=result.plan.evaluation_id, handout__isnull=False)
     return rows.filter(**{name: value for name, value in wanted.items() if value}).order_by("handout__number")
 
 
-def _headline(plan: Plan) -> str:
-    said = headline(plan)
-    return said.sentence if said else ""
-
-
-def _rows(said: str, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
-    found = []
+def _rows(result: PlanResult, attempts: QuerySet[Trial]) -> list[dict[str, Any]]:
+    said, found = result.headline.sentence if result.headline else "", []
     for *row, kept, recording, frames in attempts.values_list(
         *_FIELDS, "ended_by", "episode__status", "episode__frames"
     ):

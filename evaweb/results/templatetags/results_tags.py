@@ -13,9 +13,9 @@ from django.utils.safestring import SafeString
 
 from evaweb.plans.design import visible_close_reason
 from evaweb.plans.models import Plan, PlanState, StoppingRule
+from evaweb.results.analysis import wording
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.analysis.outcomes import Outcome
-from evaweb.results.presentation import wording
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.proportions import Proportion
 

@@ -10,6 +10,7 @@ from django import template
 from evaweb.statistics.means import Average
 from evaweb.statistics.proportions import Proportion
 from evaweb.trials import rate_bars
+from evaweb.trials.average_text import average_text
 from evaweb.trials.lifecycle import advice
 from evaweb.trials.models import Evaluation, TrialStatus
 
@@ -58,7 +59,7 @@ def interval(found: Proportion) -> str:
 @register.filter
 def mean_with_interval(found: Average | None, of: int) -> str:
     """Return a mean with its interval and count; a dash if there is none."""
-    return rate_bars.average_text(found, of) or "–"
+    return average_text(found, of) or "–"
 
 
 @register.filter

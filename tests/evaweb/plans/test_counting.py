@@ -11,6 +11,7 @@ from evaweb.plans.draft_checks import problems
 from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan
 from evaweb.plans.toml_exchange import export_toml, import_file
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.reports.recompute.scenes import ending_faults, scene_faults
 from evaweb.results.reports.tables import outcome_pages, score_pages
 from evaweb.trials import services, voids
@@ -108,7 +109,7 @@ def test_exports_say_what_ended_each_run_and_the_reports_program_holds_it_agains
     scored(bench, ended(bench, plan, TIME, "ended"), True)
     scored(bench, ended(bench, plan, "stopped by the operator", "ended"), True)
     voids.void_trial(user=bench.operator, trial=ended(bench, plan, FAULT), reason="the e-stop box fell on it")
-    (page,) = outcome_pages(plan)
+    (page,) = outcome_pages(PlanResult(plan))
     assert [row["ended_by"] for row in page] == ["estop", "timeout", "", ""]
     rows = [{name: plain(value) for name, value in row.items()} for row in page]
     assert ending_faults(plan.document, rows) == []

@@ -15,7 +15,7 @@ from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_pl
 from evaweb.results.analysis.caching import cached_analysis, corrected_of
 from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.presentation.alternatives import headline_alternatives
-from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.stations.models import Station
 from evaweb.statistics.designs import evaluate_design, in_blocks
 from evaweb.trials import services as trials
@@ -197,7 +197,7 @@ def test_all_pairs_made_close_it_too(bench, draft, owner):
     plan = frozen_plan(draft, owner, stopping="late", repetitions=1)
     carry_out(bench, plan, 4)
     assert plan.closed_because == "all pairs of its comparison are made, after 2 pairs"
-    assert headline(plan).sentence.startswith(
+    assert PlanResult(plan).headline.sentence.startswith(
         f"Undecided: 2 pairs cannot tell {BETTER} and pi0-block apart: 2/2"
     )
 
@@ -210,24 +210,24 @@ def test_a_fixed_plan_of_three_makes_all_its_trials_and_says_not_what_they_show(
     assert plan.state == PlanState.FROZEN
     carry_out(bench, plan, 1)
     assert plan.closed_because == "all pairs of its comparison are made, after 8 pairs"
-    assert headline(plan).sentence.startswith(f"{BETTER} succeeded more often")
+    assert PlanResult(plan).headline.sentence.startswith(f"{BETTER} succeeded more often")
 
 
 def test_closed_before_its_design_ended_it_concludes_nothing(bench, draft, owner):
     plan = frozen_plan(draft, owner, stopping="evidence", repetitions=20)
     carry_out(bench, plan, 6)
-    assert headline(plan).sentence.endswith("3 of 40 pairs are made, and the design goes on")
+    assert PlanResult(plan).headline.sentence.endswith("3 of 40 pairs are made, and the design goes on")
     close_plan(user=owner, plan=plan, reason="the gripper broke")
     said = f"{BETTER} and pi0-block were not compared: closed after 3 of 40 pairs, before the design ended"
-    assert headline(plan).sentence == said
+    assert PlanResult(plan).headline.sentence == said
 
 
 def test_a_fixed_number_says_nothing_before_its_end_however_clear_it_is(bench, draft, owner):
     plan = frozen_plan(draft, owner, repetitions=10)
     carry_out(bench, plan, 38)
-    assert "not compared yet: 19 of 20 pairs" in headline(plan).sentence
+    assert "not compared yet: 19 of 20 pairs" in PlanResult(plan).headline.sentence
     carry_out(bench, plan, 2)
-    assert headline(plan).sentence.startswith(
+    assert PlanResult(plan).headline.sentence.startswith(
         f"{BETTER} succeeded more often than pi0-block: 20/20 against 0/20"
     )
 
@@ -235,7 +235,7 @@ def test_a_fixed_number_says_nothing_before_its_end_however_clear_it_is(bench, d
 def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early, owner):
     until_it_ends(bench, early)
     reveal_plan(user=owner, plan=early)
-    before = headline(early)
+    before = PlanResult(early).headline
     assert before.corrected == ""
     apart = ("digest", "at", "by", "commitment", "key")
     held = {name: value for name, value in early.at_reveal.items() if name not in apart}
@@ -244,7 +244,7 @@ def test_what_is_corrected_after_the_reveal_makes_no_other_headline(bench, early
     assert corrected_of(early, TrialFilter()) == {}
     for handout in early.handouts.all():
         scored(bench, handout.trial, success=True, reason="looked again")
-    after = headline(early)
+    after = PlanResult(early).headline
     assert after.sentence == before.sentence
     assert after.corrected.startswith(f"{BETTER} and pi0-block would not be compared yet")
     now = cached_analysis(early)
@@ -263,7 +263,7 @@ def test_what_counts_of_a_plan_that_is_not_blind_is_kept_at_its_close(
     with django_capture_on_commit_callbacks(execute=True):
         carry_out(bench, plan, 8)
     plan.refresh_from_db()
-    kept, said = plan.at_reveal, headline(plan)
+    kept, said = plan.at_reveal, PlanResult(plan).headline
     assert (plan.state, kept["by"], kept["headline"]) == (
         "closed",
         bench.operator.username,
@@ -271,8 +271,8 @@ def test_what_counts_of_a_plan_that_is_not_blind_is_kept_at_its_close(
     )
     trial = next(handout.trial for handout in plan.handouts.all() if handout.trial.checkpoint.name == BETTER)
     scored(bench, trial, success=False, reason="looked again")
-    assert headline(plan).sentence == said.sentence
-    assert "3/4 against 0/4" in headline(plan).corrected
+    assert PlanResult(plan).headline.sentence == said.sentence
+    assert "3/4 against 0/4" in PlanResult(plan).headline.corrected
     plan = reveal_plan(user=owner, plan=plan)
     assert plan.at_reveal == kept
     assert "what counts is that of the close of" in plan.events.get(what="revealed").text
@@ -303,7 +303,7 @@ def test_a_correction_before_the_reveal_is_told_beside_the_headline(bench, draft
     first = next(h.trial for h in plan.handouts.all() if h.trial.checkpoint.name == BETTER)
     scored(bench, first, success=False, reason="it fell later")
     reveal_plan(user=owner, plan=plan)
-    said = headline(plan)
+    said = PlanResult(plan).headline
     assert "7/8 against 0/8" in said.sentence
     assert "8/8 against 0/8" in said.at_first
 
@@ -313,7 +313,7 @@ def test_the_better_one_is_named_first_with_its_numbers(bench, draft, owner):
     draft.first, draft.second = draft.second, draft.first
     plan = frozen_plan(draft, owner, repetitions=4)
     carry_out(bench, plan, 16)
-    said = headline(plan).sentence
+    said = PlanResult(plan).headline.sentence
     assert said.startswith(
         f"{BETTER} succeeded more often than pi0-block: 8/8 against 0/8, difference 100 points ["
     )
@@ -325,10 +325,10 @@ def test_versions_before_it_are_told(bench, draft, owner):
     again = amend_plan(user=owner, plan=plan, reason="another lamp")
     again = freeze_plan(user=owner, plan=again)
     carry_out(bench, again, 16)
-    (told,) = headline(again).versions
+    (told,) = PlanResult(again).headline.versions
     assert told.startswith(f"Version 1: {BETTER} and pi0-block were not compared: closed after 3 of 8 pairs")
     assert told.endswith("Amended because: another lamp")
-    assert headline(plan).versions == ()
+    assert PlanResult(plan).headline.versions == ()
 
 
 @pytest.mark.exhaustive
@@ -347,7 +347,7 @@ def test_a_second_reveal_of_a_database_that_was_put_back_keeps_the_first(bench, 
     reveal_plan(user=owner, plan=plan)
     assert plan.at_reveal == first
     assert "what counts is that of the reveal of" in plan.events.filter(what="revealed").last().text
-    assert "8/8 against 8/8" in headline(plan).corrected
+    assert "8/8 against 8/8" in PlanResult(plan).headline.corrected
 
 
 def test_checkpoints_that_swapped_their_names_run_nothing_and_reveal_nothing(bench, draft, owner):
@@ -376,7 +376,7 @@ def test_not_worse_by_the_margin(bench, draft, owner):
     plan = frozen_plan(draft, owner, stopping="late", margin=0.5, repetitions=8)
     until_it_ends(bench, plan, success=True)
     said = f"{BETTER} is not worse than pi0-block by 50 points or more: "
-    assert headline(plan).sentence.startswith(said)
+    assert PlanResult(plan).headline.sentence.startswith(said)
 
 
 def test_designs_that_cannot_be_are_said_before_the_freeze(draft, owner):
@@ -438,12 +438,12 @@ def test_the_worst_of_what_was_thrown_away_is_held_against_what_the_reveal_kept(
         plan.refresh_from_db()
     reveal_plan(user=owner, plan=plan)
     plan.refresh_from_db()
-    before = headline(plan).worst
+    before = PlanResult(plan).headline.worst
     assert "9/10 against 0/10" in before
     for handout in plan.handouts.filter(slot__checkpoint__name=BETTER, trial__status="scored")[:6]:
         scored(bench, handout.trial, success=False, reason="looked again")
-    assert headline(plan).worst == before
-    assert "4/10 against 0/10" in headline(plan).corrected
+    assert PlanResult(plan).headline.worst == before
+    assert "4/10 against 0/10" in PlanResult(plan).headline.corrected
 
 
 # --- several comparisons, dropped checkpoints, random order ---------------------------------------------------------
@@ -493,7 +493,7 @@ def test_all_checkpoints_are_compared_and_one_that_was_found_worse_is_tried_no_m
     at = sizes.index(2)
     assert all("pi0-block" not in names for block, names in blocks.items() if block >= at)
     assert dropped_of(plan) == {"pi0-block": at}
-    said = headline(plan)
+    said = PlanResult(plan).headline
     first, second, third = said.sentences
     assert first.startswith(f"{BETTER} succeeded more often than pi0-block: {at}/{at} against 0/{at}")
     assert second.endswith("when one of them was dropped")
@@ -502,7 +502,7 @@ def test_all_checkpoints_are_compared_and_one_that_was_found_worse_is_tried_no_m
     assert "shared by 3 comparisons" in said.method
     assert "pi0" not in plan.closed_because
     reveal_plan(user=owner, plan=plan)
-    assert headline(plan).sentences == said.sentences
+    assert PlanResult(plan).headline.sentences == said.sentences
 
 
 def until_one_is_dropped(bench, plan, stations):
@@ -623,7 +623,7 @@ def test_each_checkpoint_is_compared_with_the_first_at_its_share_of_alpha(bench,
         "second" if found.each[0].p <= 0.025 else None,
         "first" if found.each[1].p <= 0.025 else None,
     ]
-    assert headline(plan).letters == ()
+    assert PlanResult(plan).headline.letters == ()
 
 
 @pytest.mark.exhaustive
@@ -642,8 +642,8 @@ def test_checkpoints_in_random_order_are_judged_by_the_numbers_that_were_drawn(b
     assert plan.closed_because == f"a boundary of its design was crossed, after {made // 2} blocks"
     numbers = [row.trial.number for row in plan.handouts.filter(slot__block=0)]
     assert numbers == [1, 2]  # which tells not whether both are of one checkpoint
-    assert headline(plan).sentence.startswith(f"{BETTER} succeeded more often than pi0-block: ")
-    assert headline(plan).sentence.endswith(f"after {made // 2} of 40 blocks")
+    assert PlanResult(plan).headline.sentence.startswith(f"{BETTER} succeeded more often than pi0-block: ")
+    assert PlanResult(plan).headline.sentence.endswith(f"after {made // 2} of 40 blocks")
     again = amend_plan(user=owner, plan=plan, reason="another lamp")
     frozen_plan(again, owner, repetitions=15)
     told = again.events.get(what="frozen").text

@@ -13,9 +13,8 @@ from evaweb.plans.models import CountsAs, Plan
 from evaweb.plans.selectors import overlapping_plans
 from evaweb.plans.services import amend_plan, close_plan, freeze_plan, reveal_plan
 from evaweb.preflights.services import start_preflight
-from evaweb.results.analysis.caching import cached_analysis
-from evaweb.results.presentation.headline import headline
 from evaweb.results.presentation.integrity import integrity_document
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.reporting import report_context
 from evaweb.stations.models import Station
@@ -54,7 +53,7 @@ def ended(bench, plan, by="", frames=375):
 
 
 def practices(plan):
-    return {item.practice: item for item in checklist(plan, cached_analysis(plan))}
+    return {item.practice: item for item in checklist(PlanResult(plan))}
 
 
 @pytest.mark.parametrize("change", [{"active": False}, {"description": "another"}])
@@ -123,7 +122,7 @@ def test_failures_by_the_plan_stand_in_the_record_with_who_pressed(bench, draft,
     assert {(row["counts"], row["reason"].partition(":")[0]) for row in pressed} == {(True, "e-stop by ann")}
     ways = {way["what"]: way for way in record["headline"]}
     assert ways["without failures by the plan's declaration"]["sentence"] == "No pair is left"
-    page = render_to_string("results/report.html", report_context(plan, cached_analysis(plan)))
+    page = render_to_string("results/report.html", report_context(PlanResult(plan)))
     assert page.count("<td>By the plan: ended by the e-stop") == 6
     assert "6 trials are failures by the plan, because of what ended the run" in page
     shown = Client()
@@ -216,9 +215,9 @@ def test_a_first_score_after_the_reveal_makes_no_doubt_about_before(bench, plan,
     late = ended(bench, plan, "interruption")
     close_plan(user=owner, plan=plan, reason="enough")
     reveal_plan(user=owner, plan=plan)
-    before = headline(Plan.objects.get()).caveats
+    before = PlanResult(Plan.objects.get()).headline.caveats
     score(bench, late, True)
-    assert headline(Plan.objects.get()).caveats == before
+    assert PlanResult(Plan.objects.get()).headline.caveats == before
 
 
 def test_the_name_of_an_account_stays(bench):

@@ -28,8 +28,7 @@ from evaweb.lab.simulated import CLUMSY, POLICIES, SKILLED, benches_of, known_po
 from evaweb.lab.single_trial import TrialChoice, report, run_one_trial
 from evaweb.plans.models import Allocation, Plan, StoppingRule
 from evaweb.results.analysis.analysis import Analysis
-from evaweb.results.analysis.caching import cached_analysis
-from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.trials.models import Checkpoint
 from runtime.core.durable_files import write_durably
 
@@ -211,9 +210,9 @@ class Command(BaseCommand):
         with progress.during("the reveal, and what came out"):
             result = plan_runner.close_and_reveal(visitors[1], name, made)
             plan.refresh_from_db()
-            found = cached_analysis(plan)
-        said = headline(plan)
-        result["headline"] = said.sentence if said else ""
+            evaluated = PlanResult(plan)
+            found = evaluated.analysis
+        result["headline"] = evaluated.headline.sentence if evaluated.headline else ""
         result |= {"lockstep": True, "analysis": asdict(found), "wall_s": time.monotonic() - begun}
         if options["json"]:
             options["json"].write_text(json.dumps(to_json_value(result), indent=1), "utf-8")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from evaweb.results.analysis.analysis import Arm
+from evaweb.results.analysis.arm import Arm
+from evaweb.results.analysis.wording import format_interval, rate_words
 from evaweb.results.presentation.drawings.svg import (
     LINE,
     PROPORTION,
@@ -23,7 +24,6 @@ from evaweb.results.presentation.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import format_interval, rate_words
 
 _LABELS = 180
 _LETTERS = 22  # characters per line of a condition or failure

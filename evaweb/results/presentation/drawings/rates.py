@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from evaweb.results.analysis.analysis import Arm, Comparison
+from evaweb.results.analysis.arm import Arm
+from evaweb.results.analysis.comparison import Comparison
+from evaweb.results.analysis.wording import format_points, rate_words
 from evaweb.results.presentation.drawings.svg import (
     LINE,
     PROPORTION,
@@ -23,7 +25,6 @@ from evaweb.results.presentation.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import format_points, rate_words
 from evaweb.statistics.proportions import Proportion
 
 WIDTH = 600

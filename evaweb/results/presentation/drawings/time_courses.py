@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from evaweb.results.analysis.analysis import Arm, Funnel
+from evaweb.results.analysis.arm import Arm, Funnel
+from evaweb.results.analysis.wording import evidence_text, rate_words
 from evaweb.results.presentation.drawings.svg import (
     LINE,
     PROPORTION,
@@ -26,7 +27,6 @@ from evaweb.results.presentation.drawings.svg import (
     words,
     wrapped,
 )
-from evaweb.results.presentation.wording import evidence_text, rate_words
 from evaweb.statistics.proportions import wilson
 from evaweb.statistics.sequential import Evidence
 

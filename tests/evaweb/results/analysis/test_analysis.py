@@ -4,7 +4,8 @@ import sys
 import numpy as np
 import pytest
 
-from evaweb.results.analysis.analysis import Standing, Verdict, analyse
+from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.comparison import Standing, Verdict
 from evaweb.results.analysis.outcomes import Outcome, pair_by_block
 from evaweb.statistics.proportions import clopper_pearson
 

@@ -4,10 +4,9 @@ import pytest
 
 from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.services import close_plan, reveal_plan
-from evaweb.results.analysis.filters import TrialFilter
 from evaweb.results.analysis.integrity import checkpoint_changes
 from evaweb.results.pages.pages import summary_page
-from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.trials import services, voids
 from tests.evaweb.trials import builders
 
@@ -44,7 +43,7 @@ def test_failures_of_one_checkpoint_that_were_voided_are_told_and_what_they_chan
     assert (found[OLD].voided, found[OLD].attempts, found[OLD].counted) == (0, 8, 8)
     assert (found[NEW].attempts, found[NEW].counted) == (8 + voided, 8)
     assert voided in (7, 8)
-    said = headline(plan)
+    said = PlanResult(plan).headline
     assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: {voided}/8 against 0/8")
     assert said.at_first.startswith(f"No significant difference between {NEW} and {OLD}: 0/8 against 0/8")
 
@@ -60,7 +59,7 @@ def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_hav
         else:
             services.abandon_trial(user=bench.operator, trial=thrown)  # it never ran: it cannot have failed
         tried(success=new)
-    said = headline(plan)
+    said = PlanResult(plan).headline
     assert said.sentence.startswith(f"{NEW} succeeded more often than {OLD}: 8/8 against 0/8")
     assert said.worst.startswith(f"No significant difference between {NEW} and {OLD}: 2/8 against 0/8")
     assert said.at_first == ""
@@ -68,7 +67,7 @@ def test_attempts_thrown_away_unscored_are_told_by_the_worst_that_they_could_hav
 
 def test_where_nothing_was_voided_there_is_one_sentence(plan, tried):
     tried(success=True)
-    assert headline(plan).at_first == ""
+    assert PlanResult(plan).headline.at_first == ""
 
 
 def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan, owner, tried):
@@ -89,11 +88,11 @@ def test_corrections_are_told_by_their_direction_and_late_ones_apart(bench, plan
 
 def test_the_page_says_that_the_plan_was_closed_as_soon_as_it_is(plan, owner, tried):
     def sentence():
-        return summary_page(plan, TrialFilter())["headline"].sentence
+        return summary_page(PlanResult(plan))["headline"].sentence
 
     tried(success=True)
     tried(success=False)
     assert "the design goes on" in sentence()
     close_plan(user=owner, plan=plan, reason="enough")
     assert "closed after 1 of 8 pairs, before the design ended" in sentence()
-    assert [row.attempts for row in summary_page(plan, TrialFilter())["changes"]] == [1, 1]
+    assert [row.attempts for row in summary_page(PlanResult(plan))["changes"]] == [1, 1]

@@ -16,6 +16,7 @@ from evaweb.episodes.models import Episode
 from evaweb.plans.services import close_plan
 from evaweb.results.analysis import caching
 from evaweb.results.presentation.facts import comparison_facts
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings import rating_queue
 from evaweb.results.selectors import PlanRow
 from evaweb.serving import computations
@@ -150,8 +151,8 @@ def test_the_page_says_the_comparison_with_n_and_interval(revealed, as_, viewer)
 def test_of_several_intervals_the_plans_own_is_marked(revealed, rule, outcome, own):
     revealed.stopping = rule
     revealed.document["stopping"] |= {"rule": rule, "outcome": outcome}
-    analysis = caching.cached_analysis(revealed)
-    facts = comparison_facts(revealed, analysis, analysis.comparisons[0])["facts"]
+    result = PlanResult(revealed)
+    facts = comparison_facts(result, result.analysis.comparisons[0])["facts"]
     assert [fact.question for fact in facts if fact.own] == own
 
 

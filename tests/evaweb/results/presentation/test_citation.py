@@ -11,9 +11,9 @@ from django.test import Client
 from evaweb.plans.design import reveal_record
 from evaweb.plans.models import Plan
 from evaweb.plans.services import close_plan, freeze_plan, reveal_plan
+from evaweb.results.analysis.wording import p_words
 from evaweb.results.presentation.citation import _looks, citation
 from evaweb.results.presentation.latex import escaped, foreign
-from evaweb.results.presentation.wording import p_words
 from evaweb.statistics.boundaries import boundary, pair_counts
 from evaweb.statistics.designs import Design
 from evaweb.trials import services

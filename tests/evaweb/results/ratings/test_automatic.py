@@ -27,6 +27,7 @@ from evaweb.results import job_kinds
 from evaweb.results.analysis import caching
 from evaweb.results.analysis.agreement import judge_agreement, rater_agreement
 from evaweb.results.models import AutomaticJudge, Judgement
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings import automatic, rating_queue
 from evaweb.results.ratings.footage import (
     CAMERAS,
@@ -341,12 +342,12 @@ def test_a_trial_that_counts_no_longer_when_the_answer_comes_is_not_judged(filme
 def everything(plan):
     """All that is said of a plan but what judges said, as bytes."""
     caching.clear_caches()
-    found = report_numbers(plan, caching.cached_analysis(plan))
+    found = report_numbers(PlanResult(plan))
     found.pop("judges")
     plan.refresh_from_db()
     rows = {
         "numbers": found,
-        "trials": [row for page in outcome_pages(plan) for row in page],
+        "trials": [row for page in outcome_pages(PlanResult(plan)) for row in page],
         "scores": list(Score.objects.order_by("pk").values()),
         "states": list(Trial.objects.order_by("pk").values()),
         "plan": [plan.state, plan.digest, plan.commitment, plan.at_reveal, plan.closed_because],
@@ -495,6 +496,6 @@ def test_a_sample_is_even_bounded_and_has_both_ends(filmed):
 
 def test_nothing_is_said_of_a_plan_that_no_judge_has_seen(revealed, tmp_path):
     assert judge_agreement(revealed) is None
-    assert report_numbers(revealed, caching.cached_analysis(revealed))["judges"] is None
+    assert report_numbers(PlanResult(revealed))["judges"] is None
     with pytest.raises(EvaError, match="there are: none, an administrator adds them"):
         automatic.request_judging(user=revealed.owner, plan=revealed, name="x")

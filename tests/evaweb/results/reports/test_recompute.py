@@ -6,9 +6,9 @@ import random
 import pytest
 
 from evaweb.results.analysis.agreement import agreement, by_text
-from evaweb.results.analysis.analysis import Verdict, analyse
+from evaweb.results.analysis.analysis import analyse
+from evaweb.results.analysis.comparison import Verdict
 from evaweb.results.analysis.outcomes import Interruption, Outcome
-from evaweb.results.reports.document import analysis_document
 from evaweb.results.reports.recompute import judged, methods
 from evaweb.results.reports.recompute.__main__ import differences
 from evaweb.results.reports.recompute.numbers import Trial, numbers
@@ -101,7 +101,7 @@ def test_both_ways_come_to_the_same(checkpoints, n, scenes, seed):
     analysis = analyse(
         runs, broken, planned=dict.fromkeys(planned, verdict), limits=limits, whole=True, recipes=recipes
     )
-    shown = json.loads(json.dumps(analysis_document(analysis)))
+    shown = json.loads(json.dumps(analysis.document))
     rows = [*as_rows(runs), Trial(9000, "x", 0, "c0", "s0", 1, "interrupted", False, 0.0, 12.5, "", ())]
     plan = {
         "stopping": {

@@ -16,9 +16,8 @@ from evaweb.plans.allocation import allocate_trial
 from evaweb.plans.models import Achieved, Plan, Reference
 from evaweb.plans.services import freeze_plan, reveal_plan
 from evaweb.results.analysis.agreement import preference_comparisons
-from evaweb.results.analysis.caching import cached_analysis
 from evaweb.results.models import Judgement
-from evaweb.results.presentation.headline import headline
+from evaweb.results.presentation.plan_result import PlanResult
 from evaweb.results.ratings import rating_queue
 from evaweb.results.reports.checklist import checklist
 from evaweb.results.reports.recompute.sealed import faults
@@ -497,7 +496,7 @@ def test_letters_are_those_of_a_plan_that_compared_all(bench, owner, tmp_path):
     call_command("eval_report", "three", "--out", str(tmp_path / "report"))
     path = tmp_path / "report" / "data" / "numbers.json"
     numbers = json.loads(path.read_text("utf-8"))
-    assert numbers["letters"] == dict(headline(plan).letters)
+    assert numbers["letters"] == dict(PlanResult(plan).headline.letters)
     assert recompute(tmp_path / "report").returncode == 0
     path.write_text(json.dumps({**numbers, "letters": dict.fromkeys(numbers["letters"], "a")}), "utf-8")
     assert "letters.pi0-block: 'a' is shown" in recompute(tmp_path / "report").stdout
@@ -565,7 +564,7 @@ def test_a_folder_that_is_not_empty_is_not_written_to(revealed, tmp_path):
 
 
 def test_the_checklist_says_what_the_record_says(revealed):
-    kept = {item.practice: item for item in checklist(revealed, cached_analysis(revealed))}
+    kept = {item.practice: item for item in checklist(PlanResult(revealed))}
     assert kept["As many trials as planned, or a rule to stop"].kept == "yes"
     assert kept["Every trial that counts recorded"].record == "16 of 16 have a recording"
     assert kept["A second, blind rater"].kept == "no"
@@ -576,7 +575,7 @@ def test_scores_are_kept_where_only_categories_of_failures_were_corrected(reveal
     def kept():
         (item,) = (
             item
-            for item in checklist(revealed, cached_analysis(revealed))
+            for item in checklist(PlanResult(revealed))
             if item.practice == "Scores kept as they were given"
         )
         return item

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from evaweb.results.analysis.analysis import Comparison
 from evaweb.statistics.base import Interval
 from evaweb.statistics.difference import Difference
 from evaweb.statistics.planning import POWER, detectable
@@ -27,6 +26,11 @@ def format_points(found: Difference) -> str:
     return f"{_signed(100 * found.value)} points [{format_interval(found.interval)}]"
 
 
+def signed_points(share: float) -> str:
+    """Return for example "+36 points"."""
+    return f"{100 * share:+.0f} points".replace("-", "−")
+
+
 def probability(p: float) -> str:
     """Return a probability in the format of papers."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
@@ -35,27 +39,6 @@ def probability(p: float) -> str:
 def p_words(p: float) -> str:
     """Return "p = 0.03" or "p < 0.001"."""
     return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
-
-
-def difference_sentence(found: Comparison, one: Proportion, other: Proportion, alpha: float) -> str:
-    """Return the comparison as one sentence that states only the result of the corrected exact test.
-
-    Raises:
-        ValueError: If the comparison is planned and still open: its design decides.
-    """
-    if found.corrected is None:
-        raise ValueError(f"{found.first} and {found.second}: their design decides, which has not ended")
-    difference = found.difference
-    if found.corrected > alpha:
-        counts = f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {format_points(difference)}"
-        return f"No significant difference between {found.first} and {found.second}: {counts}"
-    better, worse = found.first, found.second
-    if difference.value < 0:
-        better, worse, one, other, difference = worse, better, other, one, difference.swapped
-    counts = (
-        f"{one.successes}/{one.n} against {other.successes}/{other.n}, difference {format_points(difference)}"
-    )
-    return f"{better} succeeded more often than {worse}: {counts}"
 
 
 def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:

@@ -1,0 +1,106 @@
+"""Declaration of a statistic: one row says how it is computed, written as JSON, and shown by pages and reports.
+
+The rows are the fields of `Arm` and `Comparison`, in whose order all of it comes out (docs/contributing.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from evaweb.statistics.base import StatisticsError
+
+Answer = tuple[str, str, str]  # question, method, answer
+_ROW = "statistic"
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Column of the table of checkpoints, on the page and in the report, whose program checks it.
+
+    Attributes:
+        head: Heading.
+        cell: Text from value and arm.
+    """
+
+    head: str
+    cell: Callable[[Any, Any], str]
+    page: bool = True
+    report: bool = True
+
+    def text(self, arm: Any, name: str) -> str:
+        """Return the text of an arm's cell; "" without a value."""
+        value = getattr(arm, name)
+        return "" if value is None else self.cell(value, arm)
+
+
+@dataclass(frozen=True, slots=True)
+class Statistic:
+    """Declaration of one statistic of an arm or a comparison.
+
+    Attributes:
+        compute: Value from the trials; None, or StatisticsError, if they do not give it.
+        key: Its name in JSON, from which REST and reports have it; "" if another row writes it.
+        form: Its value there.
+        write: Instead of both, a part of the JSON object from the whole arm or comparison.
+        answers: Answers from comparison, value and context.
+        rank: Answers are shown by rank, and within one in the order of the rows.
+        none_too: Whether None is an answer.
+        describes: Whether it is shown while the design of its comparison has not ended.
+        column: Column of the table of checkpoints.
+    """
+
+    compute: Callable[[Any], Any]
+    key: str = ""
+    form: Callable[[Any], Any] = lambda value: value
+    write: Callable[[Any], dict[str, Any]] | None = None
+    answers: Callable[[Any, Any, Any], list[Answer]] = lambda *_: []
+    rank: int = 0
+    none_too: bool = False
+    describes: bool = False
+    column: Column | None = None
+
+
+def statistic(*declared: Any, **more: Any) -> Any:
+    """Return the field of a dataclass that is a `Statistic`."""
+    return field(metadata={_ROW: Statistic(*declared, **more)})
+
+
+def statistics_of(kind: Any) -> dict[str, Statistic]:
+    """Return the rows of `Arm` or `Comparison` by the name of their field."""
+    return {each.name: each.metadata[_ROW] for each in fields(kind) if _ROW in each.metadata}
+
+
+def compute_all(kind: Any, trials: Any, notes: list[str] | None = None) -> dict[str, Any]:
+    """Return every statistic by its name; with `notes`, one that cannot be computed is None, with its reason there."""
+    found: dict[str, Any] = {}
+    for name, row in statistics_of(kind).items():
+        try:
+            found[name] = row.compute(trials)
+        except StatisticsError as error:
+            if notes is None:
+                raise
+            found[name] = None
+            notes.append(str(error))
+    return found
+
+
+def write_all(found: Any) -> dict[str, Any]:
+    """Return the statistics of an arm or a comparison as JSON."""
+    document: dict[str, Any] = {}
+    for name, row in statistics_of(type(found)).items():
+        value = getattr(found, name)
+        if row.write:
+            document |= row.write(found)
+        elif row.key:
+            document[row.key] = None if value is None else row.form(value)
+    return document
+
+
+def answer_all(found: Any, context: Any) -> Iterator[tuple[str, Answer]]:
+    """Yield the answers of a comparison, each with the name of its statistic."""
+    for name, row in sorted(statistics_of(type(found)).items(), key=lambda item: item[1].rank):
+        value = getattr(found, name)
+        if value is not None or row.none_too:
+            yield from ((name, answer) for answer in row.answers(found, value, context))
