@@ -529,5 +529,5 @@ def _failed(remote: Remote, command: Command, reason: str, sent: bool = False) -
     """
     if command.kind == "estop":
         return Ack(command.uuid, "failed", f"USE THE HARDWARE STOP: {reason}", data={"station": remote.name})
-    status = "failed" if sent or command.kind in STOPPING else "refused"
-    return Ack(command.uuid, status, reason, kind=command.kind)
+    failed = sent or command.kind in STOPPING
+    return Ack(command.uuid, "failed" if failed else "refused", reason, kind=command.kind)
