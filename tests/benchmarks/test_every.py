@@ -15,7 +15,6 @@ from tests.sources import ROOT
 OPTIONS = {
     "estop": {"attacks": ["none"]},
     "pages": {"plans": 2, "trials": 40},
-    "results": {"plans": 2, "trials": 40, "runs": 20},
 }
 FEWER = {
     "lab": {"climb.RUNGS": [1, 2], "climb._MOST_VIEWERS": 10, "lab._CUTS": 2, "lab._UPLOAD_MB": 50},
@@ -54,8 +53,13 @@ if __name__ == "__main__":  # and not in a process that it starts
 
 
 # What is no lab is made beside other tests; those that another test makes whole are not made twice.
-COMPUTED = ("ik", "moving_target", "partial_credit", "results", "strategies")
-ELSEWHERE = ("coverage", "designs", "soak")  # test_coverage, test_designs, test_fuzzing
+COMPUTED = ("ik", "moving_target", "partial_credit", "strategies")
+ELSEWHERE = (
+    "coverage",
+    "designs",
+    "results",
+    "soak",
+)  # test_coverage, test_designs, test_results, test_fuzzing
 EVERY = [
     pytest.param(name, marks=pytest.mark.exhaustive if name in COMPUTED else pytest.mark.lab)
     for name in _BENCHMARKS

@@ -47,12 +47,11 @@ def test_a_share_is_one_of_the_values():
 
 
 @pytest.mark.exhaustive
-def test_a_small_lab_is_measured_on_sqlite(tmp_path):
-    found = results._measured(tmp_path / "data", {}, plans=2, trials=80)
-    assert set(found["pages"]) == set(results.PAGES)
-    assert (found["handing"]["left"], found["handing"]["twice"], found["handing"]["out_of_order"]) == (
-        0,
-        0,
-        0,
-    )
-    assert max(page["queries"] for page in found["pages"].values()) <= results.MOST_QUERIES
+def test_a_small_lab_is_measured_on_each_database():
+    report = results.measure(1.0, plans=2, trials=80, runs=20)
+    assert "export_rows_per_s" in {figure.name for figure in report.figures}
+    assert report.rows[0]["database"] == "sqlite"
+    for found in report.rows:
+        assert set(found["pages"]) == set(results.PAGES)
+        assert [found["handing"][fault] for fault in ("left", "twice", "out_of_order")] == [0, 0, 0]
+        assert max(page["queries"] for page in found["pages"].values()) <= results.MOST_QUERIES
