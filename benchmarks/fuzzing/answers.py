@@ -50,7 +50,7 @@ _PROTOCOLS = (
     Protocol(
         "starvla",
         lambda: StarvlaServer(_ROBOT, StarvlaBehaviour(size=_SIZE)),
-        {"cameras": _VIEWS, "ping_every": None},
+        {"cameras": _VIEWS, "ping_every": 0},
     ),
 )
 

@@ -45,6 +45,6 @@ def test_lockstep_refuses_what_goes_on_in_real_time_before_anything_is_connected
     data = ["--set", f'data_dir="{tmp_path}"']
     assert command_line.main([str(DEPLOYMENTS / file), *data, "--lockstep"]) == 2
     said = capsys.readouterr().err
-    assert "with --lockstep: what is at its other end goes on in real time" in said
+    assert "with --lockstep: its other end runs in real time" in said
     assert "allowed: dataset, or leave --lockstep out" in said
     assert not list(tmp_path.iterdir())

@@ -197,8 +197,8 @@ def test_a_job_that_is_done_twice_asks_once(ask, resting, monkeypatch):
 
 def test_the_workers_errors_are_the_reason(ask, resting):
     row = ask(station=resting)
-    Job.objects.update(status=JobStatus.FAILED, error="preflight: its process ended with -9")
-    assert refresh_preflight(row=row).reason == "preflight: its process ended with -9"
+    Job.objects.update(status=JobStatus.FAILED, error="preflight: its process exited with -9")
+    assert refresh_preflight(row=row).reason == "preflight: its process exited with -9"
     row = ask(station=resting)
     Job.objects.all().delete()
     assert "its job is gone" in refresh_preflight(row=row).reason

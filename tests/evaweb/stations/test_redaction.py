@@ -120,7 +120,7 @@ def holding(reason):
         (REFUSED(count=10, why="numbers of somebody else"), "safety held the robot"),
         (
             MISSING(why=OLD(seconds=0.31, allowed=0.2), seconds=1.0),
-            "joints were too old (safety.joint_age_s): the run stands, and goes on by itself where they are back "
+            "joints were too old (safety.joint_age_s): the run is held, and continues by itself if they are back "
             "before they are 1 s old",
         ),
         (STARVED(seconds=1.2), COVERED),

@@ -329,7 +329,7 @@ def test_a_correction_that_comes_late_takes_no_newer_ones_place(bench):
     trial = bench.scored(success=True)
     score(bench, trial, True, True, False, reason="on the rim")
     newer = score(bench, trial, True, True, True, reason="it fell off afterwards")
-    with pytest.raises(Conflict, match=r"you said just this of trial .* before, and it was corrected since"):
+    with pytest.raises(Conflict, match=r"you sent just this for trial .* before, and it was corrected since"):
         score(bench, trial, True, True, False, reason="on the rim")
     trial.refresh_from_db()
     assert trial.verdict == newer

@@ -112,7 +112,7 @@ def test_a_wrong_table_names_the_key_and_what_is_allowed(
 
 def test_on_a_virtual_clock_there_is_no_live_camera(tmp_path: Path) -> None:
     with pytest.raises(
-        SetupError, match=r"cameras\.cam_high: kind 'mjpeg' goes on by itself.*allowed there: 'file'"
+        SetupError, match=r"cameras\.cam_high: kind 'mjpeg' runs in real time.*allowed there: 'file'"
     ):
         make_source(planned(tmp_path, {"cam_high": HIGH}), VirtualClock())
 

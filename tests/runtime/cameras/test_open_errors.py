@@ -23,7 +23,7 @@ def error(number: int) -> Exception:
         (errno.EBUSY, "another program has it open"),
         (errno.EACCES, "this user may not open it: is it in the group video?"),
         (errno.ENODEV, "it is no camera"),
-        (errno.EINVAL, "it cannot do what it is asked for (video_size = 640x480)"),
+        (errno.EINVAL, "it cannot do what was requested (video_size = 640x480)"),
         (errno.EPROTO, "it cannot be read: text"),
     ],
 )

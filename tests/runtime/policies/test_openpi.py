@@ -1075,7 +1075,7 @@ def test_what_waits_before_a_question_answers_none(after: str) -> None:
         if after == "answer":
             policy.infer(observation(0.1))
         assert there.wait(PATIENCE_S)
-        with pytest.raises(UnsolicitedError, match="bytes that nobody had asked for"):
+        with pytest.raises(UnsolicitedError, match="sent an unrequested message"):
             policy.infer(observation(0.2))
         assert policy.infer(observation(0.3)).actions[0, 0] == np.float32(0.3)
 

@@ -107,7 +107,7 @@ def test_one_that_is_cancelled_says_for_what(bench: Bench) -> None:
 )
 def test_a_process_that_says_nothing_of_use_is_a_failure_with_its_code(bench: Bench) -> None:
     bench.start()
-    assert "its process ended with" in bench.over()["failure"]
+    assert "its process exited with" in bench.over()["failure"]
 
 
 def test_the_oldest_reports_are_forgotten(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +136,7 @@ def test_who_waits_for_one_gets_the_report_or_why_there_is_none(monkeypatch: pyt
     monkeypatch.setattr(module, "_spawn_child", lambda: bench.spawn(SAYS))
     assert module.run_preflight({}, 30.0) == {"verdict": "ok"}
     monkeypatch.setattr(module, "_spawn_child", lambda: bench.spawn(HANGS))
-    with pytest.raises(RuntimeFault, match="its process ended with -9"):
+    with pytest.raises(RuntimeFault, match="its process exited with -9"):
         module.run_preflight({}, 0.2)
 
 

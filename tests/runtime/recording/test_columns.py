@@ -138,8 +138,12 @@ def test_a_tick_that_came_over_the_ring_of_control_is_written_as_it_was_sent(cha
     assert ring.push(encode(sent))
     [payload] = ring.drain()
     received = admit_tick(LAYOUT, decode(payload))
+    folders = [tmp_path / side for side in ("sent", "received")]
+    for folder in folders:
+        folder.mkdir()
     for name in ["ticks"] if sent.smoothed is None else ["ticks", "smoothed"]:
-        assert written(tmp_path, name, received).equals(written(tmp_path, name, sent))
+        there, here = (written(*one) for one in zip(folders, (name, name), (sent, received), strict=True))
+        assert here.equals(there)
 
 
 def test_how_late_a_tick_was_is_in_its_row_and_null_in_episodes_from_before(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def recorded(root: Path, **changes: Any) -> Path:
     journal.append(row(0))
     for k in range(16):
         made = {"chunk_ids": [0, 1], "weights": [0.75, 0.25]} if k == 4 else {}
-        made |= {"smoothed": None, "chunk_ids": (), "weights": (), "changes": ()} if k < 4 else {}
+        made |= {"smoothed": None, "chunk_ids": (), "weights": (), "notes": ()} if k < 4 else {}
         made |= {"executed": None, "refused": True} if k == 7 else {}
         made |= {"woke": STARTED + k / 100 + 0.0005} if k == 5 else {}
         journal.append(tick(k, **made))

@@ -50,7 +50,7 @@ TAKEN = [
         (["ssh: connect to host gpu port 22: Connection timed out"], "timed out", "policy.tunnel.host"),
         (["Timeout, server gpu not responding."], "Timeout, server gpu not responding.", ""),
         (["Connection to gpu closed by remote host."], "Connection to gpu closed by remote host.", ""),
-        ([], "ssh ended with 255 and said nothing", ""),
+        ([], "ssh exited with 255 and no output", ""),
     ],
 )
 def test_the_last_that_was_said_comes_with_what_to_do(said: list[str], sentence: str, advice: str) -> None:
@@ -65,7 +65,7 @@ def test_what_ended_at_the_far_end_is_told_from_what_ssh_could_not() -> None:
     told = explain_exit(["This account is currently not available."], 1)
     assert told.startswith("This account is currently not available.: what is run there")
     assert "policy.tunnel.session = false" in told
-    assert explain_exit([], -15) == "ssh ended with -15 and said nothing"
+    assert explain_exit([], -15) == "ssh exited with -15 and no output"
     assert "policy.tunnel.session" in explain_exit([], 0)
 
 

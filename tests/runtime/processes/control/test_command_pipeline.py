@@ -225,7 +225,7 @@ def test_a_motion_to_nowhere_is_refused_and_held(bench, goal):
     following(bench, wave(60))
     bench.say("motion", goal=goal)
     bench.run(20)
-    assert "expected 2 numbers" in bench.said("refusals")[0].text
+    assert "expected 2 values" in bench.said("refusals")[0].text
     assert bench.behaviour == "hold"
 
 

@@ -69,7 +69,7 @@ def stood(joints=STANDS):
 
 def test_the_first_samples_are_believed_once_they_agree_for_a_while(watcher):
     doubts = watcher.stand(6)
-    assert doubts[:3] == ["joints have not been seen for 0.1 s yet"] * 3
+    assert doubts[:3] == ["joint positions have been received for less than 0.1 s"] * 3
     assert doubts[3:] == ["", "", ""]
 
 

@@ -122,7 +122,7 @@ def test_an_arm_that_was_moved_while_ready_makes_the_station_idle_and_stays_wher
     station.go(75)
     assert station.state is SessionState.IDLE
     assert "0.5" in station.reason  # by which it is known that it was moved; where it ends is followed
-    assert "from where it was told to hold" in station.reason
+    assert "from its hold target" in station.reason
     arms = [dim for dim in range(len(STANDS)) if dim not in station.spec.robot.gripper_dims]
     assert np.allclose(station.robot.sent[-1][arms], moved[arms], atol=0.05)
     station.close()

@@ -109,7 +109,7 @@ def test_a_run_that_holds_without_its_holder_does_not_go_on_by_itself(running: R
 
 def test_finish_is_refused_where_nobody_beside_the_robot_could_stop_it(tmp_path: Path) -> None:
     with pytest.raises(
-        ConfigurationError, match=r'lease.lost = "finish": .* somebody beside it must be able to stop it'
+        ConfigurationError, match=r'lease.lost = "finish": .* a person beside it must be able to stop it'
     ):
         stubbed(tmp_path, lease={"lost": "finish"})
 

@@ -576,7 +576,7 @@ def test_a_chunk_is_not_committed_while_the_robot_is_on_its_way_to_it(tmp_path: 
     station.go(2)
     station.command("approach")
     station.go(2)
-    with pytest.raises(SetupError, match=r"on its way to where the chunk begins: wait, or cancel"):
+    with pytest.raises(SetupError, match=r"moving to the start of the chunk: wait, or cancel"):
         station.command("commit")
     station.until(lambda: phase(station) == "proposed", 20.0, "to arrive")
     station.command("commit")
@@ -596,7 +596,7 @@ def test_an_arm_that_was_moved_while_a_person_looks_holds_the_run(tmp_path: Path
         station.go(1)
     station.go(75)
     assert station.state is SessionState.HOLDING
-    assert "from where it was told to hold" in station.reason
+    assert "from its hold target" in station.reason
     assert station.coordinator.inference.proposal is None
     if station.robot.commands:
         assert np.allclose(station.robot.sent[-1], station.robot.position, atol=0.05)

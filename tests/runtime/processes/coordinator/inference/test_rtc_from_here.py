@@ -160,4 +160,4 @@ def test_the_models_own_rows_are_not_handed_back_where_they_would_mean_something
     held.add_chunk(1, replace(chunk, **changes), 100)
     held.on_merged(merged(1, 100, 3, COUNT))
     assert held.conditioning(110, [3], 0.9, None, seen(110, START)) is None
-    assert "the model's own rows are relative to an observation that is over" in held.warning
+    assert "the model's own rows are relative to an earlier observation" in held.warning

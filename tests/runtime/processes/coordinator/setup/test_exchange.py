@@ -193,7 +193,7 @@ def test_an_open_recording_keeps_the_policy_that_its_manifest_names(tmp_path: Pa
     station = Station(stubbed(tmp_path)).ready()
     station.command("record_start")
     station.go(2)
-    with pytest.raises(SetupError, match=r"a recording is open, .* record stop first"):
+    with pytest.raises(SetupError, match=r"a recording .* is open: record stop first"):
         station.command("setup", policy=OTHER)
     station.command("setup")  # as it is, it may be set up again
     station.reach(SessionState.READY)
