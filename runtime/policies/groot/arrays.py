@@ -103,7 +103,10 @@ def _text(key: object) -> object:
 
 
 def _from_npy(data: object) -> np.ndarray[Any, Any]:
-    """Return the array of a .npy file. Its header is parsed here, because numpy's would allocate any size."""
+    """Return the array of a .npy file.
+
+    Its header is parsed here, because numpy would allocate whatever size the header states.
+    """
     if not isinstance(data, bytes) or data[:6] != _MAGIC:
         raise CodecError(f"an array's as_npy is {_short(data)}; expected the bytes of a .npy file")
     start, length = {1: (10, "<H"), 2: (12, "<I")}.get(data[6] if len(data) > 6 else 0, (0, ""))
