@@ -1,4 +1,5 @@
-"""URLs of network cameras: checks, and insertion of passwords, which come from the environment and are never recorded.
+"""URLs of network cameras: checks, and insertion of passwords, which come from the environment and are never
+recorded.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ class FrozenCameraDetector:
         self._frozen: set[str] = set()
 
     def captured(self, pictures: Mapping[str, UInt8], time: float) -> dict[str, float]:
-        """Return by camera when its picture first appeared: `time`, or earlier if the picture equals the previous one.
+        """Return by camera when its picture first appeared: `time`, or earlier if the picture equals the
+        previous one.
         """
         times = {}
         for camera, picture in pictures.items():

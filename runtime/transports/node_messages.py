@@ -1,4 +1,5 @@
-"""Messages of an execution node, checked against the robot; an invalid message is refused under the name of its fault.
+"""Messages of an execution node, checked against the robot; an invalid message is refused under the name of its
+fault.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Observations of an execution node over ZMQ: the newest by arrival, with times on our clock, and with counted faults.
+"""Observations of an execution node over ZMQ: the newest by arrival, with times on our clock, and with counted
+faults.
 """
 
 from __future__ import annotations
@@ -312,7 +313,8 @@ class NodeSource(Source):
             self._count_fault("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, time: float) -> dict[str, float]:
-        """Return the capture time by stream: `time`, but for an unchanged picture the time at which it first appeared.
+        """Return the capture time by stream: `time`, but for an unchanged picture the time at which it first
+        appeared.
         """
         times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
         if self._detect_frozen:
