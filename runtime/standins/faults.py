@@ -57,7 +57,7 @@ class Fault:
     argument: str = ""
 
     def number(self, default: float) -> float:
-        """Return the argument as a number, `default` if there is none."""
+        """Return the argument as a number; `default` if there is no argument."""
         return float(self.argument) if self.argument else default
 
 

@@ -1,4 +1,6 @@
-"""Stand-in for LeRobot's policy server: gRPC with its rules and silences, a script as policy, faults on demand."""
+"""Stand-in for LeRobot's policy server: gRPC with the same rules and empty answers, a script as policy, faults on
+demand.
+"""
 
 from __future__ import annotations
 
@@ -211,7 +213,7 @@ class LerobotServer:
         return rows[: self._told.actions_per_chunk]
 
     def _actions(self, observation: Any, rows: Float32) -> bytes:
-        """Return the pickled rows, modified by the fault."""
+        """Return the pickled actions for the rows of an answer, modified by the fault."""
         fault = self._behaviour.fault.name
         if fault == "nan":
             rows[min(3, len(rows) - 1), 2] = np.nan
