@@ -39,7 +39,7 @@ class Collision:
 class Collisions:
     """Collision checker for joint vectors float64 [D]: links closer than `margin` [m] count as touching.
 
-    A pair that touches already may hold its distance or separate; only a further approach is forbidden. Grippers are
+    A pair that touches already may keep its distance or separate; only a further approach is forbidden. Grippers are
     not restricted: the purpose is to separate arms, and releasing an object must be possible everywhere.
     """
 
@@ -54,7 +54,7 @@ class Collisions:
         return self._worst(apart, apart < self._least)
 
     def closer_pair(self, q: Float64, before: Float64) -> Collision | None:
-        """Return the closest pair that touches at `q` and has approached since `before`, None if there is none."""
+        """Return the closest pair that touches at `q` and is nearer than at `before`, None if there is none."""
         apart = self._clearance.distances(q)
         touching = apart < self._least
         if not touching.any():
@@ -87,7 +87,7 @@ class Collisions:
         return worst, at
 
     def _gripping(self, q: Float64, like: Float64) -> Float64:
-        """Return `q` with the gripper positions of `like`."""
+        """Return `q` with its gripper positions replaced by those of `like`."""
         if not len(self._grippers):
             return q
         gripping = q.copy()
