@@ -224,7 +224,7 @@ class _Operator(threading.Thread):
 
 
 def _name(process: psutil.Process) -> str:
-    """Return the name of a process of lab or station, "" for others."""
+    """Return the name of a process that belongs to lab or station, "" for any other process."""
     words = process.cmdline()
     found = [name for name in _OF_LAB if any(one.endswith("manage.py") for one in words) and name in words]
     found += [name for name in _OF_STATION if f"runtime.processes.{name}.process" in words]

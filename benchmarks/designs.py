@@ -1,7 +1,7 @@
 """Error and power of each design of a comparison, and coverage of the intervals that are shown with it.
 
-Exact for successes and failures, simulated otherwise. Reference values: STEP (Snyder et al. 2025), a near-optimal
-sequential test of two policies, as measured by us.
+The figures are exact for successes and failures, simulated otherwise. Reference values are those that we measured for
+STEP (Snyder et al. 2025), a near-optimal sequential test of two policies.
 """
 
 from __future__ import annotations

@@ -229,7 +229,7 @@ def _postures(name: str) -> list[Figure]:
 
 
 def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Return the processor time of the other backends as a multiple of the default backend's.
+    """Return the processor time of each other backend as a multiple of the default backend's.
 
     Wall time would depend on the machine's load, and more so for long calls.
     """

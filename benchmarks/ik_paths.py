@@ -102,7 +102,9 @@ def _bounds(robot: Robot) -> tuple[Float64, Float64]:
 
 
 def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64:
-    """Return a posture with arm joints at a margin [share of their range] from limits, other joints as at home."""
+    """Return a random posture whose arm joints are at least `margin` (a share of their range) from limits; other joints
+    are at home.
+    """
     low, high = _bounds(robot)
     posture = robot.poses["home"].copy()
     dims = arm_dims(robot)

@@ -1,7 +1,7 @@
 """Lab with stations on other computers: e-stop, idle cost, lost link, transfer of an episode, and limits.
 
-Lab and station are processes of this machine with separate data folders, linked over loopback: the network's share is
-not included.
+Lab and station are processes of this machine with separate data folders, linked over loopback, so that delays of a real
+network are not included.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def _presses(running: RunningLab, seconds: float) -> list[Press]:
 
 
 def _presses_here(robot: Path, seconds: float) -> list[float]:
-    """Press at the station's own socket, repeatedly; return the durations [ms]."""
+    """Press at the station's own socket, repeatedly for `seconds`; return the durations [ms]."""
     taken: list[float] = []
     client = StationClient(robot / "stations" / PRESSED, "benchmark")
     until = time.monotonic() + seconds
@@ -232,7 +232,7 @@ def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
 
 
 def enrol(robot: Path, words: Sequence[str]) -> None:
-    """Enrol this station's computer at the lab; the supervisor then starts its link."""
+    """Enrol the station's computer at the lab with these `words`; the station's supervisor then starts its link."""
     for command in (["new"], ["enrol", *words]):
         keys = [sys.executable, "-m", "runtime.keys", "--data-dir", str(robot), *command]
         subprocess.run(keys, cwd=ROOT, env=os.environ, check=True, stdout=subprocess.DEVNULL)

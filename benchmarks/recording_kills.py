@@ -63,7 +63,7 @@ class KillCount:
 
 
 def kill_recording(lab: Lab, many: KillCount, seed: int) -> list[dict[str, Any]]:
-    """Return one row per kill: process, moment, loss [s], and how the episode ended."""
+    """Return one row per kill: process, time of the kill, loss [s], and how the episode ended."""
     kills: deque[float] = deque(maxlen=MOST_RESTARTS)
     moments = enumerate(many.moments(seed, _SPREAD_S))
     return [_one(lab, PROCESSES[number % len(PROCESSES)], moment, kills) for number, moment in moments]

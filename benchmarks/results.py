@@ -94,7 +94,7 @@ def _measured(
 
 
 def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
-    """Yield the figures of one database."""
+    """Yield the figures that were measured on one database."""
     name = row["database"]
     for page in PAGES:
         found = row["pages"][page]

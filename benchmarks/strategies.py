@@ -1,6 +1,6 @@
 """Quality of strategies with known policy actions: offset, error, jerk, reaction, starvation.
 
-The halves of the strategies (query, merge, timeline, conditioning) run in integer steps in benchmarks/step_loop.py,
+The parts of the strategies (query, merge, timeline, conditioning) run in integer steps in benchmarks/step_loop.py,
 without processes, wire, safety or robot lag: deterministic, and fast enough for every cell. `checked_in_lockstep` is
 the number of actions that the complete station in lockstep (benchmarks/strategy_station.py) planned for the same
 policy; `different_in_lockstep` is how many of them the step loop does not reproduce bit by bit.

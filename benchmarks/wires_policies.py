@@ -148,7 +148,7 @@ class Timed:
         return float(np.median(self.round_trips))
 
     def row(self) -> Row:
-        """Return the row; `cpu_ms` is the processor time of this process per request, with all threads."""
+        """Return the measurements as a row; `cpu_ms` is this process's processor time per request, with all threads."""
         percentiles = {f"p{q}": 1e3 * float(np.percentile(self.round_trips, q)) for q in (50, 99)}
         return {"round_trip_ms": percentiles, "cpu_ms": 1e3 * float(np.mean(self.processor))}
 

@@ -50,7 +50,7 @@ class Receiving:
 
 
 def layout(robot: Robot) -> SharedStateLayout:
-    """Return the shared state layout of a station with this robot and all of its cameras."""
+    """Return the layout of shared state for a station with this robot and all its cameras."""
     return SharedStateLayout(robot.dim, robot.eef_dim, tuple(camera.key for camera in robot.cameras))
 
 

@@ -82,7 +82,7 @@ def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
 
 
 def check_mounts(file: Path, tables: Sequence[GroupTable], groups: Sequence[Group]) -> None:
-    """Raise RobotError if groups that share one copy of the URDF declare different mounts."""
+    """Raise RobotError if groups that share a copy of the URDF declare different mounts."""
     mounts = {table.name: table.mount for table in tables}
     for members in urdf_copies(groups):
         first = members[0].name

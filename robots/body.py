@@ -157,7 +157,7 @@ class _Copy:
         }
 
     def above_from(self, start: int) -> NDArray[np.intp]:
-        """Return the index of each link's parent if this copy's first link has index `start`; -1 for the root."""
+        """Return the index of each link's parent, -1 for the root, if the first link of this copy has index `start`."""
         parents = [self.links.index(joint.parent) for joint in self._movers.values()]
         return np.array([-1, *(start + parent for parent in parents)], dtype=np.intp)
 

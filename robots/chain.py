@@ -122,7 +122,10 @@ class Chain:
         return tip, columns if self._plain else columns @ self._coupling
 
     def _steps(self, q: Float64) -> Float64:
-        """Return the transforms [..., moving joints, 4, 4], each including the fixed joints before it."""
+        """Return the transform of each moving joint relative to the previous one, [..., moving joints, 4, 4].
+
+        Each includes the fixed joints in between.
+        """
         if q.shape[-1:] != (self.size,):
             raise RobotError(
                 f"{self._path}: the chain {self.frame} to {self.tip} was given joints of shape {q.shape}; "

@@ -1,4 +1,4 @@
-"""Robot as used by all other code: groups of joints, cameras, poses, limits, one flat vector."""
+"""Robot as all other code uses it: groups of joints, cameras, poses, limits, one flat vector."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ class Robot:
         )
 
     def group(self, name: str) -> Group:
-        """Return the group of that name.
+        """Return the group with that name.
 
         Raises:
             RobotError: If it does not exist; the message lists the names.

@@ -73,7 +73,7 @@ class Urdf:
     held: tuple[str, ...]
 
     def joint(self, name: str) -> Joint:
-        """Return the joint of that name.
+        """Return the joint with that name.
 
         Raises:
             RobotError: If it does not exist; the message lists the names.

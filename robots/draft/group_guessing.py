@@ -99,7 +99,7 @@ class _Skeleton:
         return set(below).union(*(self.descendants(child) for child in below))
 
     def depth(self, name: str | None) -> int:
-        """Return the number of joints from the root to this one."""
+        """Return the number of joints from the root to `name`."""
         return 0 if name is None else 1 + self.depth(self.parent[name])
 
     def fingers(self, wheels: set[str]) -> dict[str, str | None]:

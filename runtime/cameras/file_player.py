@@ -45,7 +45,7 @@ class FilePlayer:
         self._rewind(now)
 
     def frame_at(self, now: float) -> CapturedImage | None:
-        """Return the newest picture that is due and not yet returned, else None.
+        """Return the newest picture that is due and was not returned yet, else None.
 
         Raises CameraError for an unreadable file.
         """

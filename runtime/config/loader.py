@@ -34,7 +34,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """Valid deployment, its canonical form and the digest of that."""
+    """Valid deployment, with its canonical form and the digest of that form."""
 
     deployment: Deployment
     tree: Mapping[str, Any]

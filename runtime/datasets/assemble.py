@@ -111,7 +111,10 @@ class SourceDataset:
         return self.names.rename_keys(self.dataset.features)
 
     def episode_refs(self, indices: Sequence[int] | None = None) -> list[EpisodeRef]:
-        """Return all episodes, or those of `indices`. Raises: RecordingError if one does not exist."""
+        """Return the episodes with these indices, or all if `indices` is None.
+
+        Raises: RecordingError if an episode does not exist.
+        """
         if indices is None:
             return [EpisodeRef(self, listed.index) for listed in self.dataset.episodes]
         return [EpisodeRef(self, self.dataset.entry(index).index) for index in indices]

@@ -137,7 +137,7 @@ def position_columns(
 def timestamps(frames: int, fps: float) -> NDArray[np.float32]:
     """Return frame / fps as float32 [N].
 
-    float32 is too coarse for LeRobot's check of neighbouring rows after about 17 minutes.
+    After about 17 minutes float32 is too coarse for LeRobot's check that the steps between rows are even.
 
     Raises:
         RecordingError: LeRobot would refuse the timestamps as uneven.

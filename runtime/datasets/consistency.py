@@ -374,10 +374,11 @@ def _column_statistic(
 def is_rounding_error(
     name: str, given: np.ndarray[Any, Any], value: np.ndarray[Any, Any], known: np.ndarray[Any, Any]
 ) -> bool:
-    """Return True if single precision explains a difference: LeRobot sums float32, with variance E[x^2] - E[x]^2.
+    """Return True if LeRobot's use of single precision explains the difference between two statistics.
 
-    Source: the sum of n numbers in sequence has an error of at most n u sum|x|, u = 2^-24 (Higham, Accuracy and
-    Stability of Numerical Algorithms, 2002, section 4.2). The variance has three such factors.
+    LeRobot sums float32, with variance E[x^2] - E[x]^2. Source: the sum of n numbers in sequence has an error of at
+    most n u sum|x|, u = 2^-24 (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 4.2). The variance
+    has three such factors.
     """
     share = len(known) * _ROUNDING
     if name == "mean":

@@ -39,7 +39,7 @@ def episode_lines(root: Path, info: Info) -> list[Line]:
     An episode whose publication is in progress or was interrupted is excluded.
 
     Raises:
-        RecordingError: The list has other episodes than info.json counts, so that some would be lost silently.
+        RecordingError: The list does not have the episodes that info.json counts, so that some would be lost unnoticed.
     """
     v30 = info["codebase_version"] == layout.V30
     path = root / (parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES)

@@ -152,7 +152,7 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
 
 
 def is_language(kind: pa.DataType) -> bool:
-    """Return True for the type of a column of LeRobot's language annotations."""
+    """Return True if it is the type of a column with LeRobot's language annotations."""
     import pyarrow as pa
 
     rows = kind.value_type if pa.types.is_list(kind) or pa.types.is_large_list(kind) else None

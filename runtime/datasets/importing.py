@@ -92,7 +92,7 @@ def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRob
 
     Raises:
         RecordingError: The episode cannot be read or written.
-        DamagedError: The folder exists and differs from what was imported.
+        DamagedError: The folder exists and differs from the imported data.
     """
     uuid = uuids_of(dataset.root)[index]
     folder, drafts = episodes / uuid, episodes.parent / f".{IMPORTED}"

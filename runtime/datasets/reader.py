@@ -108,7 +108,7 @@ class Dataset:
         raise RecordingError(f"{self.root} has no episode {index}, there are {len(self.episodes)}: {there}")
 
     def episode(self, index: int, mapping: ColumnMapping | None = None) -> RecordedEpisode:
-        """Read episode `index`, with its columns as `mapping` names them. Raises: RecordingError."""
+        """Read episode `index` with the columns that `mapping` names. Raises: RecordingError."""
         mapping = mapping or ColumnMapping()
         listed = self.entry(index)
         cameras = self._cameras(mapping)

@@ -1,4 +1,4 @@
-"""Images of one episode and camera by frame number, exact with any B-frames and groups of pictures."""
+"""Images of one episode and camera by frame number, which is exact with any B-frames and groups of pictures."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ class VideoFrames(ImageSequence):
 
     @property
     def is_deep(self) -> bool:
-        """True for depth: one component of more than 8 bits."""
+        """True if the video is depth: one component of more than 8 bits."""
         given = self._stream.codec_context.format
         return given is not None and [part.bits > 8 for part in given.components] == [True]
 

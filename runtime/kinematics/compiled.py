@@ -93,7 +93,7 @@ class CompiledKinematics(Kinematics):
         )
 
     def warm_up(self) -> None:
-        """Compile kernels that are not cached and load the others, so that no command waits for them.
+        """Load all kernels, and compile those that are not cached, so that no command waits for it.
 
         A cached kernel that cannot be read (a full disk, a power failure) is compiled again.
         """

@@ -77,9 +77,9 @@ class Fade:
 class Timeline:
     """Contiguous planned actions from step `first` on; empty if nothing is planned.
 
-    The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as one is
-    active: a chunk merged meanwhile changes the plan, and the fade continues over the new plan. `laid` are the placed
-    chunks that an averaging strategy still needs. A merge discards all steps before it.
+    The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as a fade is
+    active: a chunk merged in that time changes the plan, and the fade continues over the new plan. `laid` are the
+    placed chunks that an averaging strategy still needs. A merge discards all steps before it.
     """
 
     def __init__(self, dim: int) -> None:
@@ -145,7 +145,7 @@ class Timeline:
 
 
 def single_contribution(chunk_id: int, count: int) -> list[Contributions]:
-    """Return the contributions of `count` rows that come from one chunk alone."""
+    """Return the contributions of `count` rows, all of which come from the chunk `chunk_id` alone."""
     return [((chunk_id, 1.0),)] * count
 
 

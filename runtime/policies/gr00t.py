@@ -1,8 +1,9 @@
 """Policies on GR00T servers N1.5, N1.6 and N1.7: one request, one response over a ZMQ REQ socket.
 
-First the server is asked for its modality configuration, i.e. the inputs and outputs of its model. Requests follow
-from that and from maps in the deployment; arrays are sent in the form that the server reads. Its `kill` endpoint is
-never used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality configuration, StarVLA.
+First the server is asked for its modality configuration, i.e. the inputs and outputs of its model. The form of requests
+follows from it and from maps in the deployment; arrays are sent in the form that the server reads. The server's `kill`
+endpoint is never used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality
+configuration, StarVLA.
 """
 
 from __future__ import annotations

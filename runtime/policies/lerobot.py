@@ -167,7 +167,7 @@ class LerobotPolicy(Policy):
             self._asked = False
 
     def close(self) -> None:
-        """Cut the connection and return at once; a call that waits in another thread raises PolicyError."""
+        """Abort the connection and return at once; a call that waits in another thread raises PolicyError."""
         with self._turning:
             self._ended.set()
             self._link.abort()

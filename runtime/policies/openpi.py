@@ -1,7 +1,7 @@
-"""Policies on openpi websocket servers: metadata on connect, then one map per observation, one map of actions.
+"""Policies on openpi websocket servers: metadata on connect, then one map of actions for each map of an observation.
 
-Source: openpi's websocket_policy_server and openpi-client. The layout of requests is declared in the configuration,
-so that those of ALOHA, DROID and LIBERO are settings and not code.
+Source: openpi's websocket_policy_server and openpi-client. The layout of requests is declared in the configuration, so
+that the layouts of ALOHA, DROID and LIBERO are settings and not code.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class OpenpiPolicy(WebsocketPolicy):
         return self._chunk(result, round_trip)
 
     def reset(self) -> None:
-        """Do nothing: the protocol has no reset, and no response depends on an earlier one."""
+        """Do nothing, because the protocol has no reset, and no response depends on an earlier request."""
 
     def request(self, observation: Observation) -> dict[str, object]:
         """Return the request map for an observation in the declared layout, without the dialect's additions."""

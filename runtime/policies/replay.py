@@ -62,8 +62,8 @@ class ReplayPolicy(Policy):
     """Policy that replays an episode: row 0 is for the first observation after a reset, later rows for later steps.
 
     After a hold, a replay in joint space continues with the row of the last chunk that is nearest to the robot's
-    joints; one in poses continues with the first row of the last chunk. A chunk beyond the end repeats the last row:
-    the robot holds there, instead of running out of rows in motion and braking beyond it.
+    joints; a replay in poses continues with the first row of the last chunk. A chunk beyond the end repeats the last
+    row, so that the robot holds there; without rows it would brake, and stop beyond that row.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:

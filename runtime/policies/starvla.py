@@ -129,7 +129,7 @@ class StarvlaPolicy(WebsocketPolicy):
         return self._chunk(reply.get("data"), round_trip)
 
     def reset(self) -> None:
-        """Do nothing: the protocol has no reset, and no response depends on an earlier one."""
+        """Do nothing, because the protocol has no reset, and no response depends on an earlier request."""
 
     def close(self) -> None:
         """Close the connection as every policy does, and stop the pings."""

@@ -23,7 +23,7 @@ _NEARER = 1e-6  # [m] rounding tolerance
 class Collision:
     """Two links ("left_arm/link5"), or a link and "table", that touch or nearly touch.
 
-    `distance` is that between the capsules that model them [m], negative if they overlap.
+    `distance` is the distance between the capsules that model them [m], negative if they overlap.
     """
 
     first: str
@@ -49,7 +49,7 @@ class Collisions:
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 
     def nearest(self, q: Float64) -> Collision | None:
-        """Return the closest pair within the margin, None if there is none."""
+        """Return the closest pair within the margin, None if no pair is."""
         apart = self._clearance.distances(q)
         return self._worst(apart, apart < self._least)
 
@@ -64,9 +64,11 @@ class Collisions:
         )
 
     def first_on_path(self, way: Float64) -> tuple[Collision, int] | None:
-        """Return the first pair that approaches while touching, and its row in `way` [T, D]; None if there is none.
+        """Return the first pair that approaches while touching, and its row in `way` [T, D]; None if there is no such
+        pair.
 
-        The path is checked with the grippers of its first row and with those of its last: they may move at any time.
+        The path is checked with the grippers of its first row and with those of its last row, because grippers may move
+        at any time.
         """
         found = [hit for end in self._ends(way) if (hit := self._hit(self._gripping(way, end))) is not None]
         return min(found, key=lambda hit: hit[1], default=None)

@@ -1,4 +1,4 @@
-"""Command filter of a careful execution node: one master, fresh finite targets within limits, a deadline.
+"""Command filter of a careful execution node: one master; targets that are fresh, finite and within limits; a deadline.
 
 Control words that switch the drives of a simulated robot (`runtime.simulation.drives`) are accepted from any client. A
 node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions`.

@@ -1,7 +1,8 @@
 """Drives of a simulated robot, on or off, with faults; `python -m runtime.simulation.drives` switches them.
 
 Control words on the node's command socket: "drives_disable", "drives_enable" (which clears all faults), and
-"drives_fault" with a `fault`, a sentence. Operators at the robot send them, so the sender need not be the master.
+"drives_fault" with a `fault`, a sentence. Operators at the robot send them, so the sender need not be the gate's
+master.
 """
 
 from __future__ import annotations

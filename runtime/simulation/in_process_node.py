@@ -1,4 +1,4 @@
-"""Simulated node within this process, for lockstep: its real messages in both directions, without sockets."""
+"""Simulated node within the station's process, for lockstep: the same messages in both directions, without sockets."""
 
 from __future__ import annotations
 

@@ -52,11 +52,11 @@ class Ticking(Protocol):
 class Node:
     """Simulated node of one robot with two sockets; call `open`, then `tick` at the rate, then `close`.
 
-    To exchange messages without sockets, call `exchange` instead. `around` replaces the environment that the options
-    name.
+    To exchange messages without sockets, call `exchange` instead. `around` is used instead of the environment that the
+    options name.
 
     Raises:
-        SetupError: If a camera or pose of the options does not exist.
+        SetupError: If a camera or pose in the options does not exist.
     """
 
     def __init__(
@@ -277,7 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def start_pose(robot: Robot, name: str) -> Float64:
-    """Return the joints [D] of a pose.
+    """Return the joints [D] of the pose `name`.
 
     Raises:
         SetupError: If the robot has no such pose; the message lists its poses.

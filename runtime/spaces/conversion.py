@@ -161,7 +161,7 @@ class ActionSpaces(EndEffectors):
         )
 
     def _layout_of(self, pose: PoseFormat | None) -> PoseRows:
-        """Return the row layout of a format; the last one is cached, because a policy uses a single format."""
+        """Return the row layout of a pose format; the last layout is cached, because a policy uses a single format."""
         wanted = CANONICAL if pose is None else pose
         if self._layout is None or self._layout.pose != wanted:
             self._layout = PoseRows(wanted, self._robot, "the policy's pose format")

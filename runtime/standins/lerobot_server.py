@@ -158,7 +158,10 @@ class LerobotServer:
         return np.array([observation.observation[name] for name in names], np.float32)
 
     def _act(self, request: Any, context: Any) -> Any:
-        """Return the actions for the pending observation; empty if none arrives in time, and after any error."""
+        """Return the actions for the pending observation.
+
+        The message is empty if no observation arrives in time, and after any error.
+        """
         try:
             observation = self._waiting.get(timeout=self._behaviour.patience)
             self._predicted.add(observation.timestep)

@@ -82,7 +82,7 @@ class RoboarenaServer(WebsocketServer):
         return found | {"url": f"{found['url']}{path}"}
 
     def serves_path(self, path: str) -> bool:
-        """Return True for any path of RoboArena's server, and for the path of vLLM-Omni."""
+        """Return True if a policy is served at this path: at any path as RoboArena, at a single path as vLLM-Omni."""
         return self._arena.variant == "roboarena" or path == VLLM_PATH
 
     def greeting(self) -> Frames | None:

@@ -20,7 +20,9 @@ _ERRORS = {"not_found": "404 Not Found", "no_login": "401 Unauthorized"}
 
 
 class RtspServer(CameraServer):
-    """Server of one H.264 track; `stamp_offset` [s] is added to the images' time stamps and may change any time."""
+    """Server of one H.264 track; `stamp_offset` [s] is added to the images' time stamps, and may be changed at any
+    time.
+    """
 
     scheme = "rtsp"
     stamp_offset = 0.0

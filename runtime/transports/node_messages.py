@@ -233,7 +233,7 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
 
 
 def _drives(name: str, given: object) -> Mapping[str, Any]:
-    """Return the state of the drives: enabled or not, and their faults; other keys are dropped."""
+    """Return the state of the drives: whether they are enabled, and their faults; other keys are dropped."""
     if not isinstance(given, dict):
         raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map")
     enabled, faults = given.get("enabled"), given.get("faults", [])

@@ -270,7 +270,7 @@ class NodeSource(Source):
             socket.close()
 
     def _handle_messages(self, payloads: list[memoryview], arrived: float) -> None:
-        """Store the newest usable message; a partial or broken message never replaces an older complete one."""
+        """Store the newest usable message of `payloads`; an unusable newer one does not replace a usable older one."""
         self._heard_at = arrived
         for payload in reversed(payloads):
             try:

@@ -28,7 +28,7 @@ _MOST_DIMENSIONS = 32
 
 
 def pack(value: object, mnp: bool = False) -> bytes:
-    """Return `value` as one message, arrays as NPY or `mnp`, numpy scalars as numbers.
+    """Return `value` as one message: arrays as MNP if `mnp`, else as NPY; numpy scalars as numbers.
 
     Raises CodecError for other types.
     """
@@ -40,10 +40,10 @@ def pack(value: object, mnp: bool = False) -> bytes:
 
 
 def unpack(payload: bytes, limit: int) -> Any:
-    """Return the value of one message; arrays of bools, integers and floats are **read-only**.
+    """Return the value in one message; arrays of bools, integers and floats are **read-only**.
 
     Raises CodecError for more than `limit` bytes, invalid msgpack, an array whose data do not fill its shape, object
-    arrays and other dtypes, and openpi's arrays (which the message names).
+    arrays and other dtypes, and for arrays in openpi's form (which the message then names).
     """
     if len(payload) > limit:
         raise CodecError(f"a message of {len(payload)} bytes exceeds the limit of {limit}")

@@ -1,4 +1,4 @@
-"""Explanations of an ssh exit, as one sentence with advice."""
+"""Explanations of why ssh ended, each as one sentence with advice."""
 
 from __future__ import annotations
 

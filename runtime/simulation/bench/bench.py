@@ -1,7 +1,7 @@
 """Objects of the simulated bench with their sizes and places, and its cameras; without robot and physics.
 
 World frame: the robot's scene, z up, the table's surface at z = 0; metres, radians. Robots are at the near side of the
-table, where y is below that of the area.
+table, where y is less than in the area for objects.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class Belt:
 class Bench:
     """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table.
 
-    `area` is where objects may be placed: x from, x to, y from, y to. The first block belongs to the task and has the
-    first of `block_colours`; the other blocks have the next colours in turn.
+    `area` bounds the places of objects: lowest x, highest x, lowest y, highest y. The first block belongs to the task
+    and has the first of `block_colours`; the other blocks have the next colours in turn.
     """
 
     block_edge: float = 0.04

@@ -1,4 +1,4 @@
-"""Painter of solids into a camera's image: back to front, with smooth edges and light from one side."""
+"""Painter of solids into a camera's image, from back to front, with smooth edges and light from one side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of fingertips that point down at a place, and paths between such poses."""
+"""Poses of fingertips that point down, and paths between such poses."""
 
 from __future__ import annotations
 

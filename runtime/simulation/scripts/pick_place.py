@@ -111,7 +111,7 @@ class PickPlace(Script):
 
 
 class EpisodeNoise:
-    """Random errors of one episode: the same for the same seed and episode number."""
+    """Random errors of one episode, which depend only on the seed and the episode's number."""
 
     def __init__(self, skill: Skill, episode: int, edge: float) -> None:
         self._chance = np.random.default_rng([skill.seed, episode])

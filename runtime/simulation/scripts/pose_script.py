@@ -94,7 +94,9 @@ def _rows(pose: PoseFormat, robot: Robot) -> PoseRows:
 
 
 def _vectors(arm: Group, joints: Float64) -> Float64:
-    """Return the end-effector vectors [H, 8] of one arm for joint rows [H, D]; the gripper is 0 if there is none."""
+    """Return the end-effector vectors [H, 8] of one arm for joint rows [H, D]; without a gripper the last
+    number is 0.
+    """
     vectors = np.zeros((len(joints), EEF_WIDTH))
     vectors[:, : EEF_WIDTH - 1] = arm.pose(joints)
     if arm.gripper_dim is not None:

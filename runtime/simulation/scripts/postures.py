@@ -272,12 +272,12 @@ def jaws(arm: Group) -> Gripper:
 
 
 def opened(arm: Group, q: Float64) -> Float64:
-    """Return joints [..., D] with an arm's jaws open, but short of their limit, near which safety slows them."""
+    """Return joints [..., D] with an arm's jaws open, but not up to their limit, near which safety slows them."""
     return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).open, jaws(arm).close)
 
 
 def closed(arm: Group, q: Float64) -> Float64:
-    """Return joints [..., D] with an arm's jaws closed, but short of their limit."""
+    """Return joints [..., D] with an arm's jaws closed, but not up to their limit."""
     return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).close, jaws(arm).open)
 
 

@@ -88,7 +88,7 @@ class JointOrder:
 
 
 def _optional_values(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
-    """Return velocity or effort in the given order; None if the driver leaves them empty or too short."""
+    """Return velocity or effort in the given order; None if a value is not finite or their number is wrong."""
     if len(numbers) != len(message.position):
         return None
     chosen = numbers[order]

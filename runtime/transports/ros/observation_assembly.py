@@ -125,7 +125,10 @@ class Assembly:
         return times
 
     def _vectors(self, values: Mapping[str, Value]) -> tuple[Float32, Float32 | None, Float32 | None]:
-        """Return position, velocity, effort of the whole robot [D]; the last two only if every group reports them."""
+        """Return position, velocity and effort of the whole robot [D].
+
+        Velocity and effort are None unless every group reports them.
+        """
         positions, velocities, efforts = [], [], []
         for group in self._robot.groups:
             arm = values[f"{group.name} joints"]

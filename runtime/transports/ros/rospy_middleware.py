@@ -109,7 +109,7 @@ class TcpRosMiddleware(Middleware):
         return RospyProcess(self._site, f"{self._name}_{uuid.uuid4().hex[:12]}")
 
     def _run(self) -> None:
-        """Run the thread: read from one child after the other."""
+        """Run the thread: read from a child until it ends, then from the next one."""
         child = self._start_child(0.0)
         while child is not None:
             self._farewell = ""

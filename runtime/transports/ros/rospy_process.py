@@ -46,7 +46,7 @@ class RosEnvironment:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Environment variables of this process, with those that rospy reads replaced."""
+        """Environment variables for the child: those of this process, with those that rospy reads replaced."""
         kept = {
             name: value
             for name, value in os.environ.items()

@@ -55,7 +55,7 @@ class RosSink(Sink):
     def send(self, command: RobotCommand) -> None:
         """Publish one absolute target.
 
-        Raises TransportError for a wrong width, numbers that are not finite, or no poses.
+        Raises TransportError for a wrong width, numbers that are not finite, or missing poses.
         """
         if self._middleware is None:
             raise TransportError("the command topics are not advertised; connect before sending")
