@@ -55,7 +55,7 @@ class RecorderCost:
     peak_mb: float
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields as JSON."""
+        """Return the fields by name, as values for JSON."""
         return asdict(self)
 
 

@@ -114,9 +114,9 @@ def _case(protocol: Protocol, robot: Robot, seconds: float) -> Row:
 
 
 def _round(opened: Sequence[Opening], seconds: float) -> list[Timed]:
-    """Measure each client with a new connection.
+    """Measure each client for `seconds` with a new connection.
 
-    The connection is new because the placement of its threads on processors is random.
+    Several rounds are needed, because the placement of a connection's threads on processors is random.
     """
     with contextlib.ExitStack() as stack:
         return in_turn([stack.enter_context(opening()) for opening in opened], seconds)
@@ -183,7 +183,7 @@ def observation(robot: Robot) -> Observation:
 
 
 def absent(protocol: Protocol, robot: Robot) -> str:
-    """Return the names of the software that is missing for a protocol, "" if nothing is missing."""
+    """Return why a protocol cannot be measured on this machine, "" if it can."""
     try:
         _policy(protocol, robot)
     except ConfigurationError as error:

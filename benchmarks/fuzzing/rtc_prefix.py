@@ -215,7 +215,7 @@ class PrefixKeepingPolicy(Policy):
         return f"is {off[worst]:.2e} off in number {worst}, allowed {allowed[worst]:.2e}"
 
     def _bend(self, before: int, planned: dict[int, Float64]) -> Float64:
-        """Return the curvature of the plan around a step: the error of interpolation between the steps next to it."""
+        """Return the curvature of the plan around a step: the largest second difference of the planned rows there."""
         rows = [self._of(planned[step]) for step in range(before - 2, before + 4) if step in planned]
         steps = [self._difference(later, sooner) for sooner, later in pairwise(rows)]
         bends = [np.abs(later - sooner) for sooner, later in pairwise(steps)]

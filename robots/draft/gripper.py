@@ -45,9 +45,10 @@ class GripperDraft:
 
 
 def end_link(tree: Urdf, limb: GroupGuess) -> str:
-    """Return an arm's end effector.
+    """Return the end effector of an arm.
 
-    That is a leaf after its last joint with a typical name, else the link that carries the fingers.
+    With fingers it is a link after the last joint that is named as for grasping, else the link that carries the
+    fingers. Without, it is a leaf after the last joint with a typical name, else the link that the last joint moves.
     """
     last = tree.joint(limb.joints[-1]).child
     if limb.fingers:

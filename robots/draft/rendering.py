@@ -143,7 +143,7 @@ def _numbers(numbers: Iterable[float]) -> str:
 
 
 def render_readme(name: str, sheet: RobotDraft, pictures: MeshCopyReport) -> str:
-    """Return the README with a checklist of guesses to verify."""
+    """Return the text of the README, with a checklist of guesses to verify."""
     numbers = sum(len(group.numbers) for group in sheet.groups if not group.optional)
     lines = [
         f"# {sheet.title}",

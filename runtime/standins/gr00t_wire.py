@@ -42,9 +42,9 @@ def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
 
 
 def unpacked(payload: bytes, npy: bool = True, mnp: bool = True) -> Any:
-    """Unpack one message with arrays as .npy if `npy`, as msgpack_numpy if `mnp`; other arrays remain maps.
+    """Unpack one message; arrays are read as .npy if `npy`, and as msgpack_numpy encodes them if `mnp`.
 
-    GR00T's server leaves them as maps, too.
+    Arrays in other formats remain maps, as in GR00T's server.
     """
 
     def read(fields: dict[Any, Any]) -> object:

@@ -59,7 +59,7 @@ class OpenpiServer(WebsocketServer):
         self._wire = WIRES[behaviour.rtc](self._space, behaviour.horizon, behaviour.fault)
 
     def greeting(self) -> Frames | None:
-        """Return the metadata."""
+        """Return the metadata, which are the first frame of a connection."""
         metadata = dict(self._script.metadata) | self._wire.metadata()
         if self._behaviour.fault.name == "action_mode":
             metadata["action_mode"] = self._behaviour.fault.argument

@@ -205,7 +205,7 @@ class DdsMiddleware(Middleware):
             _domains.leave(self._domain)
 
     def _create_endpoint(self, kind: Any, topic: Topic, life: bool) -> Any:
-        """Create a reader or writer of the topic."""
+        """Create a reader or writer (`kind`) of the topic."""
         from cyclonedds.core import DDSException
         from cyclonedds.topic import Topic as DdsTopic
 
