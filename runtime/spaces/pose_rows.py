@@ -93,7 +93,7 @@ class PoseRows:
         first row is written close to it; with `previous` [T, width] each row is written close to the corresponding row.
 
         Raises:
-            PolicyError: A quaternion is zero or not finite.
+            PolicyError: A quaternion is nearly zero or not a number.
         """
         upright = self.normalize_quaternions(vectors)
         appended = np.broadcast_to(joints, (len(vectors), joints.shape[-1]))[:, self.dims]
@@ -145,7 +145,7 @@ class PoseRows:
         """Return the vectors [T, arms, 8] with unit quaternions; signs are unchanged, as a robot chooses its own.
 
         Raises:
-            PolicyError: a quaternion has no direction; the message begins with `whose`.
+            PolicyError: A quaternion is nearly zero or not a number; the message begins with `whose`.
         """
         codec = QuaternionOrientation(scalar_first=True)
         made = vectors.copy()
