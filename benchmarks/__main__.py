@@ -39,7 +39,7 @@ _SECONDS = 20.0
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Run a benchmark; return 0 if every figure with a requirement meets it, else 1."""
+    """Run a benchmark; return 0 if every figure that has a requirement meets it, else 1."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("name", choices=_BENCHMARKS)
     parser.add_argument(

@@ -1,7 +1,7 @@
 """Lab for measurements: `python -m benchmarks.busy_lab READY_FILE --set KEY=VALUE ...`; ends with Ctrl-C.
 
-Tabletop bench with three cameras of 640x480 at 30 Hz, a policy whose motion never ends, web and worker, with the
-processes of any lab. Data are in EVA_DATA_DIR.
+Tabletop bench with three cameras of 640x480 at 30 Hz, a policy whose motion never ends, and the web, the worker and the
+other processes of any lab. Data are in EVA_DATA_DIR.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PATIENT = (
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Run the lab until a signal."""
+    """Run the lab until a signal arrives."""
     import django
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -1,8 +1,7 @@
-"""Lab whose processes are killed while trials are run and scored; at the end everything that it acknowledged is
-counted.
+"""Lab whose processes are killed while trials are run and scored; at the end, everything it acknowledged is counted.
 
 Lab and one station with a simulated robot are connected over loopback, each with its own data folder. Depending on the
-seed, processes of either are killed (SIGKILL), or the link is stopped for seconds (SIGSTOP), as if it were cut. Never
+seed, processes of either are killed (SIGKILL), or the link is paused for seconds (SIGSTOP), as if it were cut. Never
 killed are the supervisors of lab and station, which restart the others, and the simulated robot and policy. A station
 whose processes end six times within a minute ends for good, so at most four are killed per minute.
 """
@@ -51,7 +50,7 @@ _OF_STATION = ("control", "coordinator", "reception", "media", "guard", "link")
 
 @dataclass(frozen=True, slots=True)
 class Act:
-    """Request acknowledged with 2xx: `prepare`, `run` with its episode, or `score` with its uuid."""
+    """Request that was acknowledged with status 2xx: `prepare`, `run` with its episode, or `score` with its uuid."""
 
     kind: str
     trial: int
@@ -61,7 +60,7 @@ class Act:
 
 @dataclass(slots=True)
 class DataAtEnd:
-    """Contents of database and data folders at the end."""
+    """Contents of the database and of both data folders at the end."""
 
     trials: dict[int, str] = field(default_factory=dict)  # status
     scores: list[tuple[int, str]] = field(default_factory=list)  # trial, uuid
@@ -77,7 +76,7 @@ _OVER = ("scored", "voided", "abandoned")
 
 
 def counted(acts: Iterable[Act], found: DataAtEnd) -> dict[str, list[str]]:
-    """Return the faults by figure: everything lost, duplicated or stuck."""
+    """Return the faults by figure: everything that was lost, exists twice or remained unfinished."""
     acts = list(acts)
     runs = {act.episode: act for act in acts if act.kind == "run" and act.uuid not in found.unopened}
     scores = {act.uuid for act in acts if act.kind == "score"}
@@ -101,7 +100,7 @@ def counted(acts: Iterable[Act], found: DataAtEnd) -> dict[str, list[str]]:
 
 
 class _Operator(threading.Thread):
-    """Thread that prepares, runs, ends and scores trials over REST, and records what was acknowledged."""
+    """Thread that prepares, runs, ends and scores trials over REST, and records each acknowledged request."""
 
     def __init__(self, running: RunningLab, chance: random.Random) -> None:
         super().__init__(daemon=True)
@@ -118,7 +117,7 @@ class _Operator(threading.Thread):
             self.once()
 
     def once(self) -> bool:
-        """Run one trial, or finish the open one; return True if it was completed."""
+        """Run one trial from begin to end, or finish the open one; return True if it was completed."""
         try:
             return self._trial()
         except (
@@ -129,7 +128,7 @@ class _Operator(threading.Thread):
             return False
 
     def leave_none(self, number: int) -> str:
-        """Score a trial that was left open, or void it; return "" or why neither was possible."""
+        """Score a trial that was left open, or void it; return "", or the reason if neither was possible."""
         try:
             self._end(number)
             return ""
@@ -199,7 +198,10 @@ class _Operator(threading.Thread):
             self.acts.append(act)
 
     def _request(self, verb: str, *given: Any, again: bool = True) -> Mapping[str, Any]:
-        """Return the answer; requests without an answer, or with unknown outcome (504), are repeated."""
+        """Send a request by the client's method `verb` and return the answer.
+
+        With `again`, a request without an answer, or with an unknown outcome (504), is repeated.
+        """
         until = time.monotonic() + _PATIENCE_S
         while True:
             try:
@@ -222,7 +224,7 @@ class _Operator(threading.Thread):
 
 
 def _name(process: psutil.Process) -> str:
-    """Return the name of a process of lab or station, "" for others."""
+    """Return the name of a process that belongs to lab or station, "" for any other process."""
     words = process.cmdline()
     found = [name for name in _OF_LAB if any(one.endswith("manage.py") for one in words) and name in words]
     found += [name for name in _OF_STATION if f"runtime.processes.{name}.process" in words]
@@ -231,7 +233,7 @@ def _name(process: psutil.Process) -> str:
 
 
 def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
-    """Return the current processes by name, the first of each."""
+    """Return the current processes by name; of several with the same name the first."""
     found: dict[str, psutil.Process] = {}
     for parent in parents:
         for child in parent.children(recursive=False):
@@ -244,7 +246,7 @@ def _ours(*parents: psutil.Process) -> dict[str, psutil.Process]:
 
 
 def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Random) -> Counter[str]:
-    """Kill and stop processes for `seconds`; return the counts by name."""
+    """Kill and pause processes for `seconds`; return how often, by name."""
     done: Counter[str] = Counter()
     of_station: list[float] = []
     until = time.monotonic() + seconds
@@ -270,8 +272,9 @@ def _hurt(parents: tuple[psutil.Process, ...], seconds: float, chance: random.Ra
 
 
 def measure(seconds: float, seed: int | None = None) -> Report:
-    """Measure `lost_episodes`, `lost_scores`, `lost_trials`, `doubled`, `stuck_trials`, `lost_after_delete`
-    after `seconds`.
+    """Kill processes for `seconds`, then measure what was lost.
+
+    The figures are `lost_episodes`, `lost_scores`, `lost_trials`, `doubled`, `stuck_trials` and `lost_after_delete`.
     """
     seed = secrets.randbelow(2**31) if seed is None else seed
     chance = random.Random(seed)
@@ -317,7 +320,7 @@ def measure(seconds: float, seed: int | None = None) -> Report:
 
 
 def _rows(policy: str) -> None:
-    """Create scene and checkpoint of the trials."""
+    """Create the scene and the checkpoint of the trials, whose policy server has the url `policy`."""
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     import django
 
@@ -329,7 +332,7 @@ def _rows(policy: str) -> None:
 
 
 def _at_rest(operator: _Operator, robot: Path, data: Path) -> DataAtEnd:
-    """Run one more trial, wait for transfers, finish what was left, reconcile, and return the contents."""
+    """Run one more trial, wait for transfers, finish open trials, reconcile, and return the contents."""
     from evaweb.stations.models import Command
     from evaweb.trials.models import Score, Trial
 

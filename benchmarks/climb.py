@@ -1,4 +1,4 @@
-"""Number of stations, and of pages on one of them, that a lab supports: doubled until an answer is too late.
+"""Number of stations, and of pages on one station, that a lab supports: doubled until an answer is too late.
 
 Everything is on this machine: the lab, stations with simulated robots, pages. The bottleneck at the failing step need
 not be the lab.
@@ -30,7 +30,7 @@ _STATION_BYTES = 500e6  # memory per additional station, with its robot
 
 @dataclass(frozen=True, slots=True)
 class _Rung:
-    """Step with a number of stations or pages: delays of presses and pages, and processor load."""
+    """Measured step with `count` stations or pages: delays of presses and pages, and processor load."""
 
     count: int
     estop_p99_ms: float
@@ -46,7 +46,7 @@ class _Rung:
 
     @property
     def saturated(self) -> str:
-        """What was too late, and which resource was saturated."""
+        """Text that states which answers were too late, and which resource was saturated."""
         late = "presses" if self.estop_p99_ms > _ESTOP_MS else "pages"
         if self.machine_percent >= _FULL * (psutil.cpu_count() or 1):
             return (
@@ -57,7 +57,7 @@ class _Rung:
         return f"{late}, with no processor full"
 
     def row(self, what: str) -> dict[str, Any]:
-        """Return the row of the report."""
+        """Return the step as a row of the report; `what` is "stations" or "viewers"."""
         return {
             what: self.count,
             **{name: getattr(self, name) for name in self.__slots__ if name != "count"},
@@ -67,9 +67,10 @@ class _Rung:
 def stations(
     running: RunningLab, add: Callable[[str], None], names: list[str], seconds: float
 ) -> tuple[list[Figure], list[Mapping[str, Any]]]:
-    """Measure `stations_max`: presses alternate between the stations, each of which has one open page.
+    """Measure `stations_max`: the largest number of stations at which answers are in time.
 
-    The first of `names` is running already; `add` starts one more.
+    Presses alternate between the stations, each of which has one open page. The first of `names` is running already;
+    `add` starts one more.
     """
     rungs: list[Any] = []
     up = 1
@@ -86,7 +87,10 @@ def stations(
 
 
 def viewers(running: RunningLab, name: str, seconds: float) -> tuple[list[Figure], list[Mapping[str, Any]]]:
-    """Measure `viewers_max`: a growing number of pages shows one station, which is pressed meanwhile."""
+    """Measure `viewers_max`: the largest number of pages on one station at which answers are in time.
+
+    The station's e-stop is pressed at every step.
+    """
     rungs, count = [], 10
     while count <= _MOST_VIEWERS:
         rungs.append(_rung(running, [name], count, count, seconds))
@@ -105,7 +109,7 @@ def _told(what: str, rungs: list[_Rung], otherwise: str) -> tuple[list[Figure], 
 
 
 def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds: float) -> _Rung:
-    """Open `pages` on each of `names` for `seconds`, press in turn, and return the measured step."""
+    """Open `pages` pages in all on the stations `names` for `seconds`, press in turn, and return the measured step."""
     watching = [watch(running.visitor, seconds, station=name, reading=pages) for name in names]
     open_pages = [OpenPage(running.visitor, running.announced["stops"], name) for name in names]
     taken: list[float] = []
@@ -132,7 +136,7 @@ def _rung(running: RunningLab, names: list[str], pages: int, count: int, seconds
 
 
 def _used() -> dict[str, float]:
-    """Return the processor time of every process by name and id [s]; that of the whole machine under ""."""
+    """Return the processor time [s] of every process by name and id; under "" that of the whole machine."""
     found: dict[str, float] = {}
     for process in psutil.process_iter():
         try:

@@ -1,4 +1,4 @@
-"""Station in lockstep at the simulated conveyor: node, transport and policy in this process, without sockets."""
+"""Station in lockstep at the simulated conveyor: node, transport and policy are in this process, without sockets."""
 
 from __future__ import annotations
 
@@ -45,13 +45,15 @@ def _renderer(robot: str) -> Renderer:
 
 @cache
 def _places(robot: str) -> PlaceMap:
-    """Return the joints of a robot for positions of the belt, shared by all stations of this process."""
+    """Return the map from positions of the belt to a robot's joints, shared by all stations of this process."""
     assert CONVEYOR.belt is not None
     return PlaceMap(robots.load_robot(robot), CONVEYOR.belt)
 
 
 class DeferredPicturesEnvironment(Environment):
-    """Conveyor environment whose images are stamps with the frame number; `render` draws the image on demand."""
+    """Conveyor environment whose images contain only the frame number; `render` draws the image of a frame on
+    demand.
+    """
 
     def __init__(self, robot: Robot, conveyor: Conveyor) -> None:
         self.conveyor = conveyor
@@ -60,11 +62,11 @@ class DeferredPicturesEnvironment(Environment):
         self._frames: OrderedDict[int, tuple[Float64, BenchState]] = OrderedDict()
 
     def move(self, plant: Plant, seconds: float) -> None:
-        """Advance the plant, and objects that its fingers touch."""
+        """Advance the plant, and the objects that its fingers touch."""
         self.conveyor.advance(plant, seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """Return a stamp for each camera, uint8 [4, 4, 3]."""
+        """Return for each camera an image with only the frame number, uint8 [4, 4, 3]."""
         self._frames[frame] = q.copy(), self.conveyor.state()
         if len(self._frames) > _KEPT:
             self._frames.popitem(last=False)
@@ -72,7 +74,7 @@ class DeferredPicturesEnvironment(Environment):
         return {key: np.broadcast_to(digits[:, None, None], (4, 4, 3)).copy() for key in self._keys}
 
     def render(self, stamp: UInt8) -> dict[str, UInt8]:
-        """Return the overhead image of the frame in a stamp, RGB [H, W, 3] by key."""
+        """Return the overhead image of the frame whose number is in `stamp`, RGB [H, W, 3] by camera key."""
         q, state = self._frames[int.from_bytes(stamp[:, 0, 0].tobytes(), "big")]
         drawn = self._renderer.draw(q, state)
         return {key: np.ascontiguousarray(bgr[..., ::-1]) for key, bgr in drawn.items()}
@@ -82,12 +84,12 @@ class DeferredPicturesEnvironment(Environment):
         return self.conveyor.truth()
 
     def reset(self, wish: ResetRequest) -> None:
-        """Reset the conveyor with another course."""
+        """Reset the conveyor with another motion of the belt."""
         self.conveyor.reset(wish)
 
 
 class ScriptPolicy(Policy):
-    """Script as a policy in this process, with rendered images."""
+    """Policy in this process that answers with the rows of a script, for rendered images."""
 
     def __init__(self, script: ChaseScript, gallery: DeferredPicturesEnvironment) -> None:
         self._script, self._gallery = script, gallery
@@ -111,11 +113,11 @@ class ScriptPolicy(Policy):
         self._answer = self._script.begin()
 
     def close(self) -> None:
-        """Do nothing: there are no resources."""
+        """Do nothing, because there are no resources."""
 
 
 def station_at(data: Path, strategy: Mapping[str, Any], delay: int, seed: int) -> tuple[Conveyor, Lockstep]:
-    """Return the conveyor with the course of `seed`, and a station at it that records nothing."""
+    """Return the conveyor with the motion that `seed` decides, and a station with it that records nothing."""
     tree: dict[str, Any] = {
         "station": "conveyor",
         "robot": "agilex_piper",

@@ -1,4 +1,4 @@
-"""Coverage of the displayed 95 % intervals, from the smallest number of trials and for skewed outcomes."""
+"""Coverage of the displayed 95 % intervals, from the smallest number of trials on, and for skewed outcomes."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ Chance = np.random.Generator
 
 
 class Case(NamedTuple):
-    """Way of generating outcomes.
+    """Kind of outcomes for which the coverage of an interval is measured.
 
-    `holds` is whether the interval of `n` outcomes contains the truth, `fewest` the smallest n with an interval, and
-    `wanted` the requirement, "" if the coverage is only reported.
+    `holds` generates `n` outcomes and returns whether their interval contains the truth. `fewest` is the smallest n
+    with an interval, and `wanted` the requirement, "" if the coverage is only reported.
     """
 
     holds: Callable[[Chance, int, int], bool]
@@ -61,7 +61,7 @@ def covered(case: Case, n: int, *, runs: int, draws: int) -> float:
 
 
 def _mean(truth: float, draw: Callable[[Chance, int], NDArray[np.float64]]) -> Case:
-    """Return the case of scores of one checkpoint."""
+    """Return the case of the scores of one checkpoint, which `draw` generates with the mean `truth`."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         outcomes = draw(chance, n).tolist()
@@ -71,7 +71,7 @@ def _mean(truth: float, draw: Callable[[Chance, int], NDArray[np.float64]]) -> C
 
 
 def _scenes(*rates: float) -> Case:
-    """Return the case of successes over scenes, n trials in each."""
+    """Return the case of successes over several scenes, n trials in each."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         scenes = {str(i): (chance.random(n) < rate).tolist() for i, rate in enumerate(rates)}
@@ -82,7 +82,9 @@ def _scenes(*rates: float) -> Case:
 
 
 def _conditions(first: float, second: float, spread: float, trials: int) -> Case:
-    """Return the case of two checkpoints over conditions in which the first one's rate varies by up to `spread`."""
+    """Return the case of two checkpoints over conditions between which the first one's rate varies by up to
+    `spread`.
+    """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = first + spread * chance.uniform(-1, 1, n)
@@ -97,7 +99,7 @@ def _conditions(first: float, second: float, spread: float, trials: int) -> Case
 
 
 def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
-    """Return the case of successes of two checkpoints with uniform random rates."""
+    """Return the case of successes of two checkpoints whose rates are uniform random."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         rates = chance.random(2)
@@ -110,7 +112,7 @@ def _rate_of_two(interval: Callable[[int, int, int, int], Interval]) -> Case:
 def _rate(
     interval: Callable[[int, int], Interval | None], given: float | None = None, wanted: str = _WANTED
 ) -> Case:
-    """Return the case of successes of one checkpoint, at a uniform random or `given` rate."""
+    """Return the case of successes of one checkpoint whose rate is `given`, or uniform random."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         truth = chance.random() if given is None else given
@@ -125,7 +127,7 @@ def _per_hour(chance: Chance, n: int, draws: int) -> bool:
 
 
 def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, wanted: str) -> Case:
-    """Return the case of one number per trial."""
+    """Return the case of the mean of one number per trial, which `draw` generates with the mean `truth`."""
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
         found = average(draw(chance, n).tolist())
@@ -135,8 +137,9 @@ def _student(draw: Callable[[Chance, int], NDArray[np.float64]], truth: float, w
 
 
 def _anytime(first: float, second: float) -> Case:
-    """Return the case of successes of two checkpoints in pairs; valid after every pair, because exclusion is
-    permanent.
+    """Return the case of successes of two checkpoints in pairs.
+
+    Its interval has to contain the truth after every pair, because what it once excludes stays excluded.
     """
 
     def holds(chance: Chance, n: int, draws: int) -> bool:
@@ -148,8 +151,9 @@ def _anytime(first: float, second: float) -> Case:
 
 
 def _preferred(chance: Chance, n: int, draws: int) -> bool:
-    """Return whether the interval holds for comparisons of two checkpoints, one worth e times the other; if
-    it is shown.
+    """Return True if the interval contains the truth for comparisons of two checkpoints, one worth e times the other.
+
+    Also True if no interval is shown.
     """
     weights = np.array([math.e, math.exp(0.5), 1.0])  # Davidson's weights with frequent ties
     said = chance.choice(["first", "tie", "second"], n, p=weights / weights.sum()).tolist()

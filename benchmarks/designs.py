@@ -1,7 +1,7 @@
 """Error and power of each design of a comparison, and coverage of the intervals that are shown with it.
 
-Exact for successes and failures, simulated otherwise. Reference values: STEP (Snyder et al. 2025), a near-optimal
-sequential test of two policies, as measured by us.
+The figures are exact for successes and failures, simulated otherwise. Reference values are those that we measured for
+STEP (Snyder et al. 2025), a near-optimal sequential test of two policies.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ Courses = list[dict[str, object]]
 
 
 class Case(NamedTuple):
-    """Design without its number of pairs; there is a look after `every` this many pairs.
+    """Design of a comparison, without its number of pairs; there is a look after every `every` pairs.
 
-    `random`: two checkpoints in random order, in blocks of two trials at ten conditions.
+    If `random`, the trials of two checkpoints are in random order, in blocks of two trials at ten conditions.
     """
 
     rule: str
@@ -72,7 +72,7 @@ class Case(NamedTuple):
 
 
 class SimulatedPower(NamedTuple):
-    """Power, median number of pairs, and standard error of a simulated power."""
+    """Power, median number of pairs, and the standard error of the power if it is simulated."""
 
     power: float
     median: float
@@ -108,10 +108,10 @@ STEP = {((0.5, 0.7), 50): (0.464, 50), ((0.5, 0.8), 50): (0.838, 29), ((0.5, 0.7
 
 
 def measure(seconds: float, long: bool = False) -> Report:
-    """Measure `type1.DESIGN.N`, `power.`, `median_pairs.` and `bias.WHAT.DESIGN.P0.P1.N`, `drift.DESIGN.N`, and
-    coverage.
+    """Measure error and power of the designs, and the coverage of their intervals.
 
-    With `long` designs of 250 pairs too; an interrupted measurement is continued.
+    The figures are `type1.DESIGN.N`, `power.` and `median_pairs.` of DESIGN.P0.P1.N, `bias.WHAT.DESIGN.P0.P1.N` and
+    `drift.DESIGN.N`. With `long` designs of 250 pairs are measured, too; an interrupted measurement is continued.
     """
     rows: Courses = []
     kept = PartStore() if long else None
@@ -138,8 +138,9 @@ def _parts(sizes: Sequence[int]) -> Iterator[tuple[str, Part]]:
 
 
 class PartStore:
-    """Store of the completed parts of a long measurement, which can then be continued; keyed by a hash of its
-    sources.
+    """Store of the completed parts of a long measurement, so that it can be continued.
+
+    Its file is named by a hash of the sources, so that changed sources begin anew.
     """
 
     def __init__(self) -> None:
@@ -151,7 +152,7 @@ class PartStore:
         self._done: dict[str, dict[str, Any]] = {part["name"]: part for part in map(json.loads, lines)}
 
     def once(self, name: str, part: Part, rows: Courses) -> list[Figure]:
-        """Return the figures of a part and add its rows; computed only if not stored."""
+        """Return the figures of a part and add its rows to `rows`; they are computed only if they are not stored."""
         if name not in self._done:
             own: Courses = []
             figures = [asdict(figure) for figure in part(own)]
@@ -163,7 +164,7 @@ class PartStore:
 
 
 def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
-    """Yield the largest error over all common rates, with a bound between them.
+    """Yield the largest error over all common rates; between computed rates it is bounded.
 
     Simulated errors may exceed alpha by three standard errors.
     """
@@ -181,7 +182,8 @@ def error_of(name: str, case: Case, n: int, rows: Courses) -> Iterator[Figure]:
 def powers(rows: Courses) -> Iterator[Figure]:
     """Yield the power of each design, and of scipy's Barnard test for comparison.
 
-    Required: *late* within 0.05 of a fixed number's, *early* within 0.02 of STEP's with at most a tenth more pairs.
+    Required is for *late* at most 0.05 less than for a fixed number of pairs, for *early* at most 0.02 less than for
+    STEP, with at most a tenth more pairs.
     """
     for name, case in DESIGNS.items():
         for rates, n in SAME if case.margin else DIFFERENT:
@@ -203,7 +205,7 @@ def estimates(rows: Courses) -> Iterator[Figure]:
     """Yield the bias of the difference, raw and corrected for early stopping, and the coverage of the corrected
     interval.
 
-    Computed exactly, over every table at which the design ends.
+    Both are computed exactly, over every table at which the design ends.
     """
     for name in ("late", "early"):
         exact = boundary_of(DESIGNS[name], SIZES[0])
@@ -223,7 +225,7 @@ def estimates(rows: Courses) -> Iterator[Figure]:
 
 
 def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, int], float]]:
-    """Yield every table at which the design ends (successes and trials of both arms) with its probability."""
+    """Yield every table at which the design ends (successes and trials of both arms), with the table's probability."""
     pairs = exact.looks[-1].first
     alive = np.zeros((pairs + 1, pairs + 1))
     alive[0, 0] = 1.0
@@ -239,9 +241,9 @@ def _ends(exact: Boundary, rates: Rates) -> Iterator[tuple[tuple[int, int, int, 
 
 
 def drifts(rows: Courses) -> Iterator[Figure]:
-    """Yield the largest error found for common rates that change over time; only reported.
+    """Yield the largest error found for common rates that change over time; it is only reported.
 
-    The designs assume constant rates; `type1` is their error for these.
+    The designs assume constant rates; `type1` is their error for those.
     """
     for name, (case, n) in DRIFTING.items():
         exact = boundary_of(case, n)
@@ -253,8 +255,9 @@ def drifts(rows: Courses) -> Iterator[Figure]:
 
 @lru_cache(maxsize=64)
 def boundary_of(case: Case, pairs: int) -> Boundary | None:
-    """Return the design's exact boundary; None for an e-process, or for scores. Barnard's test is a boundary
-    with one look.
+    """Return the design's exact boundary; None for an e-process, or for scores.
+
+    Barnard's test is a boundary with one look.
     """
     if case.rule == ANYTIME or case.outcome == SCORE:
         return None
@@ -282,7 +285,7 @@ def _in_random_order(blocks: int) -> list[Unit]:
 def families(rows: Courses) -> Iterator[Figure]:
     """Yield how often any of several comparisons of equal checkpoints is significant, with and without dropping.
 
-    Simulated; allowed are three standard errors above alpha.
+    This is simulated; three standard errors above alpha are allowed.
     """
     three = ((0, 1), (0, 2), (1, 2))
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
@@ -302,10 +305,11 @@ def families(rows: Courses) -> Iterator[Figure]:
 
 
 def choices(rows: Courses) -> Iterator[Figure]:
-    """Yield figures on choosing the best of several checkpoints, with all trials made or with dropping.
+    """Yield figures on choosing the best of several checkpoints, with all trials or with dropping.
 
-    How often a wrong checkpoint is called the best, how often the best one is, how often the highest rate among the
-    remaining ones is not that of the best, and the median number of trials. Among equal checkpoints none is the best.
+    They are: how often a wrong checkpoint is called the best, how often the best one is, how often the highest rate
+    among the remaining ones is not that of the best, and the median number of trials. Among equal checkpoints none is
+    the best.
     """
     allowed = ALPHA + 3 * math.sqrt(ALPHA * (1 - ALPHA) / _RUNS)
     for rates in _CHOICES:
@@ -337,7 +341,10 @@ def choices(rows: Courses) -> Iterator[Figure]:
 
 
 def _least(n: int, alpha: float) -> tuple[int, int] | None:
-    """Return the least extreme table that is significant in Barnard's test; all more extreme ones are too."""
+    """Return the least extreme table that is significant in Barnard's test, as successes of both arms; None if none is.
+
+    All more extreme tables are significant, too.
+    """
     tables = sorted(
         ((a, b) for a in range(n + 1) for b in range(a)),
         key=lambda table: operator.truediv(*extremeness_of(table[0], n, table[1], n, None)),
@@ -351,9 +358,10 @@ def _least(n: int, alpha: float) -> tuple[int, int] | None:
 
 
 def worst_drift(exact: Boundary) -> tuple[float, tuple[float, ...]]:
-    """Return the largest error found, and the rates at start, middle and end of its piecewise linear course.
+    """Return the largest error found, and the common rates at start, middle and end with which it occurs.
 
-    Straight lines from a grid of angles, then successively finer steps of all three around the best.
+    The rate is piecewise linear in time. The search begins with straight lines from a grid, then varies all three rates
+    around the best in ever finer steps, each as the angle whose squared sine is the rate.
     """
     angles = np.linspace(0.05, math.pi / 2 - 0.05, _GRID)
     lines = [(one, (one + other) / 2, other) for one, other in product(angles, repeat=2)]
@@ -377,9 +385,9 @@ def _worst(exact: Boundary, knots: Sequence[tuple[float, ...]]) -> tuple[float, 
 
 
 def errors_at(exact: Boundary, rates: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the errors for courses of the common rate before each pair, `rates` [courses, pairs]: float64 [courses].
+    """Return the errors float64 [courses] for common rates before each pair, `rates` [courses, pairs].
 
-    With a margin both rates differ by it: the second is `1 - margin` times the course.
+    With a margin, the second rate is (1 - margin) times the given one, and the first is larger by the margin.
     """
     margin = exact.margin or 0.0
     pairs = exact.looks[-1].first
@@ -408,7 +416,7 @@ def _runs(case: Case) -> int:
 
 @lru_cache(maxsize=256)
 def _found(case: Case, rates: Rates, pairs: int) -> SimulatedPower:
-    """Return power and median at these rates, exact if possible."""
+    """Return power and median number of pairs at these rates, exact if possible."""
     if exact := boundary_of(case, pairs):
         ended = exact.operating_characteristics(*rates)
         return SimulatedPower(ended.power, ended.median // 2)
@@ -419,7 +427,10 @@ def _found(case: Case, rates: Rates, pairs: int) -> SimulatedPower:
 
 
 def _simulated(case: Case, rates: Rates, pairs: int) -> SimulatedPower:
-    """Return power and median for scores that are shares of milestones, each reached with these probabilities."""
+    """Return power and median number of pairs for scores that are shares of milestones.
+
+    Each milestone is reached with the probability in `rates`.
+    """
     chance = np.random.default_rng(pairs)
     planned = design(rule=case.rule, blocks=pairs, alpha=case.alpha, outcome=case.outcome)
     scores = chance.binomial(_STEPS, rates, size=(_RUNS, pairs, 2)) / _STEPS
@@ -437,7 +448,7 @@ def _error(share: float, runs: int) -> float:
 
 
 def _of_scipy(rates: Rates, n: int) -> float:
-    """Return the power of scipy's test, by enumeration; tables that are equal by symmetry are tested once."""
+    """Return the power of scipy's test, by enumeration of all tables; of tables equal by symmetry one is tested."""
     from scipy.stats import barnard_exact, binom
 
     first, second = (binom.pmf(np.arange(n + 1), n, rate) for rate in rates)

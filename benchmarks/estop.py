@@ -1,8 +1,8 @@
 """Time until an e-stop takes effect under each attack.
 
-A page presses over its websocket and at the process for stops simultaneously, and the first answer counts; both ways
-are also measured alone. Each attack has its own lab: a real web, a station with a running simulated robot, and another
-station. Attackers are separate programs at nice 19 (`benchmarks.attacks`).
+A page presses over its websocket and at the process for stops simultaneously, and the first answer counts; each of the
+two ways is also measured alone. Each attack has its own lab: a real web, a station with a running simulated robot, and
+another station. Attackers are separate programs at nice 19 (`benchmarks.attacks`).
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ _ENDING_S = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Lab, operator's session and station; `database` is the folder of its PostgreSQL server, if it has one."""
+    """Lab, operator's session and station of a measurement.
+
+    `database` is the folder of the lab's PostgreSQL server, None without one.
+    """
 
     lab: RunningLab
     ready_file: Path
@@ -69,7 +72,7 @@ class Bench:
 
 
 def measure(seconds: float, attacks: Sequence[str] = ATTACKS) -> Report:
-    """Measure `WAY_p99_ms.ATTACK` of each way, lost presses, and whether station and web survive."""
+    """Measure `WAY_p99_ms.ATTACK` for each way of pressing, lost presses, and whether station and web still run."""
     rows = []
     for attack in attacks:
         with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as found:
@@ -94,7 +97,7 @@ def _on_postgresql(seconds: float) -> dict[str, Any]:
 
 @contextmanager
 def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator[Bench]:
-    """Yield a running lab in a folder, on the PostgreSQL server in `database` at `url`, or on SQLite."""
+    """Yield a running lab in a folder; its database is the PostgreSQL server in `database` at `url`, or SQLite."""
     folder.mkdir(exist_ok=True)
     ready = folder / "ready.json"
     environment = {"DJANGO_SETTINGS_MODULE": "evaweb.settings", "DATABASE_URL": url}
@@ -108,9 +111,7 @@ def bench(folder: Path, database: Path | None = None, url: str = "") -> Iterator
 def measure_attack(
     found: Bench, attack: str, seconds: float, share: float = 1.0, moving: bool = True
 ) -> dict[str, Any]:
-    """Measure presses for `seconds` during an attack of relative strength `share`, with a run in progress if
-    `moving`.
-    """
+    """Measure presses for `seconds` during an attack of relative strength `share`; with `moving`, during a run."""
     facts = found.lab.announced
     program = RestPresser(facts["stops"], {"Authorization": f"Bearer {facts['token']}"})
     with closing(OpenPage(found.operator, facts["stops"])) as page:
@@ -139,7 +140,7 @@ def measure_attack(
 
 
 def _warmed(found: Bench, *ways: Callable[[str], Press]) -> None:
-    """Do everything once, so that first-time costs count neither as delay nor as memory growth."""
+    """Press in each of `ways` and load a page, so that first-time costs count neither as delay nor as memory growth."""
     for press in ways:
         press("to begin with")
     page_load_time(found.operator, _GIVEN_UP_S)
@@ -154,7 +155,7 @@ def _interruption(station: Station) -> str:
 
 @contextmanager
 def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
-    """Run the attack during the block; the yielded map has the attacker's counts afterwards."""
+    """Run the attack within the context; afterwards the yielded map has the attacker's counts."""
     did: dict[str, int] = {}
     if attack == "none":
         yield did
@@ -180,7 +181,10 @@ def _under(found: Bench, attack: str, share: float) -> Iterator[dict[str, int]]:
 
 
 def _presses(station: Station, press: Callable[[str], Press], seconds: float) -> dict[str, Any]:
-    """Press and release alternately for `seconds`; if a release fails, presses accumulate."""
+    """Press and release alternately for `seconds`, and return the results.
+
+    After a failed release there are no more releases.
+    """
     made: list[Press] = []
     lost, releases = 0, True
     until = time.monotonic() + seconds
@@ -197,7 +201,7 @@ def _presses(station: Station, press: Callable[[str], Press], seconds: float) ->
 
 
 def summarize_presses(presses: Sequence[Press], lost: int) -> dict[str, Any]:
-    """Return the results of presses, of which the station did not receive `lost`."""
+    """Return the results of presses; `lost` is the number of presses that the station did not receive."""
     ms = np.array([press.ms for press in presses])
     undone = [
         f"{press.status or 'unanswered'}: {press.reason}" for press in presses if press.status != "done"

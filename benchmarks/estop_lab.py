@@ -34,7 +34,7 @@ _SETTINGS = (
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Run the lab until a signal."""
+    """Run the lab until a signal arrives."""
     import django
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -24,7 +24,7 @@ _DONE = "done"
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """Press with its result ("" without an answer), reason, and duration [ms]."""
+    """Press of the e-stop with its status ("" without an answer), reason, and duration [ms]."""
 
     status: str
     reason: str
@@ -32,12 +32,12 @@ class Press:
 
     @property
     def ms(self) -> float:
-        """Time until it was executed [ms]; otherwise the complete timeout."""
+        """Time until the press was executed [ms]; the whole timeout if it was not."""
         return self.took_ms if self.status == _DONE else PATIENCE_S * 1000.0
 
     @property
     def failed(self) -> bool:
-        """Answered, but not executed."""
+        """Whether the press was answered but not executed."""
         return self.status not in (_DONE, "")
 
 
@@ -71,7 +71,7 @@ class _Page(LivePage):
 
 
 class OpenPage:
-    """Operator's page at the station, which presses over its socket and at the process for stops, as in a browser.
+    """Operator's page at the station, which presses over its websocket and at the process for stops, as in a browser.
 
     A broken connection is reopened.
     """
@@ -83,7 +83,7 @@ class OpenPage:
         self._way.ready()
 
     def press(self, why: str) -> Press:
-        """Press both ways with one uuid; the first executed press counts."""
+        """Press in both ways with one uuid; return the first press that was executed, or a failed one."""
         identity, answers = str(uuid4()), queue.SimpleQueue[Press]()
         ways = (self.over_the_socket, self._way.press)
         for way in ways:
@@ -111,14 +111,14 @@ class OpenPage:
 
 
 class RestPresser:
-    """Program with these headers that opens a connection for each press."""
+    """Program that presses over HTTP with the given headers, with a new connection for each press."""
 
     def __init__(self, url: str, headers: Mapping[str, str], station: str = PRESSED) -> None:
         self._address, self._station = urlsplit(url).netloc, station
         self._headers = {**headers, "Content-Type": "application/json"}
 
     def ready(self) -> None:
-        """Request whether this way works, as a page does when it opens."""
+        """Request the state of the e-stop, as a page does when it opens to test this way."""
         self.post("GET", "estop")
 
     def press(self, why: str, identity: str = "") -> Press:

@@ -1,4 +1,4 @@
-"""Station whose e-stop is pressed: its run, releases, responsiveness of the coordinator, and memory growth."""
+"""Station whose e-stop is pressed: its run, its releases, responsiveness of the coordinator, and memory growth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FAMILY = ("coordinator", "guard")
 
 
 class Station:
-    """Station commanded directly, bypassing the web."""
+    """Station that is commanded directly, without the web."""
 
     def __init__(self, data: Path) -> None:
         self._folder = data / "stations" / PRESSED
@@ -38,7 +38,7 @@ class Station:
 
     @property
     def latched(self) -> bool:
-        """True if the e-stop is latched on disk."""
+        """Whether the e-stop is latched on disk."""
         return Latch(self._folder).read() is not None
 
     def pids(self) -> list[int]:
@@ -62,7 +62,7 @@ class Station:
                 time.sleep(0.1)
 
     def run(self) -> None:
-        """Set up and begin a run without end; retried if the machine was late."""
+        """Set up and begin a run without end; if the machine was late, try again."""
         why = ""
         for _ in range(_TRIES):
             try:
@@ -77,7 +77,9 @@ class Station:
         raise SystemExit(f"{PRESSED} does not run: {why}")
 
     def _tried(self) -> Mapping[str, Any]:
-        """Return the state one second after the start of a run, or the state reached instead."""
+        """Try to set up and run; return the state one second after the start of the run, or the state reached
+        instead.
+        """
         state_is = self.wait_until_up()["state_is"]
         if state_is["latched"]:
             self.release()
@@ -104,7 +106,7 @@ class Station:
         return True
 
     def interruption(self) -> str:
-        """Return the event that ended the run before the press, "" if none.
+        """Return the event that ended the run before the press, "" if the run was not interrupted.
 
         Raises:
             RuntimeFault: If the station does not answer.
@@ -119,7 +121,7 @@ class Station:
 
 
 class AttackLoad(NamedTuple):
-    """Measurements of web and station during an attack."""
+    """Measurements of web and station during an attack: snapshots and memory."""
 
     main_late_ms: float  # longest delay of a snapshot
     web_growth_mb: float
@@ -127,7 +129,7 @@ class AttackLoad(NamedTuple):
 
 
 class StationWatch:
-    """Watch of the coordinator's snapshots and of memory, which also renews the lease, until `end`."""
+    """Observer of the coordinator's snapshots and of memory, which also renews the lease, until `end`."""
 
     def __init__(self, station: Station, web: int) -> None:
         self._heard = [time.monotonic()]
@@ -147,7 +149,7 @@ class StationWatch:
             thread.start()
 
     def end(self) -> AttackLoad:
-        """End the watch and return its measurements."""
+        """Stop observing and return the measurements."""
         self._ended.set()
         for thread in self._threads:
             thread.join()
@@ -162,8 +164,9 @@ class StationWatch:
                     self._heard.append(time.monotonic())
 
     def _claim(self, client: StationClient) -> None:
-        """Renew the lease like an open page; errors are ignored, because the station's events show whether
-        the run continues.
+        """Renew the lease like an open page.
+
+        Errors are ignored, because the station's events show whether the run continues.
         """
         with closing(client):
             while not self._ended.wait(RENEW_S):
@@ -177,7 +180,7 @@ class StationWatch:
 
 
 def _memory(pids: list[int]) -> float:
-    """Return the memory of processes [bytes]; 0 for ended ones."""
+    """Return the memory of processes [bytes]; a process that has ended counts as 0."""
     found = 0.0
     for pid in pids:
         try:

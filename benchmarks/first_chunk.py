@@ -15,7 +15,7 @@ from runtime.core.plugins import variants
 
 
 def main(kind: str, name: str) -> None:
-    """Solve, then print."""
+    """Build the kinematics, solve a chunk, and print the result."""
     robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[kind]
     kinematics = module.build(module.Config(), robot)

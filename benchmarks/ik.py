@@ -1,6 +1,7 @@
 """Conversion of chunks of poses to joints: duration, accuracy and joint speeds, for all robots and installed backends.
 
-On one core, because a station uses the others. All backends solve the same chunks in turns, slow ones less often.
+It runs on one core, because a station uses the others. All backends solve the same chunks in turn, slow ones less
+often.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ _EPISODE = "EVA_SAMPLE_EPISODE"
 
 
 def measure(seconds: float) -> Report:
-    """Measure `chunk_ms.ROBOT.TRAJECTORY` and the quality of solutions; other backends' figures end with their kind."""
+    """Measure `chunk_ms.ROBOT.TRAJECTORY` and the quality of solutions.
+
+    Figures of backends other than the default end with the backend's kind.
+    """
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(allowed)})
     try:
@@ -56,7 +60,7 @@ def measure(seconds: float) -> Report:
 
 
 def _robot(name: str, seconds: float) -> list[dict[str, Any]]:
-    """Return a row per trajectory and backend."""
+    """Return the rows of one robot, one per trajectory and backend."""
     robot = robots.load_robot(name)
     cases = invented(robot)
     folder = os.environ.get(_EPISODE)
@@ -76,7 +80,7 @@ def _joints(robot: Robot) -> int:
 
 
 def _backends(robot: Robot) -> dict[str, Kinematics]:
-    """Return the backends that are available here, ready to solve."""
+    """Return by kind the backends that are available here, ready to solve."""
     built = {}
     for kind, module in variants("runtime.kinematics").items():
         try:
@@ -89,7 +93,10 @@ def _backends(robot: Robot) -> dict[str, Kinematics]:
 def _case(
     robot: Robot, backends: Mapping[str, Kinematics], chunks: Sequence[Chunk], seconds: float
 ) -> list[dict[str, Any]]:
-    """Let the backends solve the chunks in turns; each stops after its time and number of calls."""
+    """Let the backends solve the chunks in turn, and return a row per backend.
+
+    Each backend stops after its time and its number of calls.
+    """
     solved = {kind: [_solved(backend, chunk) for chunk in chunks] for kind, backend in backends.items()}
     times: dict[str, list[_Call]] = {kind: [] for kind in backends}
     while due := [kind for kind in backends if not _enough(times[kind], len(chunks), seconds)]:
@@ -105,14 +112,14 @@ def _case(
 
 
 class _Call(NamedTuple):
-    """Duration of a call [s]: wall time and processor time."""
+    """Duration of one call [s]: wall time and processor time."""
 
     took: float
     used: float
 
 
 def _enough(calls: Sequence[_Call], chunks: int, seconds: float) -> bool:
-    """Return True if a backend has used its time, and solved each chunk often enough."""
+    """Return True if a backend has used its time and solved each chunk often enough."""
     took = sum(call.took for call in calls)
     if len(calls) < _FEWEST * chunks:
         return len(calls) >= chunks and took >= _PATIENCE_S
@@ -134,10 +141,10 @@ def _timed(calls: Sequence[_Call], arms: int) -> dict[str, float]:
 
 
 def _judged(robot: Robot, chunks: Sequence[Chunk], solved: Sequence[IkResult]) -> dict[str, float]:
-    """Return the quality of the solutions over all chunks; the first row's speed is relative to the seed.
+    """Return the quality of the solutions over all chunks; the speed of the first row is relative to the seed.
 
-    Errors of reachable targets count only frames that are limited neither by a joint limit nor by a velocity; the
-    share of limited frames and their errors are reported separately.
+    Errors of reachable targets count only frames that neither a joint limit nor a velocity limits; the share of limited
+    frames and their errors are reported separately.
     """
     dims = arm_dims(robot)
     q = np.stack([result.q for result in solved])[..., dims]
@@ -165,7 +172,7 @@ def _ours(row: Mapping[str, Any]) -> bool:
 
 
 def _figures(row: Mapping[str, Any]) -> list[Figure]:
-    """Return the figures of a row; only the default backend has requirements."""
+    """Return the figures of a row; only those of the default backend have requirements."""
     case = f"{row['robot']}.{row['trajectory']}" + ("" if _ours(row) else f".{row['kind']}")
     reachable = row["trajectory"] != OUT_OF_REACH
     wanted = {"chunk_ms": "<= 0.5" if reachable else "<= 1", "velocity_ratio": "<= 1"}
@@ -195,9 +202,10 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 
 
 def _postures(name: str) -> list[Figure]:
-    """Return figures of the default backend on loops and long paths, as shares of arms and paths.
+    """Return figures of the default backend on loops and long paths.
 
-    `far` paths have one leg anywhere within the limits. In chunks, only the current chunk of a path is known.
+    `far` paths have one leg anywhere within the limits. For figures ending with `chunks`, a path is solved chunk by
+    chunk, so that only the current chunk is known.
     """
     robot = robots.load_robot(name)
     module = variants("runtime.kinematics")[_DEFAULT]
@@ -221,7 +229,7 @@ def _postures(name: str) -> list[Figure]:
 
 
 def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Return the processor time of the other backends as a multiple of the default backend's.
+    """Return the processor time of each other backend as a multiple of the default backend's.
 
     Wall time would depend on the machine's load, and more so for long calls.
     """
@@ -236,7 +244,7 @@ def _compared(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
 
 
 def _fk() -> list[Figure]:
-    """Return the distance between the recorded poses and the poses of the recorded joints."""
+    """Return the distance between recorded poses and the poses computed from the joints recorded with them."""
     folder = os.environ.get(_EPISODE)
     if not folder:
         print(f"the recorded episode is not measured: {_EPISODE} is not set", file=sys.stderr)
@@ -254,9 +262,9 @@ def _fk() -> list[Figure]:
 
 
 def _starts() -> list[Figure]:
-    """Measure the time from the start of a process to its first chunk, with empty and with filled cache.
+    """Measure the time from the start of a process to its first chunk, with an empty and with a filled cache.
 
-    Processor time is reported too: it is independent of the machine's load.
+    Processor time is reported, too, because it is independent of the machine's load.
     """
     name = _RECORDED if _RECORDED in robots.robot_names() else robots.robot_names()[0]
     with tempfile.TemporaryDirectory() as folder:
@@ -286,6 +294,6 @@ def _first_chunk(name: str, cache: str) -> dict[str, float]:
 
 
 def _children_s() -> float:
-    """Return the processor time of children that have ended [s]."""
+    """Return the processor time of the child processes that have ended [s]."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime

@@ -27,8 +27,9 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Targets [T, arms, 7] of rows `dt` apart, joints [D] from which to solve, and whether joints exist for
-    the targets.
+    """Poses [T, arms, 7] to solve, in rows `dt` [s] apart.
+
+    `seed` [D] are the joints to start from; `reachable` is True if joints exist for all poses.
     """
 
     targets: Float64
@@ -38,7 +39,7 @@ class Chunk:
 
 
 def invented(robot: Robot) -> dict[str, list[Chunk]]:
-    """Return chunks of every kind for a robot; except those out of reach they are poses of a slow joint path.
+    """Return chunks of every kind for a robot; except those out of reach, they are poses along a slow joint path.
 
     `singular` chunks approach a singularity in the middle, `through` chunks pass through it.
     """
@@ -62,7 +63,7 @@ def _chunk(robot: Robot, path: Float64) -> Chunk:
 
 
 def _leaving(chunk: Chunk) -> Chunk:
-    """Return a chunk from the same start that moves away from the arms' bases."""
+    """Return a chunk from the same start that moves away from the arms' bases until it is out of reach."""
     first = chunk.targets[0, :, :3]
     targets = np.repeat(chunk.targets[:1], ROWS, axis=0)
     outwards = first / np.linalg.norm(first, axis=-1, keepdims=True)
@@ -78,7 +79,7 @@ class Recording:
     poses: Float64
 
     def chunks(self, robot: Robot) -> list[Chunk]:
-        """Return the complete recording as chunks, each from the joints measured at its first row."""
+        """Return the whole recording as chunks, each starting from the joints measured at its first row."""
         rows = [slice(at, at + ROWS) for at in range(0, len(self.joints) - ROWS + 1, ROWS)]
         return [Chunk(self.poses[row], self.joints[row.start], 1 / robot.control_rate, True) for row in rows]
 
@@ -101,7 +102,9 @@ def _bounds(robot: Robot) -> tuple[Float64, Float64]:
 
 
 def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64:
-    """Return a posture with arm joints at a margin [share of their range] from limits, other joints as at home."""
+    """Return a random posture whose arm joints are at least `margin` (a share of their range) from limits; other joints
+    are at home.
+    """
     low, high = _bounds(robot)
     posture = robot.poses["home"].copy()
     dims = arm_dims(robot)
@@ -110,7 +113,7 @@ def _within(robot: Robot, chance: np.random.Generator, margin: float) -> Float64
 
 
 def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
-    """Return joints [T, D] that accelerate and decelerate from `start` towards `end`, as far as speed limits allow."""
+    """Return joints [T, D] that accelerate from `start` towards `end` and decelerate, as far as speed limits allow."""
     way = end - start
     dims = arm_dims(robot)
     steepest = math.pi / 2 * robot.control_rate / (ROWS - 1)
@@ -122,7 +125,10 @@ def _path(robot: Robot, start: Float64, end: Float64) -> Float64:
 
 
 def _with_singular_value(robot: Robot, chance: np.random.Generator, wanted: float) -> Float64:
-    """Return a posture in which every arm's Jacobian has nearly that smallest singular value, by random search."""
+    """Return a posture in which the Jacobian of every arm has nearly the smallest singular value `wanted`.
+
+    It is found by random search.
+    """
     low, high = _bounds(robot)
     low, high = low + 0.1 * (high - low), high - 0.1 * (high - low)
     posture = _within(robot, chance, 0.1)
@@ -146,7 +152,7 @@ def _smallest(arm: Group, posture: Float64) -> float:
 
 
 def _ends_around(robot: Robot, middle: Float64, towards: Float64) -> tuple[Float64, Float64]:
-    """Return two postures with `middle` halfway between them, both within the limits."""
+    """Return two postures within the limits that have `middle` halfway between them."""
     low, high = _bounds(robot)
     way = np.minimum(np.abs(towards - middle), np.minimum(middle - low, high - middle)) * np.sign(
         towards - middle

@@ -32,7 +32,7 @@ def redundant(robot: Robot) -> bool:
 
 
 def followed(kinematics: Kinematics, robot: Robot, targets: Float64, start: Float64, rows: int) -> IkResult:
-    """Solve poses [T, arms, 7] in chunks of `rows`, each from the last command of the previous chunk."""
+    """Return the joints solved for poses [T, arms, 7] in chunks of `rows`, each from the end of the previous chunk."""
     dt, at, parts = 1 / robot.control_rate, start, []
     for begin in range(0, len(targets), rows):
         parts.append(kinematics.solve(targets[begin : begin + rows], at, dt, at, 0))
@@ -46,7 +46,7 @@ def followed(kinematics: Kinematics, robot: Robot, targets: Float64, start: Floa
 
 
 def drift(robot: Robot, kinematics: Kinematics) -> Float64:
-    """Return the largest joint difference between the ends of consecutive loops, rad [planes, LOOPS]."""
+    """Return the largest difference of the joints between the ends of consecutive loops, rad [planes, LOOPS]."""
     home, dims = robot.poses["home"], arm_dims(robot)
     rows = round(_LOOP_S * robot.control_rate)
     angles = np.tile(np.arange(1, rows + 1) / rows * 2 * math.pi, LOOPS)
@@ -62,7 +62,7 @@ def drift(robot: Robot, kinematics: Kinematics) -> Float64:
 
 
 def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Float64:
-    """Return joints [T, D] through random postures with smooth acceleration; deterministic for a number."""
+    """Return joints [T, D] through random postures with smooth acceleration; the same for the same `number`."""
     chance, dims = np.random.default_rng([0, number]), arm_dims(robot)
     low = np.maximum(robot.lower + _ROOM, -_ENDLESS)[dims]
     high = np.minimum(robot.upper - _ROOM, _ENDLESS)[dims]
@@ -82,7 +82,10 @@ def path(robot: Robot, number: int, legs: int = LEGS, leg: float = _LEG) -> Floa
 
 
 def worst(robot: Robot, kinematics: Kinematics, joints: Float64, rows: int | None = None) -> Float64:
-    """Return the largest position error of a joint path [T, D], m [arms], in chunks of `rows` or in one chunk."""
+    """Return the largest position error along a joint path [T, D], m [arms].
+
+    The path is solved in chunks of `rows`, or in one chunk.
+    """
     targets = kinematics.forward(joints)
     missed: Float64 = followed(kinematics, robot, targets, joints[0], rows or len(joints)).position_error.max(
         axis=0

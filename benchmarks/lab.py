@@ -1,7 +1,7 @@
 """Lab with stations on other computers: e-stop, idle cost, lost link, transfer of an episode, and limits.
 
-Lab and station are processes of this machine with separate data folders, linked over loopback: the network's share is
-not included.
+Lab and station are processes of this machine with separate data folders, linked over loopback, so that delays of a real
+network are not included.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Found = TypeVar("Found")
 
 
 class _Page(LivePage):
-    """Open page that records the state of the link."""
+    """Open page that stores whether the link to the station works."""
 
     link_ok = False
 
@@ -57,11 +57,12 @@ class _Page(LivePage):
 
 
 def measure(seconds: float) -> Report:
-    """Measure `estop_p99_ms` from a page through the link, `estop_here_p99_ms` at the station, and `lost_shown_s`.
+    """Measure a lab with a linked station; presses and idling last `seconds` each.
 
-    Also `cpu_percent` and `memory_mb` of an idle station with its link, and of the lab's gate; `seconds` of presses,
-    and of idling. During a transfer at full speed: `upload_mb_s`, processor time of both ends, and presses.
-    `stations_max` and `viewers_max` as in `benchmarks.climb`, with half of `seconds` per step.
+    The figures are `estop_p99_ms` from a page through the link, `estop_here_p99_ms` at the station, and `lost_shown_s`;
+    `cpu_percent` and `memory_mb` of an idle station with its link, and of the lab's gate. During a transfer at full
+    speed: `upload_mb_s`, processor time of both ends, and presses. `stations_max` and `viewers_max` as in
+    `benchmarks.climb`, with half of `seconds` per step.
     """
     os.environ["EVA_UPLOAD_MB_S"] = "50"
     with tempfile.TemporaryDirectory() as name:
@@ -94,7 +95,7 @@ def measure(seconds: float) -> Report:
 
 @contextmanager
 def _linked(running: RunningLab, folder: Path, name: str) -> Iterator[StartedStation]:
-    """Yield a station with a simulated robot, enrolled at the lab, in a data folder of its own."""
+    """Yield a station with a simulated robot, in a data folder of its own, that is enrolled at the lab."""
     folder.mkdir()
     bench = Lab(folder)
     try:
@@ -159,7 +160,7 @@ def _idle(processes: Mapping[str, psutil.Process], seconds: float) -> dict[str, 
 
 
 def _presses(running: RunningLab, seconds: float) -> list[Press]:
-    """Press from an open page, both ways at once, repeatedly."""
+    """Press from an open page, in both ways at once, repeatedly for `seconds`; return the presses."""
     pressed: list[Press] = []
     page = OpenPage(running.visitor, running.announced["stops"])
     until = time.monotonic() + seconds
@@ -171,7 +172,7 @@ def _presses(running: RunningLab, seconds: float) -> list[Press]:
 
 
 def _presses_here(robot: Path, seconds: float) -> list[float]:
-    """Press at the station's own socket, repeatedly; return the durations [ms]."""
+    """Press at the station's own socket, repeatedly for `seconds`; return the durations [ms]."""
     taken: list[float] = []
     client = StationClient(robot / "stations" / PRESSED, "benchmark")
     until = time.monotonic() + seconds
@@ -187,7 +188,10 @@ def _presses_here(robot: Path, seconds: float) -> list[float]:
 def _upload(
     running: RunningLab, robot: Path, processes: Mapping[str, psutil.Process]
 ) -> tuple[float, dict[str, float]]:
-    """Return p99 of presses during a transfer [ms]; its speed, and processor time per GB at either end."""
+    """Return the 99th percentile of presses during a transfer [ms], and figures of the transfer.
+
+    These are its speed, and the processor time per GB at either end.
+    """
     folder = robot / "episodes" / str(uuid4())
     folder.mkdir(parents=True)
     (folder / "manifest.json").write_text(json.dumps({"uuid": folder.name, "station": PRESSED}))
@@ -210,7 +214,7 @@ def _upload(
 
 
 def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
-    """Return the times from the silence of the link (SIGSTOP) until an open page shows that it is lost [s]."""
+    """Return for each pause of the link (SIGSTOP) the time until an open page shows that the link is lost [s]."""
     page, shown = _Page(running.visitor, PRESSED), []
     try:
         for _ in range(_CUTS):
@@ -228,7 +232,7 @@ def _cuts(running: RunningLab, link: psutil.Process) -> list[float]:
 
 
 def enrol(robot: Path, words: Sequence[str]) -> None:
-    """Enrol this station's computer at the lab; the supervisor then starts its link."""
+    """Enrol the station's computer at the lab with these `words`; the station's supervisor then starts its link."""
     for command in (["new"], ["enrol", *words]):
         keys = [sys.executable, "-m", "runtime.keys", "--data-dir", str(robot), *command]
         subprocess.run(keys, cwd=ROOT, env=os.environ, check=True, stdout=subprocess.DEVNULL)
@@ -252,7 +256,7 @@ def _until(found: Callable[[], Found], what: str) -> Found:
 
 
 def two_free_ports() -> int:
-    """Return a free port whose next port is free too; another program may still use them before the lab does."""
+    """Return a free port whose next port is free, too; another program may still use them before the lab does."""
     while True:
         with socket.socket() as first:
             first.bind(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""Complete lab in separate processes: started, used from outside, and ended by benchmarks."""
+"""Complete labs in separate processes, which benchmarks start, use from outside, and end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _END_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class RunningLab:
-    """Running lab, a logged-in client, and the facts that it announced."""
+    """Running lab, with a logged-in client and the addresses that the lab announced."""
 
     visitor: RestClient
     announced: Mapping[str, Any]
@@ -42,7 +42,7 @@ def lab(
 ) -> Iterator[RunningLab]:
     """Start `python PROGRAM`, which announces its lab in `ready_file`; its data folder is next to that file.
 
-    `extra` is added to its environment.
+    `extra` is added to its environment variables.
     """
     data = ready_file.parent / "data"
     environment = os.environ | {"EVA_DATA_DIR": str(data), "EVA_LOG_LEVEL": "WARNING"} | dict(extra or {})
@@ -63,7 +63,7 @@ def lab(
 
 @contextmanager
 def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Iterator[RunningLab]:
-    """Yield the lab of `benchmarks.busy_lab`, with these overrides of its deployment.
+    """Yield the lab of `benchmarks.busy_lab`, with `assignments` to keys of its deployment.
 
     `without` is a comma-separated list of measures of runtime.core.realtime that its control process omits.
     """
@@ -78,7 +78,7 @@ def busy_lab(folder: Path, assignments: Sequence[str], without: str = "") -> Ite
 def watch(
     visitor: RestClient, seconds: float, station: str = STATION, **counts: int
 ) -> subprocess.Popen[str]:
-    """Open pages at the station in a separate process, the given numbers `reading` or `stalled`."""
+    """Open pages at the station in a separate process: `reading` and `stalled` are their numbers."""
     options = [part for name, count in counts.items() for part in (f"--{name}", str(count))]
     command = [sys.executable, "-m", "benchmarks.viewers", visitor.url, station, visitor.cookies]
     command += ["--streams", ",".join(STREAMS), "--seconds", str(seconds), *options]
@@ -86,7 +86,7 @@ def watch(
 
 
 class ProcessorUsage:
-    """Processor usage of a lab's processes, and of all others of the machine, since creation."""
+    """Processor usage of a lab's processes, and of all other processes of the machine, since creation."""
 
     def __init__(self, lab: psutil.Process) -> None:
         self._lab = lab
@@ -130,7 +130,7 @@ def _used(processes: Iterable[psutil.Process]) -> dict[str, float]:
 
 
 class Scheduling:
-    """Kernel scheduling of one process of a lab since creation."""
+    """Kernel scheduling of one process of a lab since creation of this object."""
 
     def __init__(self, lab: psutil.Process, module: str) -> None:
         (self._process,) = (p for p in lab.children(recursive=True) if named(p.cmdline()) == module)
@@ -138,7 +138,7 @@ class Scheduling:
         self._before = self._counts()
 
     def figures(self) -> dict[str, float]:
-        """Return per second: time running and waiting for a processor [ms], involuntary switches, page faults."""
+        """Return per second: time running and waiting for a processor [ms], involuntary switches, and page faults."""
         seconds = time.monotonic() - self._begun
         now = self._counts()
         return {name: (value - self._before[name]) / seconds for name, value in now.items()}
@@ -169,7 +169,7 @@ def named(command: Sequence[str]) -> str:
 
 
 def set_up(page: LivePage) -> Mapping[str, Any]:
-    """Take the station and set it up; return its state when it is ready."""
+    """Claim the station and set it up; return its state when it is ready."""
     page.wait(lambda state: state["state_is"]["connected"], 60.0, "waiting for the station")
     page.claim()
     page.wait(lambda state: state["lease"]["epoch"] == page.epoch, 10.0, "waiting for the lease")
@@ -181,7 +181,7 @@ def set_up(page: LivePage) -> Mapping[str, Any]:
 
 
 def only_episode(data: Path, seconds: float = 30.0) -> Episode:
-    """Return the only episode of a data folder, when it is closed."""
+    """Return the only episode of a data folder as soon as it is closed."""
     deadline = time.monotonic() + seconds
     while not (found := list(data.glob("episodes/*/outcome.json"))):
         if time.monotonic() > deadline:

@@ -9,8 +9,8 @@
 * `observation_ms`: from the node's stamp to the policy request with this observation.
 * `muxed_ms`: from the node's stamp until the frame's packet is passed to the muxer.
 
-The runtime maps the node's clock onto ours such that the fastest message has no delay (runtime.core.clock.ClockMap).
-Here both clocks are the same, so the shortest delay is measured, and added to durations that begin at the node's
+The runtime maps the node's clock to ours such that the fastest message has no delay (runtime.core.clock.ClockMap). Here
+both clocks are the same, so the shortest delay can be measured; it is added to durations that begin at the node's
 stamp.
 """
 
@@ -50,7 +50,7 @@ _WANTED = {
 
 
 class PressingPage(LivePage):
-    """Page that records when it pressed and when it received the answers, on the monotonic clock [s]."""
+    """Page that records the times of its presses and of their answers on the monotonic clock [s]."""
 
     def __init__(self, visitor: RestClient, station: str) -> None:
         self._answers: dict[str, tuple[float, str]] = {}  # by uuid: time and status
@@ -84,7 +84,9 @@ class PressingPage(LivePage):
         super()._on_message(message)
 
     def _renew(self) -> None:
-        """Renew more often than a page does, each time after the previous answer."""
+        """Renew the lease, each time as soon as the previous answer has arrived, which is more often than a
+        page does.
+        """
         while not self._failure:
             time.sleep(1.0 / _RENEWALS_HZ)
             if not self.epoch:
@@ -119,7 +121,10 @@ def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
 
 
 def _run(lab: RunningLab, seconds: float) -> tuple[dict[str, Any], list[float], dict[str, float]]:
-    """Halt and resume for `seconds`; return latencies measured by the page [ms], times of presses, processor load."""
+    """Halt and resume for `seconds`.
+
+    Return the latencies measured by the page [ms], the times of the presses, and the processor load.
+    """
     commands, resumes, presses = [], [], []
     with closing(PressingPage(lab.visitor, STATION)) as page:
         set_up(page)
@@ -172,7 +177,7 @@ def _shortest_delay(endpoint: str) -> float:
 
 
 def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[str, Any]:
-    """Return latencies from the recording [ms]: arrays, or percentiles if only these are recorded."""
+    """Return latencies from the recording [ms]: arrays, or percentiles if only percentiles are recorded."""
     assert episode.outcome is not None
     outcome: Mapping[str, Any] = episode.outcome
     muxed = outcome["muxed_ms"].values()
@@ -186,7 +191,7 @@ def _from(episode: Episode, presses: Sequence[float], transit: float) -> dict[st
 
 
 def _to_the_node(episode: Episode, presses: Sequence[float]) -> list[float]:
-    """Return the time from each press to the first command that is not the policy's [s]."""
+    """Return the time from each press to the first command after it that does not come from the policy [s]."""
     ticks = episode.ticks
     sent = ticks.column("sent").to_numpy() + episode.manifest["started_monotonic"]
     ours = np.array(ticks.column("control_source").to_pylist()) != "policy"

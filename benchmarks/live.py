@@ -1,7 +1,8 @@
-"""Twenty viewers of one running station: their delay, their effect on the control loop, and the cost of stalled ones.
+"""Twenty viewers of one running station: their delay, their effect on the control loop, and the cost of stalled
+viewers.
 
-The complete demo runs: bench, policies, worker, web. The first trial has no viewer, the second twenty; then ten
-viewers that never read join an idle station.
+The complete demo runs: bench, policies, worker, web. The first trial has no viewer, the second twenty; then ten viewers
+that never read join an idle station.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _VIEWERS, _STALLED = 20, 10
 
 
 def measure(seconds: float) -> Report:
-    """Measure `viewer_p99_ms`, `stalled_viewer_mb`, `lateness_p99_ms`, and the latter without viewers."""
+    """Measure `viewer_p99_ms`, `stalled_viewer_mb`, `lateness_p99_ms`, and lateness without viewers."""
     with tempfile.TemporaryDirectory() as folder:
         ready = Path(folder) / "ready.json"
         with lab(["manage.py", "demo", "--port", "0", "--ready-file", str(ready)], ready) as demo:
@@ -50,7 +51,7 @@ def measure(seconds: float) -> Report:
 
 
 def _run(visitor: RestClient, seconds: float, viewers: int) -> Mapping[str, Any]:
-    """Run one trial for `seconds` with that many viewers, and void it afterwards."""
+    """Run one trial for `seconds` with `viewers` viewers, and void it afterwards."""
     with closing(LivePage(visitor, STATION)) as page:
         trial = start(visitor, page, TrialChoice(STATION, "block-on-plate", 1, "pick-place-40k", seed=1))
         found = _viewers(visitor, seconds, reading=viewers) if viewers else _wait(seconds)
@@ -80,7 +81,7 @@ def _viewers(visitor: RestClient, seconds: float, **counts: int) -> dict[str, An
 
 
 def _stalled(visitor: RestClient, web: int, seconds: float) -> float:
-    """Return the largest growth of the web process per viewer that never reads [MB]."""
+    """Return the largest growth of the web process [MB] per viewer that never reads."""
     process = psutil.Process(web)
     _viewers(visitor, 3.0, reading=1)  # the first viewer's one-time cost is not growth
     before = process.memory_info().rss

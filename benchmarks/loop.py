@@ -1,9 +1,9 @@
 """Control loop under its real load, at 30, 100 and 200 Hz: lateness and missed ticks.
 
 Per rate a complete lab runs: a bench that renders and sends three 640x480 cameras at 30 Hz, recording, previews,
-continuous inference, web, worker, and five pages that watch everything. Two comparison loops run in parallel, each in
-a process of its own: one that only sleeps to absolute deadlines, in control's scheduling class, and the loop of most
-client libraries, which sleeps for the remaining period. So all three experience the same machine at the same time.
+continuous inference, web, worker, and five pages that show everything. Two comparison loops run in parallel, each in a
+process of its own: one that only sleeps to absolute deadlines, in control's scheduling class, and the loop of most
+client libraries, which sleeps for the rest of the period. So all three run on the same machine at the same time.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ Steps = NDArray[np.int64]
 
 
 def measure(seconds: float, assignments: Sequence[str] = ()) -> Report:
-    """Measure `lateness_*_ms.HZ`, `missed_ticks.HZ`, `rate_error_ppm.HZ`, `ratio_to_bare_loop.HZ`, per tick."""
+    """Measure `lateness_*_ms.HZ`, `missed_ticks.HZ`, `rate_error_ppm.HZ` and `ratio_to_bare_loop.HZ` for each rate."""
     rows = [case(rate, seconds, assignments) for rate in RATES]
     return Report("loop", [figure for row in rows for figure in _figures(row)], rows)
 
@@ -77,7 +77,7 @@ def _figures(row: Mapping[str, Any]) -> list[Figure]:
 
 
 def case(rate: float, seconds: float, assignments: Sequence[str], without: str = "") -> dict[str, Any]:
-    """Run one lab at a rate; `without` disables measures in control, see benchmarks.measures."""
+    """Run one lab at a rate; `without` names measures that control omits, see benchmarks.measures."""
     settings = [f"control.rate={rate}", "recording.fps=30.0", f"run.duration_s={seconds}", *assignments]
     with tempfile.TemporaryDirectory() as folder:
         with busy_lab(Path(folder), settings, without) as lab:
@@ -91,7 +91,7 @@ def case(rate: float, seconds: float, assignments: Sequence[str], without: str =
 def _run(
     lab: RunningLab, sleepers: Sequence[Sequence[str]], seconds: float
 ) -> tuple[Mapping[str, Any], list[Any], dict[str, Any]]:
-    """Run once with viewers; return the final state, the results of the comparison loops, and the usage."""
+    """Run once with viewers; return the final state, the results of the comparison loops, and processor usage."""
     with closing(LivePage(lab.visitor, STATION)) as shared:
         set_up(shared)
         watching = watch(lab.visitor, seconds + 2 * _MARGIN_S, reading=VIEWERS)
@@ -112,7 +112,7 @@ def _run(
 
 
 def _sleeper(arguments: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[str]:
-    """Start a comparison loop."""
+    """Start a comparison loop as a process."""
     command = [sys.executable, "-m", "benchmarks.sleeper", *arguments]
     return subprocess.Popen(command, cwd=ROOT, env=dict(environment), stdout=subprocess.PIPE, text=True)
 
@@ -153,6 +153,6 @@ def _spread(seconds: Times) -> dict[str, float]:
 
 
 def _rate(steps: Steps, times: Times, rate: float) -> dict[str, float]:
-    """Return the fitted rate, and its deviation from `rate` [ppm]."""
+    """Return the rate fitted to `times` of `steps`, and its deviation from `rate` [ppm]."""
     found = 1.0 / float(np.polyfit(steps, times, 1)[0])
     return {"effective_rate_hz": found, "rate_error_ppm": (found / rate - 1.0) * 1e6}

@@ -1,6 +1,6 @@
 """Effects of the measures for steady ticks: `loop` at one rate, with measures of runtime.core.realtime disabled.
 
-The bare comparison loop omits them too.
+The bare comparison loop runs without the same measures.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ _VARIANTS = ("", "lock", "gc", "fifo", "fifo,timers", "fifo,gc", "fifo,slice", "
 
 
 def measure(seconds: float) -> Report:
-    """Measure `lateness_*_ms.WITHOUT`, `missed_ticks.WITHOUT`, `waited_ms.WITHOUT` (for a processor, per second)."""
+    """Measure `lateness_*_ms.WITHOUT`, `missed_ticks.WITHOUT`, and `waited_ms.WITHOUT`.
+
+    The last is the time that control waits for a processor, per second.
+    """
     figures, rows = [], []
     for without in _VARIANTS:
         row = case(_RATE, seconds, [], without)

@@ -56,7 +56,7 @@ _ARRIVING_S = 10.0  # until fingertips must be next to the standing block
 
 @dataclass(frozen=True, slots=True)
 class ChaseResult:
-    """Result of an episode: lengths in mm, `share` of the course's time on target, final `state` of the station.
+    """Result of an episode: lengths in mm, `share` of time on target, final `state` of the station.
 
     `acceleration` [rad/s2] is that of the joint whose commands change most, exceeded in 5 % of the ticks.
     """
@@ -73,8 +73,9 @@ class ChaseResult:
 
 
 def measure(seconds: float) -> Report:
-    """Measure `success_rate.STRATEGY.DELAY` and `on_target.STRATEGY.DELAY` (share of the time); details are
-    in the rows.
+    """Measure `success_rate.STRATEGY.DELAY` and `on_target.STRATEGY.DELAY` (share of the time).
+
+    Details are in the rows.
     """
     rows = table(seconds)
     figures = [
@@ -88,7 +89,8 @@ def measure(seconds: float) -> Report:
 def table(seconds_budget: float) -> list[dict[str, Any]]:
     """Return a row for each strategy and delay [ticks]; distances in mm, means over the episodes.
 
-    Three courses for each, more if the budget allows: the same for the same budget on every machine.
+    Each is measured with three motions of the belt, or more if the budget allows: the same for the same budget on every
+    machine.
     """
     seeds = range(max(SEEDS, int(seconds_budget / _PER_SEED_S)))
     asked = list(product(STRATEGIES, DELAYS, seeds))
@@ -119,7 +121,7 @@ def _chased(asked: tuple[str, int, int]) -> ChaseResult:
 
 
 def run_chase(strategy: Mapping[str, Any], delay: int, seed: int) -> ChaseResult:
-    """Run one episode in lockstep to the end of the course; its share is 0 if it never begins."""
+    """Run one episode in lockstep to the end of the belt's motion; its share is 0 if the motion never begins."""
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory() as folder:
         course, made = station_at(Path(folder), strategy, delay, seed)
@@ -141,7 +143,7 @@ def run_chase(strategy: Mapping[str, Any], delay: int, seed: int) -> ChaseResult
 
 
 def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
-    """Set up and run until the course is over; return the arms' commands [ticks, D] during the course."""
+    """Set up and run until the belt's motion is over; return the arms' commands [ticks, D] during it."""
     session, commanded = station.coordinator.session, []
     station.connect()
     station.until(lambda: session.state is not SessionState.DISCONNECTED, 5.0, "first observation")
@@ -160,6 +162,6 @@ def _follow(station: Lockstep, conveyor: Conveyor) -> Float64:
 
 
 def _acceleration(commanded: Float64) -> float:
-    """Return the acceleration of commands [ticks, n], per tick squared; 0 if there are too few."""
+    """Return the acceleration of commands [ticks, n], per tick squared; 0 if there are too few commands."""
     changes = np.abs(np.diff(commanded, 2, axis=0))
     return float(np.quantile(changes.max(axis=1), 0.95)) if len(changes) else 0.0

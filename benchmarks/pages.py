@@ -1,4 +1,4 @@
-"""Pages in Debian's Chromium with a lab of 100,000 trials, one at a time, while the station is idle.
+"""Pages of a lab with 100,000 trials in Debian's Chromium, one at a time, while the station is idle.
 
 Each page is loaded five times by a new browser. LCP, CLS and event durations are from Chromium's PerformanceObserver,
 including events that lead to another document. Pages with 3D drawing use software rendering here, and have their own
@@ -88,7 +88,10 @@ Control = Callable[[Any], None]
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Address with its most common controls, controls that lead to another document, and whether it draws in 3D."""
+    """Page to measure: its address, its most common controls, and those that lead to another document.
+
+    `draws` is True if the page draws in 3D.
+    """
 
     name: str
     address: str
@@ -98,17 +101,17 @@ class Page:
 
 
 def click(selector: str) -> Control:
-    """Return a click on the first matching element."""
+    """Return a function that clicks the first element that matches `selector`."""
     return lambda page: page.locator(selector).first.click()
 
 
 def press(selector: str, key: str) -> Control:
-    """Return a key press with the focus on the first matching element."""
+    """Return a function that presses `key` with the focus on the first element that matches `selector`."""
     return lambda page: page.locator(selector).first.press(key)
 
 
 def drag(selector: str) -> Control:
-    """Return a short sideways drag of the first matching element."""
+    """Return a function that drags the first element that matches `selector` a short way sideways."""
 
     def dragged(page: Any) -> None:
         page.locator(selector).first.hover()
@@ -121,7 +124,10 @@ def drag(selector: str) -> Control:
 
 
 def narrow(name: str, words: str = "") -> Control:
-    """Return a filter of a list by the typed words, else by the next choice, until the list shows it."""
+    """Return a function that filters a list by its field `name`, and waits until the list shows the filter.
+
+    It types `words`, or selects the next choice if there are none.
+    """
 
     def narrowed(page: Any) -> None:
         with page.expect_response(lambda answer: f"{name}=" in answer.url):
@@ -187,7 +193,10 @@ def pages(episode: str, trial: int) -> Sequence[Page]:
 
 
 def measure(seconds: float, plans: int = PLANS, trials: int = TRIALS) -> Report:
-    """Measure `fcp_ms.PAGE` and others; `seconds` is ignored, because the number of loads is fixed."""
+    """Measure `fcp_ms.PAGE` and others.
+
+    `seconds` is ignored, because the number of loads is fixed.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _seed(folder / "data", plans, trials)
@@ -212,7 +221,7 @@ def figures(rows: Sequence[Mapping[str, Any]]) -> Iterator[Figure]:
 
 
 def _seed(data: Path, plans: int, trials: int) -> None:
-    """Create a database as after years, in a separate program with Django set up for that folder."""
+    """Create a database as after years of use, in a separate program with Django set up for the data folder."""
     data.mkdir()
     program = (
         "import django; django.setup()\n"
@@ -229,7 +238,7 @@ def _seed(data: Path, plans: int, trials: int) -> None:
 
 
 def _visits(demo: RunningLab, wanted: Sequence[Page]) -> tuple[list[dict[str, Any]], float]:
-    """Return a row per load, and the median duration of a seek in the episode [ms]."""
+    """Return a row per load of the pages `wanted`, and the median duration of a seek in the episode [ms]."""
     from playwright.sync_api import sync_playwright
 
     url = demo.announced["url"]
@@ -264,7 +273,9 @@ def _login(browser: Any, url: str, password: str) -> Any:
 
 
 def _loads(fresh: Callable[[], Any], url: str, wanted: Page) -> Iterator[dict[str, Any]]:
-    """Yield five loads of a page after a warm-up; the last one is checked by axe-core in both themes."""
+    """Yield a row for each of five loads of a page after a warm-up; the last load is checked by axe-core in both
+    themes.
+    """
     for load in range(LOADS + 1):
         page = fresh()
         page.add_init_script(_WATCH)

@@ -1,9 +1,9 @@
 """Cost of recording, and losses by kills: a station's recorder, LeRobot's writer, kill -9, a long list.
 
-One station records three cameras of 640x480 at 30 Hz, ends and publishes; others record in parallel to busy loops.
-Then our recorder alone and LeRobot's own writer receive the same frames at the same pace, if an interpreter with
-LeRobot is available: this one, or those in EVA_LEROBOT_PYTHONS. Then processes are killed at random moments, and the
-page of 10,000 episodes is requested.
+One station records three cameras of 640x480 at 30 Hz, ends the run and publishes the episode; others record in parallel
+to busy loops. Then our recorder alone and LeRobot's own writer receive the same frames at the same pace, if an
+interpreter with LeRobot is available: this one, or those in EVA_LEROBOT_PYTHONS. Then processes are killed at random
+moments, and the page of 10,000 episodes is requested.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def measure(seconds: float, long: bool = False) -> Report:
     """Measure `frames_lost`, `intake_age_p99_ms`, `memory_growth_mb`, `cpu_core_percent`, `kill9_worst_loss_s` and
     others.
 
-    `load_1min` is the machine's load at the end; that of each part is in its row.
+    `load_1min` is the machine's load at the end; the load during each part is in the part's row.
     """
     seed = random.SystemRandom().randrange(1 << 32)
     with tempfile.TemporaryDirectory() as name:
@@ -114,7 +114,7 @@ def figures(
 
 
 def _ratios(rows: Sequence[Mapping[str, Any]]) -> list[Figure]:
-    """Return LeRobot's processor time per recorded frame as a multiple of ours, including the dataset in both."""
+    """Return LeRobot's processor time per recorded frame as a multiple of ours; both include writing the dataset."""
     (ours,) = (row for row in rows if row["writer"] == "ours")
     per_frame = {row["writer"]: (row["capture_cpu_s"] + row["save_cpu_s"]) / row["frames"] for row in rows}
     found = [
@@ -135,7 +135,7 @@ def _made(folder: Path) -> Path:
 
 
 def _timed(part: Any, *arguments: Any) -> dict[str, Any]:
-    """Return the results of a part, with its duration and the machine's load at its end."""
+    """Return the results of a part, with the part's duration and the machine's load at its end."""
     begun = time.monotonic()
     print(f"recording: {part.__name__.strip('_')}", file=sys.stderr)  # progress, because it takes minutes
     found = part(*arguments)
@@ -155,7 +155,7 @@ def _beside(folder: Path, frames: Path) -> dict[str, Any]:
 
 
 def interpreters() -> list[str]:
-    """Return the interpreters with a LeRobot that can encode while recording (0.4.4 or later)."""
+    """Return the Python interpreters with a LeRobot that can encode while recording (0.4.4 or later)."""
     named = [path for path in os.environ.get("EVA_LEROBOT_PYTHONS", "").split(":") if path]
     if find_spec("lerobot") is not None:
         named.append(sys.executable)
@@ -170,7 +170,10 @@ def interpreters() -> list[str]:
 
 
 def _child(python: str, module: str, *arguments: str, **environment: str) -> dict[str, Any]:
-    """Return the last output line of a benchmark module as JSON; exit with its complete error output if it fails."""
+    """Run a benchmark module and return the last line of its output as JSON.
+
+    If it fails, exit with its complete error output.
+    """
     command = [python, "-m", f"benchmarks.{module}", *arguments]
     done = subprocess.run(
         command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
@@ -182,7 +185,7 @@ def _child(python: str, module: str, *arguments: str, **environment: str) -> dic
 
 
 def _kills(folder: Path, frames: Path, long: bool, seed: int) -> dict[str, Any]:
-    """Kill each process at 10 moments, 50 if long; fewer on a slow machine, but at least 10 in all."""
+    """Kill each process at 10 moments, 50 if `long`; on a slow machine at fewer, but at least 10 in all."""
     recording, working = (
         (KillCount(150, 150, 0.0), KillCount(50, 50, 0.0))
         if long

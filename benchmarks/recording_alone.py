@@ -20,7 +20,7 @@ _TICKS = 3  # control ticks per row: 90 Hz
 
 
 def manifest() -> dict[str, Any]:
-    """Return the manifest of an episode with the common frames."""
+    """Return the manifest of an episode with the frames that all recorders in this comparison get."""
     names = [f"joint_{number}" for number in range(JOINTS)]
     robot = {"name": "bench", "joint_names": names, "eef_names": [], "dim": JOINTS, "eef_dim": 0}
     return {
@@ -55,7 +55,7 @@ def append(journal: EpisodeJournal, index: int, pictures: dict[str, Any]) -> Non
 
 
 def main(path: str, count: str, folder: str) -> None:
-    """Record and publish one episode."""
+    """Record an episode of `count` frames from `path` in `folder`, publish it, and print the cost."""
     root = Path(folder)
     journal = EpisodeJournal(root / "episodes", RecordingSettings(min_free_bytes=0))
     journal.begin(told := manifest())

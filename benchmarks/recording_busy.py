@@ -29,7 +29,9 @@ CASES = {"quiet": (False, "auto"), "busy": (True, "auto"), "busy_ordinary": (Tru
 
 
 def record(folder: Path, seconds: float) -> dict[str, Any]:
-    """Record `seconds` on a quiet machine, with a busy loop per core, and with both but without real-time class."""
+    """Record for `seconds` on a quiet machine, with a busy loop per core, and with busy loops without real-time
+    class.
+    """
     rows = []
     for name, (busy, realtime) in CASES.items():
         lab = PatientLab(folder / name)
@@ -70,7 +72,7 @@ def _run(lab: PatientLab, seconds: float, busy: bool) -> dict[str, Any]:
 
 
 def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], list[str]]:
-    """Return ages of joints at intervals, and the reasons for holds; held runs are resumed."""
+    """Return the ages of joints at intervals, and the reasons for holds; a run that holds is resumed."""
     end, look_at = time.monotonic() + seconds, time.monotonic() + _LOOK_S
     ages: list[dict[str, float]] = []
     held: list[str] = []
@@ -90,7 +92,10 @@ def _watch(lab: PatientLab, seconds: float) -> tuple[list[dict[str, float]], lis
 
 
 def pictures(episode: Episode) -> dict[str, int]:
-    """Return the number of images that were given but are not in the videos: `flagged` or `silent`."""
+    """Return the number of rows, and of images given to the recorder that are not in the videos.
+
+    The latter are separated into images that the recording flags as `lost`, and `silent` losses.
+    """
     flagged = silent = 0
     rows = episode.rows
     for camera in episode.layout.cameras:
@@ -103,7 +108,7 @@ def pictures(episode: Episode) -> dict[str, int]:
 
 
 def _put_first(process: int) -> None:
-    """Give the node real-time priority if permitted: it represents another machine, which ours cannot delay."""
+    """Give the node real-time priority if permitted, because it represents another machine, which ours cannot delay."""
     with suppress(PermissionError):
         for thread in Path(f"/proc/{process}/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(_NODE_PRIORITY))
@@ -111,7 +116,7 @@ def _put_first(process: int) -> None:
 
 @contextmanager
 def _loops(count: int) -> Iterator[None]:
-    """Run that many busy processes during the block."""
+    """Run `count` busy processes within the context."""
     loops = [subprocess.Popen([sys.executable, "-c", _LOOP]) for _ in range(count)]
     try:
         yield

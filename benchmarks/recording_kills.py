@@ -1,7 +1,7 @@
 """kill -9 at random moments during recording and publishing: losses, and whether all files can be opened.
 
 Media, coordinator, control and reception are killed in turn, each in a recorded run, and the worker during its jobs.
-The time of a kill is taken by the killer, on the clock of the rows.
+The killer measures the time of a kill, on the clock of the rows.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ RUNNING = "select key, owner from jobs_job where status = 'running'"
 
 @dataclass(frozen=True, slots=True)
 class KillCount:
-    """Number of kills: `most`, or fewer but at least `least` after `seconds`."""
+    """Number of kills: `most`; after `seconds` only as many as are needed for `least`."""
 
     most: int
     least: int
     seconds: float
 
     def moments(self, seed: int, between: tuple[float, float]) -> Iterator[float]:
-        """Yield the moment of each kill, after the begin of the interrupted activity [s]."""
+        """Yield for each kill the time [s] from the begin of the activity that it interrupts."""
         drawn, begun = random.Random(seed), time.monotonic()
         for number in range(self.most):
             if number >= self.least and time.monotonic() - begun > self.seconds:
@@ -63,7 +63,7 @@ class KillCount:
 
 
 def kill_recording(lab: Lab, many: KillCount, seed: int) -> list[dict[str, Any]]:
-    """Return one row per kill: process, moment, loss [s], and how the episode ended."""
+    """Return one row per kill: process, time of the kill, loss [s], and how the episode ended."""
     kills: deque[float] = deque(maxlen=MOST_RESTARTS)
     moments = enumerate(many.moments(seed, _SPREAD_S))
     return [_one(lab, PROCESSES[number % len(PROCESSES)], moment, kills) for number, moment in moments]
@@ -101,7 +101,7 @@ def _closed(folder: Path) -> Episode:
 def _loss(episode: Episode, killed: float) -> dict[str, Any]:
     """Return the time from the last complete row, including its period, until the kill [s].
 
-    Without any row, from the episode's begin.
+    If there is no row, the time begins with the episode.
     """
     times = episode.rows.column("tick_time").to_numpy()
     started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
@@ -119,7 +119,7 @@ def _loss(episode: Episode, killed: float) -> dict[str, Any]:
 
 
 def make_episodes(data: Path, frames: Path, episodes: int = EPISODES) -> None:
-    """Create finished episodes of two seconds for the worker to publish."""
+    """Create `episodes` finished episodes of two seconds for the worker to publish."""
     pictures = Frames(frames)
     for _ in range(episodes):
         journal = EpisodeJournal(data / "episodes", RecordingSettings(min_free_bytes=0), patient=True)
@@ -130,9 +130,10 @@ def make_episodes(data: Path, frames: Path, episodes: int = EPISODES) -> None:
 
 
 def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
-    """Kill the worker during its jobs, then let one finish; return a row per kill, and a last one with the result.
+    """Kill the worker during its jobs, then let one worker finish; return a row per kill, and a last row with the
+    result.
 
-    `problems` are sentences on files that cannot be opened.
+    `problems` are sentences about files that cannot be opened.
     """
     environment = os.environ | {
         "EVA_DATA_DIR": str(data),
@@ -160,7 +161,7 @@ def kill_worker(data: Path, many: KillCount, seed: int) -> list[dict[str, Any]]:
 
 
 def _ask(environment: Mapping[str, str]) -> list[str]:
-    """Enqueue the publication of every closed episode, repeated if published already; return their uuids."""
+    """Enqueue the publication of every closed episode, also of those published already; return their uuids."""
     command = [sys.executable, "-m", "benchmarks.recording_jobs"]
     done = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True, text=True)
     found: list[str] = json.loads(done.stdout.splitlines()[-1])
@@ -179,7 +180,9 @@ def _worker(environment: Mapping[str, str]) -> Iterator[subprocess.Popen[bytes]]
 
 
 def _working(data: Path, worker: subprocess.Popen[bytes], dead: Collection[str]) -> tuple[str, str]:
-    """Return key and owner of this worker's first job; jobs of `dead` owners may still be listed."""
+    """Return key and owner of this worker's first job; jobs of owners in `dead` may still be listed and do not
+    count.
+    """
     begun = time.monotonic()
     while time.monotonic() - begun < 60.0 and worker.poll() is None:
         for key, owner in _query(data, RUNNING):
@@ -216,7 +219,7 @@ def _query(data: Path, query: str) -> list[Any]:
 
 
 def _problems(data: Path) -> list[str]:
-    """Return datasets and episodes that cannot be opened as they are, before any repair."""
+    """Return sentences about datasets and episodes that cannot be opened as they are, before any repair."""
     datasets = [info.parents[1] for info in data.glob(f"datasets/**/{INFO}")]
     found = [f"{dataset.name}: {said}" for dataset in datasets for said in check(dataset)]
     for folder in data.glob("episodes/*"):

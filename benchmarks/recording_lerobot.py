@@ -1,7 +1,7 @@
 """LeRobot's own writer: `PYTHON -m benchmarks.recording_lerobot FRAMES COUNT FOLDER MODE`; prints JSON.
 
 Runs in an interpreter with LeRobot 0.4 and without our packages. MODE is `default`, with images as PNG files that
-save_episode encodes, or `streaming`, H.264 during recording.
+save_episode encodes, or `streaming`, with H.264 encoded during recording.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MODES: dict[str, dict[str, Any]] = {
 
 
 def main(path: str, count: str, folder: str, mode: str) -> None:
-    """Record one episode."""
+    """Record one episode with LeRobot, and print the cost."""
     os.environ["HF_HUB_OFFLINE"] = "1"
     operators = _operators()
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -50,7 +50,10 @@ def main(path: str, count: str, folder: str, mode: str) -> None:
 
 
 def _operators() -> Any:
-    """Declare operators that torchvision requires and a torch without GPU lacks; keep the returned library alive."""
+    """Declare operators that torchvision requires and that a torch without GPU support lacks.
+
+    The caller must keep the returned library alive; None if they are declared already.
+    """
     import torch
 
     library = torch.library.Library("torchvision", "DEF")

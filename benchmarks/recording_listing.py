@@ -1,4 +1,4 @@
-"""Page of all episodes with many of them: `python -m benchmarks.recording_listing COUNT`; prints JSON.
+"""Page that lists many episodes: `python -m benchmarks.recording_listing COUNT`; prints JSON.
 
 EVA_DATA_DIR is a separate folder; requests pass through all layers of the web.
 """
@@ -29,7 +29,7 @@ FILTERS = {
 
 
 def main(count: int) -> None:
-    """Print by filter the median of seven requests [ms]."""
+    """Print for each filter the median duration of seven requests [ms]."""
     import django
 
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
@@ -69,7 +69,7 @@ def _request(page: Any, query: str) -> tuple[float, float]:
 
 
 def _fill(count: int) -> None:
-    """Create playable episodes of three stations, of all modes and results, half of them of trials."""
+    """Create playable episodes of three stations, with all modes and results; half of them belong to trials."""
     from django.utils import timezone
 
     from evaweb.episodes.folders import preview_folder

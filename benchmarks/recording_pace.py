@@ -1,6 +1,6 @@
-"""Frames for any recorder, and a camera's pace.
+"""Frames for any recorder, and the pace of a camera.
 
-Imports only numpy, because the interpreters of other recorders run it too.
+Imports only numpy, because the interpreters of other recorders run it, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Frames:
         self._pictures = np.load(path, mmap_mode="r")
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Return image `index` by camera [H, W, 3], as copies."""
+        """Return the images [H, W, 3] of frame `index` by camera, as copies."""
         turn = 2 * len(self._pictures) - 2
         place = min(index % turn, turn - index % turn)
         return {camera: np.array(self._pictures[place, number]) for number, camera in enumerate(CAMERAS)}
@@ -41,7 +41,7 @@ def joints(index: int) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class RecorderCost:
-    """Cost of an episode to a recorder; processor times include children [s]."""
+    """Cost of an episode for a recorder; processor times include child processes [s]."""
 
     frames: int
     capture_cpu_s: float
@@ -55,12 +55,12 @@ class RecorderCost:
     peak_mb: float
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields as JSON."""
+        """Return the fields by name, as values for JSON."""
         return asdict(self)
 
 
 def feed_frames(frames: Frames, count: int, add: Callable[[int, dict[str, Any]], None]) -> dict[str, Any]:
-    """Call `add` for `count` frames at 30 Hz; return the first fields of a RecorderCost."""
+    """Call `add` for `count` frames at 30 Hz; return the fields of a RecorderCost that are known then."""
     took, late = [], 0
     before = processor_s()
     own = 0.0  # for creating the frames, which is not the recorder's
@@ -86,7 +86,7 @@ def feed_frames(frames: Frames, count: int, add: Callable[[int, dict[str, Any]],
 
 
 def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> RecorderCost:
-    """Call `save` and return the complete cost; `folder` contains what was saved."""
+    """Call `save`, which writes the episode to `folder`, and return the complete cost."""
     before, begun = processor_s(), time.monotonic()
     save()
     return RecorderCost(
@@ -99,6 +99,6 @@ def finish(given: dict[str, Any], save: Callable[[], None], folder: Path) -> Rec
 
 
 def processor_s() -> float:
-    """Return the processor time of this process and of its ended children [s]."""
+    """Return the processor time of this process and of its child processes that have ended [s]."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)

@@ -1,4 +1,4 @@
-"""Recording of a complete station: cost, delay until frames are on disk, end, and publication."""
+"""Recording by a complete station: cost, delay until frames are on disk, end of the run, and publication."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class PatientLab(Lab):
     """Lab that tolerates slow starts of its processes on a busy machine."""
 
     def ready(self, **asked: Any) -> PatientLab:
-        """Set up, repeatedly while a killed process is restarting.
+        """Set up the station; try again while a killed process is restarting.
 
         Raises:
             AssertionError: If it remains impossible.
@@ -48,7 +48,7 @@ class PatientLab(Lab):
 
 
 class Watch:
-    """Observer of both processes and of an episode's videos, in a thread until `end`."""
+    """Observer of the memory of two processes and of the sizes of an episode's videos, in a thread until `end`."""
 
     def __init__(self, media: psutil.Process, reception: psutil.Process, folder: Path) -> None:
         self._media, self._reception = media, reception
@@ -102,7 +102,9 @@ def _used(process: psutil.Process) -> float:
 
 
 def record(folder: Path, seconds: float) -> dict[str, Any]:
-    """Start a station with three cameras of 640x480 at 30 Hz, record a run of `seconds`, end and publish it."""
+    """Start a station with three cameras of 640x480 at 30 Hz, record a run of `seconds`, end it and publish the
+    episode.
+    """
     lab = PatientLab(folder)
     try:
         lab.node(*SIZE).server()
@@ -153,12 +155,12 @@ def record(folder: Path, seconds: float) -> dict[str, Any]:
 
 
 def _missed(lab: Lab) -> int:
-    """Return the number of observations that the node sent and the station did not receive."""
+    """Return the number of observations that the node sent but the station did not receive."""
     return int(lab.client.status()["link"]["faults"].get("frames_lost", 0))
 
 
 def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
-    """Return missing rows of the grid, and images that were given but are not in the video.
+    """Return the number of missing rows of the grid, and of images that were given but are not in the video.
 
     Images of `missed` observations are included. `grid_repeats` and `grid_skips` are not losses: source and grid have
     independent clocks of 30 Hz.
@@ -191,8 +193,9 @@ def lost(episode: Episode, missed: int = 0) -> dict[str, Any]:
 
 
 def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> dict[str, float]:
-    """Return the time from an image's capture until its packet is completely in the file, observed from
-    outside [ms].
+    """Return the time from an image's capture until its packet is completely in the file [ms].
+
+    The sizes of the files are observed from another process.
     """
     started = float(episode.manifest["started_monotonic"])  # type: ignore[arg-type]
     taken: list[float] = []
@@ -213,9 +216,7 @@ def to_disk(episode: Episode, sizes: Mapping[str, list[tuple[float, int]]]) -> d
 
 
 def published(episode: Path, dataset: Path, frames: int) -> dict[str, Any]:
-    """Publish by the command line; return its duration, and the number of encoded frames that differ from the
-    recording.
-    """
+    """Publish by the command line; return the duration, and how many encoded frames differ from the recording."""
     command = [sys.executable, "-m", "runtime.datasets", "publish", str(episode), "--to", str(dataset)]
     command.append("--include-interrupted")  # measure it even if the run failed on a busy machine
     begun = time.monotonic()

@@ -1,4 +1,4 @@
-"""Policies whose every action is known: their rows are those of a trajectory, by control step."""
+"""Policies whose every action is known: row by row, their actions are those of a trajectory at the control step."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IntendedRows = Callable[[int], Float64]  # observation step -> rows [H, DIM]
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Trajectory of three joints as sums of sines; `rate` [Hz] is the control rate, steps may be fractional."""
+    """Trajectory of three joints as sums of sines; `rate` [Hz] is the control rate, and steps may be fractional."""
 
     rate: float
 
@@ -44,13 +44,14 @@ class Reference:
 
 
 def chunks_of(table: Float64, horizon: int) -> IntendedRows:
-    """Return the rows of `table` [N, DIM] from the observation step on."""
+    """Return a function that returns `horizon` rows of `table` [N, DIM] from the observation's step on."""
     return lambda step: table[step : step + horizon]
 
 
 def with_disagreement(meant: IntendedRows) -> IntendedRows:
-    """Return `meant` with a constant offset per chunk of at most DISAGREEMENT, deterministic and different
-    for each chunk.
+    """Return `meant`, changed so that each chunk has a constant offset of at most DISAGREEMENT.
+
+    The offset is deterministic and different for each chunk.
     """
 
     def rows(step: int) -> Float64:
@@ -63,8 +64,8 @@ def with_disagreement(meant: IntendedRows) -> IntendedRows:
 def make_policy(meant: IntendedRows) -> Callable[[int, Conditioning | None], Float64]:
     """Return a policy with the rows of `meant` that continues its last chunk if the request is conditioned.
 
-    A stand-in for a model with real-time chunking: rows that will have been executed before the answer arrives are
-    repeated, then it changes to its current intention within 8 rows. It says nothing about real models.
+    It replaces a model with real-time chunking: rows that will have been executed before the answer arrives are
+    repeated, then it changes to its current intention within 8 rows. It shows nothing about real models.
     """
 
     def policy(step: int, conditioning: Conditioning | None) -> Float64:

@@ -1,4 +1,4 @@
-"""Time until an episode plays: from its address to the first image of every camera.
+"""Time until an episode plays: from opening its address to the first image of every camera.
 
 The demo records a run; then the web alone serves it to Debian's Chromium with an empty cache.
 """
@@ -44,7 +44,9 @@ _WATCH = """
 
 
 def measure(seconds: float) -> Report:
-    """Measure `replay_start_ms` and `replay_fetched_share` (of the videos): medians of nine visits by new browsers."""
+    """Measure `replay_start_ms`, and `replay_fetched_share` (of the videos' bytes): medians of nine visits by new
+    browsers.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         ready = folder / "ready.json"
@@ -64,7 +66,7 @@ def measure(seconds: float) -> Report:
 
 
 def _recorded(visitor: RestClient, seconds: float) -> str:
-    """Return the episode of a run of that length, when its videos can be played."""
+    """Return the episode of a run of `seconds`, as soon as its videos can be played."""
     with closing(LivePage(visitor, STATION)) as page:
         scene = visitor.get("scenes")["items"][0]
         checkpoint = visitor.get("checkpoints")["items"][0]["name"]
@@ -84,7 +86,7 @@ def _recorded(visitor: RestClient, seconds: float) -> str:
 
 @contextmanager
 def _web(data: Path) -> Iterator[str]:
-    """Yield the address of a web process alone, on a free port."""
+    """Yield the address of a web process on a free port, without the other processes of a lab."""
     child = subprocess.Popen(
         [sys.executable, "manage.py", "serve", "--port", "0", "--lifeline"],
         cwd=ROOT,
@@ -103,7 +105,7 @@ def _web(data: Path) -> Iterator[str]:
 
 
 def _visits(url: str, password: str, episode: str, size: int) -> Iterator[dict[str, Any]]:
-    """Yield visits of new browsers; the first visit, which warms up the web, is not counted."""
+    """Yield the results of visits by new browsers; the first visit, which warms up the web, is not among them."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

@@ -15,7 +15,7 @@ _COMPARE = {"<=": operator.le, "<": operator.lt, ">=": operator.ge, "==": operat
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """Number with its requirement, such as "<= 0.5"; "" if it is only reported."""
+    """Number with its requirement, such as "<= 0.5"; the requirement is "" if the number is only reported."""
 
     name: str
     value: float
@@ -24,7 +24,7 @@ class Figure:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the value meets the requirement; None without one."""
+        """Whether the value meets the requirement; None if there is no requirement."""
         if not self.wanted:
             return None
         sign, bound = self.wanted.split()

@@ -1,6 +1,7 @@
 """Result pages with 100,000 trials of 200 evaluations, exports, concurrent allocation, and the stopping rule.
 
-On SQLite, and on PostgreSQL if its programs and a driver are installed: a separate server in a scratch folder.
+They are measured on SQLite, and on PostgreSQL if its programs and a driver are installed, with a server in a temporary
+folder.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def measure(
 def _measured(
     data: Path, environment: dict[str, str], plans: int, trials: int, copies: int = 1
 ) -> dict[str, Any]:
-    """Return the results on one database, from a separate program."""
+    """Return the results on one database, which a separate program measures."""
     data.mkdir()
     out = data / "out.json"
     counts = {"--plans": plans, "--trials": trials, "--copies": copies}
@@ -93,7 +94,7 @@ def _measured(
 
 
 def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
-    """Yield the figures of one database."""
+    """Yield the figures that were measured on one database."""
     name = row["database"]
     for page in PAGES:
         found = row["pages"][page]
@@ -114,7 +115,7 @@ def database_figures(row: dict[str, Any]) -> Iterator[Figure]:
 
 
 def rule_figures(runs: int) -> Iterator[Figure]:
-    """Yield the rates at which the stopping rule, and a peeking reader, separate equal checkpoints."""
+    """Yield how often the stopping rule, and a reader who tests at every look, separate equal checkpoints."""
     for rate in RATES:
         chance = random.Random(f"{rate}")
         found = naive = 0

@@ -63,8 +63,10 @@ def main() -> None:
 
 
 def pages(seeded: Seeded, rounds: int) -> dict[str, dict[str, float]]:
-    """Return by page p50 and p95 [ms] of many requests, of the first per evaluation, and the most queries of
-    a request.
+    """Return the durations of many requests by page [ms] and the largest number of queries of a request.
+
+    The durations are p50 and p95 of the first request per evaluation, after the caches were cleared (cold), and of a
+    second one.
     """
     from django.db import connection
     from django.test import Client
@@ -130,7 +132,7 @@ def _addresses(seeded: Seeded) -> dict[str, Callable[[Any], str]]:
 def planner(seeded: Seeded) -> dict[str, float]:
     """Return the delay of other pages while one viewer sends many different requests to the calculator.
 
-    p95 of the page [ms], and the numbers of answered requests and of those refused with a retry time.
+    The result has p95 of a page [ms], and the numbers of requests that were answered, and refused with a retry time.
     """
     from django.test import Client
 
@@ -190,7 +192,10 @@ def _parquet_rows(content: bytes) -> int:
 
 
 def measure_allocation(seeded: Seeded) -> dict[str, float]:
-    """Let all operators request trials of one plan at all stations simultaneously, until none is left."""
+    """Let all operators request trials of one plan at all stations simultaneously, until none is left.
+
+    Return the numbers of trials allocated, left over or allocated wrongly, and the duration of requests.
+    """
     from evaweb.plans.models import Plan
     from evaweb.plans.services import freeze_plan
 
@@ -244,9 +249,9 @@ def measure_allocation(seeded: Seeded) -> dict[str, float]:
 def _operator(
     plan: Any, operator: Any, station: Any, times: list[float], locked: list[str], faults: list[str]
 ) -> None:
-    """Request, run and score trials in a loop; another operator's trial on the station is waited for.
+    """Request, run and score trials in a loop; if another operator's trial is on the station, wait for it.
 
-    If the database is locked for too long, the web refuses and the operator retries: `locked`.
+    If the database is locked for too long, the web refuses, the operator retries, and the refusal is added to `locked`.
     """
     from django.db import OperationalError, connection
 
@@ -303,7 +308,7 @@ def _made(trial: Any, operator: Any) -> None:
 
 
 def _out_of_order(handed: Sequence[tuple[int, int, int]]) -> int:
-    """Return the number of blocks that began out of order, changed station, or had two stations."""
+    """Return the number of blocks that began out of order, changed their station, or had two stations."""
     begun = list(dict.fromkeys(block for _, block, _ in handed))
     wrong = sum(one > other for one, other in pairwise(begun))
     for station in {station for *_, station in handed}:

@@ -1,4 +1,4 @@
-"""Separate PostgreSQL server in a scratch folder, reached by a socket there."""
+"""Separate PostgreSQL server in a temporary folder, which is reached by a socket in that folder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def why_not() -> str:
 
 @contextmanager
 def server(folder: Path) -> Iterator[str]:
-    """Yield the server's address for DATABASE_URL; its durability settings are the defaults."""
+    """Yield the server's address for DATABASE_URL; its durability settings are PostgreSQL's defaults."""
     folder.mkdir()
     if os.geteuid() == 0:
         shutil.chown(folder, _USER)

@@ -1,4 +1,4 @@
-"""Database of a lab with many evaluations, as after years, for measurements of pages."""
+"""Database of a lab with many evaluations, as after years of use, for measurements of pages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _COPIED = (
 
 @dataclass(frozen=True, slots=True)
 class Seeded:
-    """Seeded data: plans with visible results, their viewer, operators, stations."""
+    """Created data: plans with visible results, a viewer who may see them, operators and stations."""
 
     plans: Sequence[Any]
     viewer: Any
@@ -40,8 +40,9 @@ class Seeded:
 
 
 def seed(plans: int, trials: int) -> Seeded:
-    """Create `plans` evaluations with about `trials` trials in all; the last twentieth of the plans is still
-    running.
+    """Create `plans` evaluations with about `trials` trials in all.
+
+    The last twentieth of the plans is still running.
     """
     from django.contrib.auth.models import Group, User
 
@@ -74,9 +75,9 @@ def seed(plans: int, trials: int) -> Seeded:
 
 
 def multiplied(seeded: Seeded, times: int) -> Seeded:
-    """Multiply each evaluation with all its rows, older copies first; PostgreSQL only.
+    """Copy each evaluation with all its rows until there are `times` as many, with the copies before the originals.
 
-    The server copies rows without checks: its user must be a superuser.
+    PostgreSQL only. The server copies rows without checks, so its user must be a superuser.
     """
     from django.apps import apps
     from django.db import connection, transaction
@@ -106,7 +107,7 @@ def multiplied(seeded: Seeded, times: int) -> Seeded:
 
 
 def _newest(cursor: Any, model: Any) -> int:
-    """Return the highest primary key; 0 if keys are not integers."""
+    """Return the highest primary key of a model; 0 if its keys are not integers."""
     from django.db.models import AutoField
 
     if not isinstance(model._meta.pk, AutoField):
@@ -116,7 +117,7 @@ def _newest(cursor: Any, model: Any) -> int:
 
 
 def _copied(field: Any, steps: Mapping[Any, int]) -> str:
-    """Return the SQL expression of a column in a copy."""
+    """Return the SQL expression for the value of a column in a copied row."""
     column = f'"{field.column}"'
     of = field.related_model if field.is_relation else field.model if field.primary_key else None
     if steps.get(of):
@@ -176,7 +177,7 @@ def _trials(
     begin: datetime,
     share: float,
 ) -> None:
-    """Create the first `share` of a plan's trials: allocated, run, scored and counted."""
+    """Create the trials for the first `share` of a plan's slots: allocated, run, scored and counted."""
     slots = list(plan.slots.order_by("index"))
     slots = slots[: int(len(slots) * share)]
     trials = _run(plan, slots, chance, operators, stations, begin)
@@ -194,7 +195,7 @@ def _run(
     stations: Sequence[Any],
     begin: datetime,
 ) -> list[Any]:
-    """Return a trial with recording for each slot; each block has one station and one operator."""
+    """Return a trial with a recording for each slot; each block has one station and one operator."""
     block_of = {slot.block: (chance.choice(stations), chance.choice(operators)) for slot in slots}
     trials = []
     for number, slot in enumerate(slots):
@@ -208,7 +209,7 @@ def _run(
 
 
 def closed_episode(station: Any, started: datetime, seconds: float) -> Any:
-    """Return an unsaved closed recording with 30 rows per second."""
+    """Return a closed recording with 30 rows per second that is not saved yet."""
     from evaweb.episodes.models import Episode
 
     return Episode(
@@ -246,7 +247,7 @@ def _trial(plan: Any, slot: Any, episode: Any, operator: Any) -> Any:
 
 
 def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Random) -> None:
-    """Score each trial; `skill` is the success rate by checkpoint. Milestones are reached in order."""
+    """Create a score for each trial; `skill` is the success rate by checkpoint. Milestones are reached in order."""
     from evaweb.trials.models import Milestone, MilestoneOutcome, Score
 
     stones: dict[int, list[Any]] = {}
@@ -285,7 +286,7 @@ def _scored(trials: Sequence[Any], skill: Mapping[int, float], chance: random.Ra
 
 
 def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
-    """Create the handouts in the order of the schedule."""
+    """Create the rows for the allocation of slots to trials, in the order of the schedule."""
     from evaweb.plans.commitment import draw_codes
     from evaweb.plans.models import Handout
 
@@ -299,7 +300,7 @@ def _handed(plan: Any, slots: Sequence[Any], trials: Sequence[Any]) -> None:
 
 
 def _written(rows: Sequence[Any]) -> list[Any]:
-    """Insert the rows of one model; on PostgreSQL by COPY, with primary keys reserved first."""
+    """Insert rows of one model; on PostgreSQL by COPY, with primary keys reserved first."""
     from django.db import connection
     from django.db.models import AutoField
     from django.db.models.expressions import DatabaseDefault
@@ -335,7 +336,7 @@ def _written(rows: Sequence[Any]) -> list[Any]:
 
 
 def _counted(plan: Any) -> None:
-    """Set each trial's only score as its verdict, in one statement for speed."""
+    """Let each trial's only score be its verdict, in one statement for speed."""
     from django.db import connection
 
     with connection.cursor() as cursor:

@@ -1,8 +1,8 @@
 """Loops that only sleep, for comparison: `python -m benchmarks.sleeper HOW HZ SECONDS [PRIORITY]`.
 
-"rest" is the common method: sleep for what is left of the period since the last wake-up. "deadlines" sleeps until
-absolute deadlines, as the control process does, and with PRIORITY in the real-time scheduling class of that process.
-The loops do no work, so that their lateness is caused by the machine alone.
+"rest" is the common method: sleep for the rest of the period since the last wake-up. "deadlines" sleeps until absolute
+deadlines, as the control process does, and with PRIORITY in the real-time scheduling class of that process. The loops
+do no work, so that their lateness is caused by the machine alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from runtime.core.clock import MonotonicClock
 
 
 def main() -> None:
-    """Print a line of JSON: scheduling class, and time, step and lateness of each wake-up [s]."""
+    """Run a loop and print a line of JSON: scheduling class, and time, step and lateness of each wake-up [s]."""
     how, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
     scheduling = realtime.enter_realtime(int(sys.argv[4])) if len(sys.argv) > 4 else "ordinary"
     loop = {"rest": _sleep, "deadlines": _deadlines}[how]
@@ -25,7 +25,7 @@ def main() -> None:
 
 
 def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep for the remaining period since the last wake-up."""
+    """Sleep repeatedly for the rest of the period since the last wake-up; return the wake-ups."""
     woke = [time.monotonic()]
     end = woke[0] + seconds
     while woke[-1] < end:
@@ -36,7 +36,7 @@ def _sleep(period: float, seconds: float) -> tuple[list[float], list[int], list[
 
 
 def _deadlines(period: float, seconds: float) -> tuple[list[float], list[int], list[float]]:
-    """Sleep until start + n * period; missed deadlines are skipped."""
+    """Sleep repeatedly until start + n * period; missed deadlines are skipped. Return the wake-ups."""
     clock = MonotonicClock()
     woke: list[float] = []
     steps: list[int] = []

@@ -30,7 +30,7 @@ Fuzzer = Callable[[int], list[str]]
 
 
 class HeldResources(NamedTuple):
-    """Resources that this process holds."""
+    """Resources that this process uses: files, threads, child processes, and memory."""
 
     files: int
     threads: int
@@ -39,14 +39,14 @@ class HeldResources(NamedTuple):
 
 
 def fuzzers() -> Mapping[str, Fuzzer]:
-    """Return `once` of each module in benchmarks/fuzzing, by name."""
+    """Return the function `once` of each module in benchmarks/fuzzing, by name."""
     names = sorted(module.name for module in pkgutil.iter_modules(fuzzing.__path__))
     modules = {name: importlib.import_module(f"benchmarks.fuzzing.{name}") for name in names}
     return {name: module.once for name, module in modules.items() if hasattr(module, "once")}
 
 
 def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: int | None = None) -> Report:
-    """Run scenarios for `seconds`, from the seed `first` on or a random one; the report lists every violation."""
+    """Run scenarios for `seconds`, from the seed `first` on or from a random one; the report lists every violation."""
     chosen = chosen or fuzzers()
     first = secrets.randbelow(2**31) if first is None else first
     begun, seed = time.monotonic(), first
@@ -69,7 +69,7 @@ def measure(seconds: float, chosen: Mapping[str, Fuzzer] | None = None, first: i
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Log only errors during the block: the scenarios provoke warnings."""
+    """Log only errors within the context, because the scenarios provoke warnings."""
     log = logging.getLogger("runtime")
     before = log.level
     log.setLevel(logging.ERROR)
@@ -80,7 +80,7 @@ def _quiet() -> Iterator[None]:
 
 
 def held_resources() -> HeldResources:
-    """Return the resources that this process holds, without memory that the C library has not returned yet."""
+    """Return the resources that this process uses, without memory that the C library has not returned yet."""
     gc.collect()
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # not available in musl
         trim(0)
@@ -90,7 +90,10 @@ def held_resources() -> HeldResources:
 
 
 def _grown(settled: Sequence[HeldResources]) -> list[Figure]:
-    """Return the growth per round; memory has no requirement if there are too few rounds."""
+    """Return figures on growth: of the counts from first to last round, and of memory per round.
+
+    Memory has no requirement if there are too few rounds.
+    """
     before, after = settled[0], settled[-1]
     memory = [held.memory_mb for held in settled]
     slope = float(theilslopes(memory).slope) if len(memory) > 1 else 0.0

@@ -1,4 +1,4 @@
-"""Time from `python -m runtime` of the tabletop deployment to its first idle snapshot, and its cost.
+"""Time from `python -m runtime` of the tabletop deployment to its first idle snapshot, and the cost until then.
 
 The bench is running, and every file has been read before. Processor time and memory are those of each process at the
 snapshot; modules are those loaded at its end.
@@ -43,7 +43,7 @@ _POLL_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class StartedStation:
-    """Idle station: its client, its processes, and the time until it was idle [s]."""
+    """Idle station, with a client, its processes, and the time that it took to become idle [s]."""
 
     client: StationClient
     processes: Mapping[str, psutil.Process]
@@ -54,9 +54,10 @@ class StartedStation:
 def started(
     node: Mapping[str, str], folder: Path, *assignments: str, broken: str = ""
 ) -> Iterator[StartedStation]:
-    """Yield the tabletop's station at `node`; afterwards `folder`/loaded has a list of modules for each program.
+    """Yield the station of the tabletop deployment, connected to the node `node`.
 
-    `broken` is a comma-separated list of modules that its processes cannot import.
+    Afterwards `folder`/loaded has a list of modules for each program. `broken` is a comma-separated list of modules
+    that its processes cannot import.
     """
     (folder / "loaded").mkdir(parents=True)
     settings = (
@@ -94,7 +95,7 @@ def started(
 
 
 def _station_dir(folder: Path, assignments: tuple[str, ...]) -> Path:
-    """Return the folder of the deployment's station, or of the station named in the overrides."""
+    """Return the folder of the deployment's station, or of the station that the assignments name."""
     named = [one.partition("=")[2].strip('"') for one in assignments if one.startswith("station=")]
     return folder / "stations" / (named[-1] if named else "bench-1")
 
@@ -126,7 +127,7 @@ def _once(node: Mapping[str, str], folder: Path) -> dict[str, Any]:
 
 
 def measure(seconds: float) -> Report:
-    """Measure `station_ready_s`, and `cpu_s.PROCESS`, `modules.PROCESS` and `memory_mb.PROCESS`; medians of 5.
+    """Measure `station_ready_s`, and `cpu_s.PROCESS`, `modules.PROCESS` and `memory_mb.PROCESS`; medians of 5 starts.
 
     `seconds` is ignored.
     """

@@ -1,7 +1,7 @@
-"""The two halves of a strategy in integer steps: request, delay, merge, one action per step.
+"""The two parts of a strategy, query and merge, in integer steps: request, delay, merge, one action per step.
 
-As in coordinator and control, in the same order, but without processes, wire and safety, and with a robot that reaches
-each command at once. A tick is: take an answer or send a request, merge, execute.
+The order is the same as in coordinator and control, but without processes, wire and safety, and with a robot that
+reaches each command at once. A tick is: take an answer or send a request, merge, execute.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class _Request:
 
 @dataclass(slots=True)
 class Log:
-    """Events so far."""
+    """Results of a step loop so far: executed steps, merged chunks, and the steps of their observations."""
 
     executed: list[Executed] = field(default_factory=list)
     merged: list[MergeResult] = field(default_factory=list)
@@ -54,7 +54,9 @@ class Log:
 
 
 class StepLoop:
-    """Run of a strategy; `delay` returns the ticks of request number n (from 1), `rate` is the control rate [Hz]."""
+    """Run of a strategy; `delay` returns the delay of request number n (from 1) in ticks, `rate` is the control rate
+    [Hz].
+    """
 
     def __init__(
         self,
@@ -87,7 +89,7 @@ class StepLoop:
         self.tune(strategy, config)
 
     def tune(self, strategy: ModuleType, config: StrategyParameters) -> None:
-        """Use this strategy from the next tick on."""
+        """Use `strategy` with these parameters from the next tick on."""
         self._joining = self._joining or self._kind not in ("", strategy.__name__)
         self._kind = strategy.__name__
         waited = self.step > 0 and self._merge.requests_while_stopped
@@ -98,7 +100,7 @@ class StepLoop:
             self._waiting = True  # the robot waits intentionally: the next chunk counts as a first one
 
     def run(self, ticks: int) -> Log:
-        """Execute that many ticks."""
+        """Execute `ticks` control periods."""
         for _ in range(ticks):
             self.tick()
         return self.log

@@ -1,6 +1,6 @@
 """Quality of strategies with known policy actions: offset, error, jerk, reaction, starvation.
 
-The halves of the strategies (query, merge, timeline, conditioning) run in integer steps in benchmarks/step_loop.py,
+The parts of the strategies (query, merge, timeline, conditioning) run in integer steps in benchmarks/step_loop.py,
 without processes, wire, safety or robot lag: deterministic, and fast enough for every cell. `checked_in_lockstep` is
 the number of actions that the complete station in lockstep (benchmarks/strategy_station.py) planned for the same
 policy; `different_in_lockstep` is how many of them the step loop does not reproduce bit by bit.
@@ -52,7 +52,7 @@ _SLOW = 4  # number of the delayed request in the run with a spike
 
 @dataclass(frozen=True, slots=True)
 class Cell(Case):
-    """Case with its derived properties."""
+    """Parameters of a measurement, with quantities derived from them."""
 
     @property
     def interval(self) -> int:
@@ -62,24 +62,26 @@ class Cell(Case):
 
     @property
     def feasible(self) -> bool:
-        """True if a chunk lasts until the next one can arrive."""
+        """Whether a chunk lasts until the next one can arrive."""
         return self.strategy == "sync" or self.horizon >= self.delay + self.interval
 
     @property
     def cycle(self) -> int:
-        """Ticks within which everything happens at least once."""
+        """Number of ticks within which everything that repeats happens at least once."""
         return self.horizon + self.delay + self.interval + JOIN_WINDOW
 
     @property
     def config(self) -> StrategyParameters:
-        """Parameters: the defaults, at the cell's rate."""
+        """Parameters of the strategy: the defaults, at the cell's rate."""
         made: StrategyParameters = variants("runtime.strategies")[self.strategy].Config(
             inference_rate=self.inference_hz
         )
         return made
 
     def loop(self, meant: IntendedRows, start: Float64, spike: int = 0) -> StepLoop:
-        """Return a run of the cell; request number _SLOW takes `spike` ticks instead."""
+        """Return a step loop of the cell; the answer to request number _SLOW takes `spike` ticks instead of the
+        delay.
+        """
         module = variants("runtime.strategies")[self.strategy]
 
         def delay(number: int) -> int:
@@ -98,7 +100,7 @@ THE_CELL = {"control_hz": 30.0, "inference_hz": 3.0, "horizon": 50, "delay": 3}
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """Tracking of the reference; errors in rad, offset in steps."""
+    """Quality with which a strategy follows the reference; errors in rad, offset in steps."""
 
     offset: float
     rms_error: float
@@ -108,7 +110,7 @@ class Tracked:
 
 
 def measure(seconds: float) -> Report:
-    """Measure everything; `seconds` is the budget of the moving target alone, cells have no limit."""
+    """Measure all figures; `seconds` is the budget of the moving target alone, the cells have no time limit."""
     cells = [Cell(*values) for values in product(KINDS, CONTROLS, RATES, HORIZONS, DELAYS)]
     with ProcessPoolExecutor(2) as pool:
         rows = list(pool.map(_row, cells, chunksize=20))
@@ -127,7 +129,7 @@ def measure(seconds: float) -> Report:
 
 
 def _figures(rows: Sequence[dict[str, Any]]) -> Iterable[Figure]:
-    """Yield the figures of one strategy: the worst over its feasible cells, and the reaction in one cell."""
+    """Yield the figures of one strategy: the worst values over its feasible cells, and the reaction in one cell."""
     kind, feasible = rows[0]["strategy"], [row for row in rows if row["feasible"]]
     there = next(row for row in rows if all(row[key] == value for key, value in THE_CELL.items()))
     window = StrategyParameters().blend_window
@@ -169,7 +171,7 @@ def _row(cell: Cell) -> dict[str, Any]:
 
 
 def measure_tracking(cell: Cell, disagree: bool, spike: int = 0) -> Tracked:
-    """Follow the reference for _SECONDS after the initial phase."""
+    """Return how well the reference is followed for _SECONDS after the initial phase."""
     reference = Reference(cell.control_hz)
     begin = 2 * cell.cycle
     ticks = begin + 4 * spike + int(_SECONDS * cell.control_hz)
@@ -216,7 +218,7 @@ def _offset(reference: Reference, cell: Cell, log: Log, begin: int) -> float:
 
 
 class _Mind:
-    """Intention of 0 or 1 for all coming steps, whatever it was before."""
+    """Intention that is 0 or 1 for all coming steps, whatever it was before; it can be changed at any time."""
 
     def __init__(self, horizon: int) -> None:
         self.value = 0.0
@@ -227,8 +229,9 @@ class _Mind:
 
 
 def measure_reaction(cell: Cell) -> tuple[int, int, int]:
-    """Return the steps until 50, 90 and 99 % of a change of intention are published, each the worst of
-    _CHANGES changes.
+    """Return the steps until 50, 90 and 99 % of a change of intention are published.
+
+    Each is the worst of _CHANGES changes.
     """
     mind = _Mind(cell.horizon)
     loop = cell.loop(mind, np.zeros(DIM))
@@ -249,6 +252,8 @@ def measure_reaction(cell: Cell) -> tuple[int, int, int]:
 
 
 def _last_below(done: Float64, share: float) -> int:
-    """Return the last step below `share`, with a tolerance of 1e-9."""
+    """Return the index of the last step at which `done` is below `share`, with a tolerance of 1e-9; -1 if there is
+    none.
+    """
     below = np.flatnonzero(done < share - 1e-9)
     return int(below[-1]) if len(below) else -1

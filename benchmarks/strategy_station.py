@@ -1,4 +1,4 @@
-"""Complete station in lockstep compared with the step loop: same policy, same delay, action by action."""
+"""Comparison of a complete station in lockstep with the step loop: same policy, same delay, action by action."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class InstantRobot(Source, Sink):
         self.position = robot.poses["ready"].astype(np.float64)
 
     def connect(self) -> None:
-        """Do nothing: there is no connection."""
+        """Do nothing, because there is no connection."""
 
     def receive(self, timeout: float) -> Observation | None:
         """Return the current observation, with black images."""
@@ -59,11 +59,11 @@ class InstantRobot(Source, Sink):
         self.position = command.action.astype(np.float64)
 
     def close(self) -> None:
-        """Do nothing: there are no resources."""
+        """Do nothing, because there are no resources."""
 
 
 class TablePolicy(Policy):
-    """Policy that answers by the number of control steps since the first observation after a reset."""
+    """Policy whose answer depends only on the number of control steps since the first observation after a reset."""
 
     def __init__(self, answer: Answering, horizon: int) -> None:
         self._answer = answer
@@ -81,11 +81,11 @@ class TablePolicy(Policy):
         return ActionChunk(self._answer(observation.step - self.first, conditioning).astype(np.float32))
 
     def reset(self) -> None:
-        """Regard the next observation as the first."""
+        """Let the next observation be the first one."""
         self.first = -1
 
     def close(self) -> None:
-        """Do nothing: there are no resources."""
+        """Do nothing, because there are no resources."""
 
 
 def station_of(
@@ -95,7 +95,7 @@ def station_of(
     clock: VirtualClock,
     around: LockstepEnvironment | None = None,
 ) -> Lockstep:
-    """Return a station in lockstep with this robot and this policy instead of its own."""
+    """Return a station in lockstep, with `robot` and `policy` instead of those of the deployment."""
     spec = replace(spec, capabilities=Capabilities(moves_robot=True))
     peers = Peers(lambda spec, clock: robot, lambda spec, clock: robot, lambda spec, clock: policy)
     return Lockstep(spec, clock, around, peers)
@@ -122,7 +122,9 @@ class Case:
 
 
 def compare(case: Case) -> tuple[int, int]:
-    """Return the number of the policy's actions that the station planned, and of those that differ in the step loop."""
+    """Return the number of the policy's actions that the station planned, and how many of them differ in the step
+    loop.
+    """
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), case)
         start = spec.robot.poses["ready"].astype(np.float64)
@@ -163,7 +165,7 @@ def _run(spec: StationSpec, policy: TablePolicy) -> tuple[int, Mapping[int, Floa
 
 
 def _answer(start: Float64, case: Case) -> Answering:
-    """Return the policy of both: disagreeing chunks around `start`, in the float32 of the wire."""
+    """Return the policy that both use: disagreeing chunks around `start`, rounded to float32 as in messages."""
     steps = np.arange(_TICKS + 4 * case.horizon, dtype=float)
     reference = Reference(case.control_hz)
     meant = with_disagreement(chunks_of(reference.at(steps) - reference.at(steps[:1]), case.horizon))
@@ -178,8 +180,9 @@ def _answer(start: Float64, case: Case) -> Answering:
 
 
 def lockstep_deployment(data: Path, robot: str, strategy: dict[str, Any], rate: float) -> dict[str, Any]:
-    """Return the deployment of a station on the virtual clock without recording; robot and policy are
-    replaced later.
+    """Return the deployment of a station on the virtual clock without recording.
+
+    Its robot and its policy are replaced later.
     """
     return {
         "station": "strategies",

@@ -1,6 +1,6 @@
 """Open pages at a station, all in this process: `python -m benchmarks.viewers URL STATION COOKIE ...`.
 
-Prints a line of JSON: the age of every snapshot when a viewer received it [ms], and the frames per viewer.
+Prints a line of JSON: the age of every snapshot on arrival at a viewer [ms], and the frames per viewer.
 """
 
 from __future__ import annotations

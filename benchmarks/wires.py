@@ -1,7 +1,7 @@
-"""All wires: round trips of the policy protocols, and delays of observations through each transport.
+"""Policy protocols and transports: round trips of the protocols, and delays of observations through each transport.
 
-See `benchmarks.wires_policies` and `benchmarks.wires_transports` for the methods. Missing software is not measured,
-and its row gives the reason.
+See `benchmarks.wires_policies` and `benchmarks.wires_transports` for the methods. If software is missing, there is no
+measurement, and the row states the reason.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Both ends of each transport that `benchmarks.wires_transports` measures: one function per case."""
+"""Both ends of each transport that `benchmarks.wires_transports` measures: one function per transport."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _MOST_DECODED_HZ = 200.0
 
 @dataclass(slots=True)
 class CaseSetup:
-    """Context of a case: its processes, its folder, and its sender."""
+    """Context in which a case is opened: its processes, its folder, and its sender."""
 
     stack: contextlib.ExitStack
     folder: Path
@@ -47,7 +47,7 @@ class CaseSetup:
         self.times = self.folder / "times.json"
 
     def send(self, module: str, *arguments: str) -> Mapping[str, Any]:
-        """Start the sender, and return what it announces."""
+        """Start the sender, and return the addresses that it announces."""
         page = str(self.page) if self.hurried else ""
         command = [sys.executable, "-m", "benchmarks.wires_sender", str(self.times), page, module, *arguments]
         self.sender = self.stack.enter_context(process(command, self.page))
@@ -63,7 +63,7 @@ class CaseSetup:
         return ("--rate", str(self.rate), "--height", str(self.size[0]), "--width", str(self.size[1]))
 
     def sent(self) -> Any:
-        """End the sender; return the times at which it began its messages."""
+        """End the sender; return the start times of its messages."""
         if self.sender is None:
             return []
         end(self.sender)
@@ -72,7 +72,10 @@ class CaseSetup:
 
 @dataclass(frozen=True, slots=True)
 class CaseEndpoints:
-    """Transport and cameras to receive; an image is dated by its number in a "strip" or "bar", or by its "due" time."""
+    """Transport and cameras of the receiving side.
+
+    `born` is the source of an image's time: the number in its "strip" or "bar", or its "due" time.
+    """
 
     transport: Mapping[str, Any]
     cameras: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -81,9 +84,10 @@ class CaseEndpoints:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Transport by the name of its figures; `needs` is the kind that must be available, with `program`.
+    """Transport to measure; its name is used in the figures.
 
-    `idle` is False if another case covers its memory.
+    `needs` is the kind of transport that must be available, with `program` if that is not "". `idle` is False if
+    another case covers its memory.
     """
 
     name: str
@@ -109,7 +113,7 @@ def cases() -> list[Case]:
 
 
 def absent(case: Case) -> str:
-    """Return why a case cannot be measured here, "" if it can."""
+    """Return why a case cannot be measured on this machine, "" if it can."""
     module = variants("runtime.transports").get(case.needs)
     if module is None:
         return f"there is no transport {case.needs!r}"
@@ -125,7 +129,7 @@ def absent(case: Case) -> str:
 
 @contextlib.contextmanager
 def process(command: Sequence[str], *descriptors: int) -> Iterator[subprocess.Popen[str]]:
-    """Yield a process with a lifeline."""
+    """Yield a process that ends when its standard input is closed, at the end of the context."""
     child = subprocess.Popen(
         command,
         cwd=ROOT,
@@ -164,14 +168,14 @@ def _zmq(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _ros2(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case with JPEG, as the robot publishes."""
+    """Open the case of ROS 2 with images as JPEG, as the robot publishes them."""
     domain = stage.stack.enter_context(free_domain())
     stage.send("ros2_node", "--robot", stage.robot, "--domain", str(domain), *stage.sized())
     return CaseEndpoints({"kind": "ros2", "domain": domain})
 
 
 def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case with raw pixels of the same robot."""
+    """Open the case of ROS 2 with raw pixels from the same robot."""
     folder = stage.folder / stage.robot
     shutil.copytree(ROOT / "robots" / stage.robot, folder)
     described = (folder / "robot.toml").read_text("utf-8")
@@ -181,7 +185,7 @@ def _ros2_raw(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _ros1(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case with rospy at both ends, and a separate master."""
+    """Open the case of ROS 1 with rospy at both ends, and a separate master."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -194,7 +198,7 @@ def _ros1(stage: CaseSetup) -> CaseEndpoints:
 
 @contextlib.contextmanager
 def _master(port: int, environment: Mapping[str, str]) -> Iterator[None]:
-    """Run a ROS 1 master during the block."""
+    """Run a ROS 1 master within the context."""
     child = subprocess.Popen(
         ["rosmaster", "--core", "-p", str(port)], env=environment, stdout=subprocess.DEVNULL
     )
@@ -216,7 +220,7 @@ def _dataset(stage: CaseSetup) -> CaseEndpoints:
 
 
 def _file_cameras(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case with video files in place of the recording's own cameras."""
+    """Open the case of a recording with video files in place of its own cameras."""
     transport, videos = _recorded(stage)
     cameras = {key: {"kind": "file", "path": str(path)} for key, path in videos.items()}
     return CaseEndpoints(transport, cameras, born="due")
@@ -229,7 +233,7 @@ def _recorded(stage: CaseSetup) -> tuple[dict[str, Any], dict[str, Path]]:
 
 
 def _mjpeg_cameras(stage: CaseSetup) -> CaseEndpoints:
-    """Open the case with network cameras in addition to a node with minimal images.
+    """Open the case of network cameras in addition to a node with minimal images.
 
     Images that arrive faster than they are decoded are skipped, so the rate is limited.
     """

@@ -1,8 +1,8 @@
 """Round trip of each policy protocol with its stand-in server, which is a separate process.
 
-Every request is a complete `infer`: three 224x224 images and 14 joints are sent, 50 rows of 14 numbers are received
-and checked. The published `openpi-client` sends the same observation to the same server, alternating with ours; it
-gets views of the same images, as in its own examples.
+Every request is a complete `infer`: three 224x224 images and 14 joints are sent, 50 rows of 14 numbers are received and
+checked. The published `openpi-client` sends the same observation to the same server, alternating with our client; it
+receives views of the same images, as in its own examples.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _PEER = "openpi-client"
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Protocol by its name in `runtime.standins.serve`: our settings, and options of the server."""
+    """Protocol to measure, by its name in `runtime.standins.serve`: our settings, and options of the server."""
 
     name: str
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -82,8 +82,9 @@ def protocols(robot: Robot) -> list[Protocol]:
 
 
 def measure(seconds: float) -> list[Row]:
-    """Return a row per protocol, each measured for `seconds`; openpi for twice as long, as it alternates with
-    its peer.
+    """Return a row per protocol, each measured for `seconds`.
+
+    openpi is measured for twice as long, because it alternates with the published client.
     """
     heap.keep_freed_memory()  # as in the coordinator
     robot = robots.load_robot(ROBOT)
@@ -113,7 +114,10 @@ def _case(protocol: Protocol, robot: Robot, seconds: float) -> Row:
 
 
 def _round(opened: Sequence[Opening], seconds: float) -> list[Timed]:
-    """Measure each client with a new connection, because the placement of its threads on processors is random."""
+    """Measure each client for `seconds` with a new connection.
+
+    Several rounds are needed, because the placement of a connection's threads on processors is random.
+    """
     with contextlib.ExitStack() as stack:
         return in_turn([stack.enter_context(opening()) for opening in opened], seconds)
 
@@ -144,7 +148,7 @@ class Timed:
         return float(np.median(self.round_trips))
 
     def row(self) -> Row:
-        """Return the row; `cpu_ms` is the processor time of this process per request, with all threads."""
+        """Return the measurements as a row; `cpu_ms` is this process's processor time per request, with all threads."""
         percentiles = {f"p{q}": 1e3 * float(np.percentile(self.round_trips, q)) for q in (50, 99)}
         return {"round_trip_ms": percentiles, "cpu_ms": 1e3 * float(np.mean(self.processor))}
 
@@ -152,7 +156,7 @@ class Timed:
 def in_turn(
     asks: Sequence[Ask], seconds: float, clock: Callable[[], float] = time.perf_counter
 ) -> list[Timed]:
-    """Call each in turn, in reversed order every second time, after a warm-up."""
+    """Call each of `asks` in turn after a warm-up, in reversed order every second time; return the measurements."""
     for _ in range(WARM):
         for ask in asks:
             ask()
@@ -179,7 +183,7 @@ def observation(robot: Robot) -> Observation:
 
 
 def absent(protocol: Protocol, robot: Robot) -> str:
-    """Return the software that is missing for a protocol, "" if none."""
+    """Return why a protocol cannot be measured on this machine, "" if it can."""
     try:
         _policy(protocol, robot)
     except ConfigurationError as error:
@@ -195,7 +199,7 @@ def _policy(protocol: Protocol, robot: Robot, url: str | None = None) -> Policy:
 
 
 def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
-    """Return the published client for the same requests, or why it is not available."""
+    """Return the published client with the same requests, or the reason why it is not available."""
     try:
         from openpi_client.websocket_client_policy import WebsocketClientPolicy
     except ImportError as error:
@@ -216,7 +220,7 @@ def _peer(shown: Observation) -> tuple[Callable[[str], Opened] | None, str]:
 
 
 def _weighed(protocol: Protocol, robot: Robot, url: str, shown: Observation) -> Row:
-    """Return the bytes per request and answer, with all protocol overhead, counted by a relay."""
+    """Return the bytes per request and per answer, with all overhead of the protocol, counted by a relay."""
     place = urlsplit(url)
     assert place.port is not None
     with Relay(place.port) as relay:

@@ -1,7 +1,7 @@
 """Receiving side of a transport in a process, like reception: `python -m benchmarks.wires_receiver JSON`.
 
-The JSON is a `Receiving`. Observations are written to the shared state of the inherited descriptor, until standard
-input ends. With `fast`, for recordings, a virtual clock advances by a frame as soon as the previous one is written,
+The JSON is a `Receiving`. Observations are written to the shared state whose descriptor is inherited, until standard
+input ends. With `fast`, for recordings, a virtual clock advances by a frame as soon as the previous frame is written,
 and a finished recording is played again.
 """
 
@@ -34,8 +34,9 @@ _PUMP_S = 0.005  # as in reception
 
 @dataclass(frozen=True, slots=True)
 class Receiving:
-    """Robot by name or path, transport and cameras as in a deployment, descriptor of the shared state, and
-    whether `fast`.
+    """Parameters of the receiving side: robot, transport and cameras, descriptor of the shared state, and `fast`.
+
+    The robot is a name or path; transport and cameras are as in a deployment.
     """
 
     robot: str
@@ -49,12 +50,12 @@ class Receiving:
 
 
 def layout(robot: Robot) -> SharedStateLayout:
-    """Return the shared state layout of a station with this robot and all of its cameras."""
+    """Return the layout of shared state for a station with this robot and all its cameras."""
     return SharedStateLayout(robot.dim, robot.eef_dim, tuple(camera.key for camera in robot.cameras))
 
 
 def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
-    """Return the transport's observations with the deployment's own cameras, which the transport does not provide."""
+    """Return the transport's observations, with the pictures of the deployment's own cameras added."""
     module = variants("runtime.transports")[given.transport["kind"]]
     kinds = variants("runtime.cameras")
     cameras = {key: kinds[table["kind"]].Config(**table) for key, table in given.cameras.items()}
@@ -63,7 +64,7 @@ def source(given: Receiving, robot: Robot, clock: Clock) -> Source:
 
 
 def main(text: str) -> None:
-    """Receive until the lifeline ends."""
+    """Receive observations until the lifeline ends."""
     heap.keep_freed_memory()
     given = Receiving(**json.loads(text))
     robot = robots.load_robot(given.robot)

@@ -1,4 +1,4 @@
-"""Recording to play: a LeRobot v2.1 dataset of one episode, whose videos file cameras play too."""
+"""Recording to play: a LeRobot v2.1 dataset of one episode, whose videos are also played by file cameras."""
 
 from __future__ import annotations
 

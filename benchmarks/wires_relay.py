@@ -46,7 +46,7 @@ class Relay:
             end.close()
 
     def settled(self) -> tuple[int, int]:
-        """Return the bytes to and from the server so far, after a tenth of a second without traffic."""
+        """Return the bytes sent to and received from the server so far, after a tenth of a second without traffic."""
         before, now = None, self._now()
         while before != now:
             time.sleep(_QUIET_S)

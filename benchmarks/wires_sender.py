@@ -1,9 +1,9 @@
-"""Sender at the other end of a transport, and the start times of its messages.
+"""Sender at the other end of a transport, which records the start times of its messages.
 
 `python -m benchmarks.wires_sender TIMES PAGE MODULE ARGUMENT...` runs the simulated robot `runtime.simulation.MODULE`,
-or with MODULE "cameras" MJPEG cameras: COUNT RATE WIDTH HEIGHT. At its end it writes the times [s] to the file TIMES
-as JSON: by message from 0 on, or by camera. If PAGE is the descriptor of the shared state that receives a simulated
-robot's images, it is never more than a few images ahead, so that none is lost.
+or with MODULE "cameras" MJPEG cameras: COUNT RATE WIDTH HEIGHT. At its end it writes the times [s] to the file TIMES as
+JSON: by message from 0 on, or by camera. If PAGE is the descriptor of the shared state that receives a simulated
+robot's images, the sender is never more than a few images ahead of the receiver, so that none is lost.
 """
 
 from __future__ import annotations
@@ -30,14 +30,17 @@ _LOOK_S = 0.0005
 
 
 class Pace:
-    """Pace that allows a sender to be a few images ahead of `arrived`; images are lost after `patience` [s]."""
+    """Limit that keeps a sender at most a few images ahead of `arrived`.
+
+    An image that has not arrived after `patience` [s] counts as lost.
+    """
 
     def __init__(self, arrived: Callable[[], int], clock: Clock, patience: float = 0.05) -> None:
         self._arrived, self._clock, self._patience = arrived, clock, patience
         self._seen, self._ahead = arrived(), 0
 
     def wait(self) -> None:
-        """Wait until one more image may be sent."""
+        """Wait until the sender may send one more image."""
         end = self._clock.now() + self._patience
         while True:
             seen = self._arrived()
@@ -81,7 +84,7 @@ class TimestampingCameraServer(MjpegServer):
 
 @exit_on_broken_pipe
 def main(file: str, shared: str, module: str, *arguments: str) -> int:
-    """Run the sender; return the exit code of the simulated robot."""
+    """Run the sender until its end; return the exit code of the simulated robot."""
     if module == "cameras":
         return _cameras(Path(file), arguments)
     simulated = importlib.import_module(f"runtime.simulation.{module}")

@@ -1,11 +1,12 @@
 """Delay of observations through each transport: three cameras and joints, from the sender to the control loop.
 
 Sender, receiving side (`benchmarks.wires_receiver`, like reception) and control loop are separate processes. The
-control loop is this one: it polls shared state at 100 Hz, so that its readings are uniformly distributed between two
-images. Live images of 640x480 come at 30 Hz. Their age counts from the moment at which the sender began to draw and
-encode them, which is known by their number; images of recordings, which have no sender, count from their due time.
-Afterwards another receiving side gets the images of ten idle minutes as fast as possible, and its memory growth since
-the first of them is reported. If this takes more than a few times the live part, the number of minutes is reported.
+control loop is this process: it polls shared state at 100 Hz, so that its readings are uniformly distributed between
+two images. Live images of 640x480 arrive at 30 Hz. Their age is the time since the sender began to draw and encode
+them, which is known by their number; the age of images of recordings, which have no sender, is the time since they were
+due. Afterwards another receiving side receives the images of ten idle minutes as fast as possible, and its memory
+growth since the first of them is reported. If this takes more than a few times as long as the live part, it ends early,
+and the number of minutes is reported.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def _measured(case: Case, seconds: float) -> Row:
 
 
 def live(case: Case, seconds: float) -> Row:
-    """Return the ages of images in a control loop at their usual rate, and the cost of receiving them."""
+    """Return the ages of images in a control loop at the transport's usual rate, and the cost of receiving them."""
     with _staged(case, FPS, _LIVE) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=False)
@@ -81,7 +82,7 @@ def live(case: Case, seconds: float) -> Row:
 
 
 def idle(case: Case, seconds: float, frames: int = IDLE_FRAMES) -> Row:
-    """Return the memory growth of the receiving side over that many images of each camera, or over `seconds`."""
+    """Return the memory growth of the receiving side over `frames` images of each camera, or over `seconds`."""
     with _staged(case, _FLOOD_HZ, _FLOOD, hurried=True) as (stage, shared):
         wired = case.open(stage)
         receiver = _receiving(stage, wired, fast=case.played)
@@ -112,7 +113,7 @@ def _staged(
 
 
 def _receiving(stage: CaseSetup, wired: CaseEndpoints, fast: bool) -> subprocess.Popen[str]:
-    """Start the process that fills the shared state."""
+    """Start the receiving process, which fills the shared state."""
     given = Receiving(stage.robot, wired.transport, stage.page, wired.cameras, fast)
     command = [sys.executable, "-m", "benchmarks.wires_receiver", given.text()]
     return stage.stack.enter_context(process(command, stage.page))
@@ -121,10 +122,10 @@ def _receiving(stage: CaseSetup, wired: CaseEndpoints, fast: bool) -> subprocess
 def _await(
     shared: SharedState, receiver: subprocess.Popen[str], frames: int, seconds: float = math.inf
 ) -> int:
-    """Return the number of images of every camera, after `frames` or `seconds`.
+    """Wait until `frames` images of every camera have arrived, or for `seconds`; return their number.
 
     Raises:
-        SystemExit: If none arrive.
+        SystemExit: If no more arrive.
     """
     seen, since = 0, time.monotonic()
     latest = since + seconds
@@ -146,7 +147,7 @@ Look = list[
 
 
 def _control_readings(shared: SharedState, seconds: float) -> tuple[list[Look], int]:
-    """Return the readings of a control loop at each of its ticks, and the number of observations meanwhile."""
+    """Return the readings of a control loop at each of its ticks, and the number of observations in that time."""
     clock = MonotonicClock()
     first = int(shared.observation.read()["sequence"])
     looks: list[Look] = []
@@ -164,12 +165,12 @@ def _control_readings(shared: SharedState, seconds: float) -> tuple[list[Look], 
 
 
 def number_marks(picture: UInt8) -> UInt8:
-    """Return the parts of an image that encode its number: the strip at its head and the bar at its foot."""
+    """Return the parts of an image that encode its number: the strip at its top and the bar at its bottom."""
     return np.concatenate([picture[:16], picture[-16:]])
 
 
 def image_ages(looks: Sequence[Look], born: str, sent: Any) -> list[float | None]:
-    """Return the age of the oldest image at each tick [s]; None if an image was being overwritten."""
+    """Return for each tick the age of the oldest image [s]; None if an image was being overwritten."""
     found: list[float | None] = []
     for look in looks:
         births = [_birth(index, *one, born, sent) for index, one in enumerate(look)]
@@ -188,7 +189,7 @@ def sent_hz(sent: Any, begun: float, took: float) -> float | None:
 def _birth(
     camera: int, marks: UInt8 | None, captured: float, now: float, born: str, sent: Any
 ) -> float | None:
-    """Return when an image's sender began it [s]."""
+    """Return when the sender began an image [s]; None if its marks could not be read."""
     if born == "due":
         return captured
     if marks is None:
@@ -200,14 +201,16 @@ def _birth(
 
 
 def strip_number(marks: UInt8) -> int:
-    """Return the number in the strip; `frame_number` expects it in the head of a complete image."""
+    """Return the number in the strip, which `frame_number` expects at the top of a complete image."""
     whole = np.zeros((_LIVE[0], *marks.shape[1:]), np.uint8)
     whole[:16] = marks[:16]
     return frame_number(whole)
 
 
 def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
-    """Return when the newest image with this bar width was sent; widths repeat every 80 images of 640 pixels."""
+    """Return the send time of the newest image with a bar of this width; widths repeat after 80 images of 640
+    pixels.
+    """
     width, cycle = int((marks[-4].mean(axis=-1) > 127).sum()), marks.shape[1] // 8
     number = round((width - 1) / 8) % cycle
     left = [time for index, time in enumerate(times) if index % cycle == number and time <= now]
@@ -215,18 +218,18 @@ def bar_birth(marks: UInt8, now: float, times: Sequence[float]) -> float:
 
 
 def _processor(process: psutil.Process) -> float:
-    """Return the processor time of a process and its children so far [s]."""
+    """Return the processor time of a process and its child processes so far [s]."""
     everybody = [process, *process.children(recursive=True)]
     return float(sum(sum(one.cpu_times()[:2]) for one in everybody))
 
 
 def _resident(process: psutil.Process) -> float:
-    """Return the memory of a process and its children [bytes]."""
+    """Return the memory of a process and its child processes [bytes]."""
     return float(sum(one.memory_info().rss for one in [process, *process.children(recursive=True)]))
 
 
 def _ended(receiver: subprocess.Popen[str]) -> Mapping[str, int]:
-    """End the receiving side; return its faults by name."""
+    """End the receiving side; return the counts of its faults by name."""
     end(receiver)
     assert receiver.stdout is not None
     faults: Mapping[str, int] = json.loads(receiver.stdout.read())

@@ -1,4 +1,4 @@
-"""Robots as data: one folder each with robot.toml, URDF and README; loader, kinematics, collision check."""
+"""Robots as data, in one folder each with robot.toml, URDF and README; loader, kinematics, collision check."""
 
 from robots.body import Body
 from robots.chain import Chain

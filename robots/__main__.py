@@ -1,4 +1,4 @@
-"""python -m robots: lists the robots, checks a description, answers forward kinematics, drafts a description."""
+"""python -m robots: lists the robots, checks a description, computes forward kinematics, drafts a description."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _print_findings(found: Inspection) -> int:
 
 
 def _with_group(name: str, group: str) -> Robot:
-    """Return the robot with its usual groups, plus that group if it is optional."""
+    """Return the robot with its usual groups, and with `group` even if it is optional."""
     robot = load_robot(name)
     declared = description.read(robot.folder / "robot.toml").groups
     if group not in [entry.name for entry in declared if entry.optional]:

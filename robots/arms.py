@@ -1,4 +1,4 @@
-"""Kinematic chains of a robot's arms, the joints that carry them, and the mounts of their URDF copies."""
+"""Kinematic chains of a robot's arms, the joints that carry the arms, and the mounts of their URDF copies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from robots.urdf import Urdf
 
 
 def check_arm(key: str, table: GroupTable) -> None:
-    """Raise RobotError unless end effector, frame and keys for arms only are declared together."""
+    """Raise RobotError unless end effector and frame are declared together, and other keys for arms only with both."""
     if (table.eef_link is None) != (table.frame is None):
         raise RobotError(f"{key}: eef_link and frame make an arm together; allowed: both or neither")
     if table.eef_link is not None:
@@ -34,7 +34,10 @@ def check_arm(key: str, table: GroupTable) -> None:
 def build_arm_chain(
     file: Path, tree: Urdf, table: GroupTable, group: Group, groups: Sequence[Group]
 ) -> Group:
-    """Return the group with the chain of its own joints, and with the carrier chain if other groups move its base."""
+    """Return the group with the chain of its own joints; if other groups move its base, also with the carrier chain.
+
+    A group without end effector is returned unchanged.
+    """
     if table.eef_link is None or table.frame is None:
         return group
     key = f"{file}: groups.{table.name}"
@@ -70,7 +73,7 @@ def build_arm_chain(
 
 
 def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
-    """Raise RobotError unless pinned joints are movable and not moved by the group itself."""
+    """Raise RobotError unless the joints in `pinned` can move and are not moved by the group itself."""
     for name in table.pinned:
         with error_context(key):
             joint = tree.joint(name)
@@ -79,7 +82,7 @@ def _check_pinned(key: str, tree: Urdf, table: GroupTable) -> None:
 
 
 def check_mounts(file: Path, tables: Sequence[GroupTable], groups: Sequence[Group]) -> None:
-    """Raise RobotError if groups that share one copy of the URDF declare different mounts."""
+    """Raise RobotError if groups that share a copy of the URDF declare different mounts."""
     mounts = {table.name: table.mount for table in tables}
     for members in urdf_copies(groups):
         first = members[0].name

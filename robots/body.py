@@ -17,11 +17,10 @@ from robots.urdf import Joint, Urdf
 
 
 class BodyTables(NamedTuple):
-    """Tables of the joints between parts [P]: a part's joint has the value coupling . q + offset, clipped to its
-    bounds.
+    """Tables of the joints between parts [P]: a part's joint has the value coupling . q + offset, within its bounds.
 
     A part's transform relative to the part `above` it (-1: the scene; parents come first) is the sum of its four
-    `motions` [P, 4, 16], weighted by 1, cosine and sine of that value, and the value.
+    `motions` [P, 4, 16], weighted by 1, by the cosine and sine of that value, and by the value itself.
     """
 
     motions: Float64
@@ -33,11 +32,11 @@ class BodyTables(NamedTuple):
 
 
 class Body:
-    """Body of a robot: its `parts` ("left_arm/link2", ...: group that moves the link, link) and their `poses`.
+    """Body of a robot: its `parts` and their `poses`.
 
-    If the URDF describes one of several equal arms, there is one copy of the tree per arm; a URDF of the whole body
-    exists once. `jaws` maps each group with a gripper to the indices of its finger parts; `above` [P] is the index of
-    each part's parent, -1 for a root.
+    A part is named by the group that moves it and its link, e.g. "left_arm/link2". If the URDF describes one of several
+    equal arms, there is one copy of the tree per arm; a URDF of the whole body exists once. `jaws` maps each group with
+    a gripper to the indices of its finger parts; `above` [P] is the index of each part's parent, -1 for a root.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -68,7 +67,7 @@ class Body:
         self._layers = _layers(self.above)
 
     def part(self, name: str) -> int:
-        """Return the index of a part.
+        """Return the index of the part with that name.
 
         Raises:
             RobotError: If it does not exist; the message lists the names.
@@ -78,11 +77,11 @@ class Body:
         return self.parts.index(name)
 
     def parts_showing(self, link: str) -> tuple[int, ...]:
-        """Return the indices of the parts of a URDF link, one per copy; () if there is no such link."""
+        """Return the indices of the parts that are copies of a URDF link; () if there is no such link."""
         return tuple(links[link] for links in self._links if link in links)
 
     def link_of(self, group: str, link: str) -> int:
-        """Return the index of a link in the copy that a group moves.
+        """Return the index of a link in the copy of the tree that a group moves.
 
         Raises:
             RobotError: If it does not exist; the message lists the links.
@@ -93,7 +92,7 @@ class Body:
         return int(links[link])
 
     def moving_mask(self) -> NDArray[np.bool_]:
-        """Return which numbers of the robot's vector move which part, directly or through a parent: bool [P, D]."""
+        """Return bool [P, D]: which numbers of the robot's vector move which part, directly or by moving its parent."""
         moved: NDArray[np.bool_] = self._coupling != 0
         for parts, above in self._layers:
             moved[parts] |= moved[above]
@@ -122,7 +121,9 @@ class Body:
 
 
 class _Copy:
-    """One copy of the tree: its links outwards from the root, and the tables that place each in its parent."""
+    """One copy of the tree: its links from the root outwards, and the tables that place each link relative to its
+    parent.
+    """
 
     def __init__(self, robot: Robot, tree: Urdf, groups: Sequence[Group]) -> None:
         self._tree = tree
@@ -144,7 +145,7 @@ class _Copy:
 
     @property
     def fingers(self) -> dict[str, list[str]]:
-        """Links that a gripper moves, by the name of its group."""
+        """Links that a gripper moves, by the name of the gripper's group."""
         return {
             group.name: [
                 link
@@ -156,12 +157,14 @@ class _Copy:
         }
 
     def above_from(self, start: int) -> NDArray[np.intp]:
-        """Return the index of each link's parent if this copy's first link has index `start`; -1 for the root."""
+        """Return the index of each link's parent, -1 for the root, if the first link of this copy has index `start`."""
         parents = [self.links.index(joint.parent) for joint in self._movers.values()]
         return np.array([-1, *(start + parent for parent in parents)], dtype=np.intp)
 
     def part(self, link: str) -> str:
-        """Return the link's name prefixed by the group that moves it, or by the first group if none does."""
+        """Return the name of a link's part, which begins with the group that moves the link, or with the copy's first
+        group.
+        """
         at = link
         while at in self._movers:
             master, _, _ = self._tree.master(self._movers[at])
@@ -174,11 +177,11 @@ class _Copy:
         return f"{self._groups[0].name}/{link}"
 
     def _placement(self, robot: Robot) -> Float64:
-        """Return scene <- root: the robot's stand, then the mount of the copy's first group."""
+        """Return the transform scene <- root: the robot's stand, followed by the mount of the copy's first group."""
         return transform_of(robot.stand) @ transform_of(self._groups[0].mount)
 
     def _drive(self, index: int, joint: Joint) -> None:
-        """Set coupling, offset and bounds of a joint; a joint that no group moves stays at its pinned value or 0."""
+        """Set coupling, offset and bounds of a joint; if no group moves it, its value is the pinned one or 0."""
         master, factor, offset = self._tree.master(joint)
         for group in self._groups:
             if master.name in group.urdf_joints:
@@ -200,7 +203,7 @@ class _Copy:
 
 
 def _layers(above: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return parts and their parents, layer by layer away from the roots (parent -1)."""
+    """Return the parts of each layer with the indices of their parents, from the children of the roots outwards."""
     depth = np.zeros(len(above), dtype=np.intp)
     for part, parent in enumerate(above):  # parents come first
         depth[part] = 0 if parent < 0 else depth[parent] + 1

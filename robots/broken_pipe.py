@@ -1,5 +1,4 @@
-"""Exit of a command without traceback if its output pipe is closed (`... | head -1`) or the disk is full (`... >
-FILE`).
+"""Exit of a command without traceback if its output pipe is closed (`... | head -1`) or the disk is full.
 
 It is in this package because all programs may import it.
 """
@@ -23,11 +22,11 @@ Given = ParamSpec("Given")
 
 
 def exit_on_broken_pipe(main: Callable[Given, int]) -> Callable[Given, int]:
-    """Decorate `main` such that a closed pipe at standard output or error gives exit code 141.
+    """Return `main`, changed so that a closed pipe at standard output or error gives exit code 141.
 
     If standard output cannot be written, because the disk is full, the exit code is 74, with a message on standard
-    error; any other OSError is raised. Output to a closed stream (`>&-`) is discarded, and the exit code is the
-    command's own.
+    error; any other OSError is raised. Output to a stream that was closed from the start (`>&-`) is discarded, and the
+    exit code is the command's own.
     """
 
     @wraps(main)
@@ -55,8 +54,9 @@ def exit_on_broken_pipe(main: Callable[Given, int]) -> Callable[Given, int]:
 
 
 def _open_closed() -> None:
-    """Connect closed standard streams to /dev/null, here and in children: otherwise the next opened file gets
-    their number.
+    """Connect closed standard streams to /dev/null, here and in children.
+
+    Otherwise the next opened file would get the number of a standard stream.
     """
     number = os.open(os.devnull, os.O_RDWR)
     while number <= _STREAMS[-1]:
@@ -73,7 +73,7 @@ def _flush() -> None:
 
 
 def _refused(error: OSError) -> bool:
-    """Return True if standard output raised the error; its pending data is then discarded."""
+    """Return True if standard output raised the error, after discarding the data that it has not written."""
     try:
         _flush()
     except OSError as again:
@@ -84,7 +84,7 @@ def _refused(error: OSError) -> bool:
 
 
 def _silenced() -> bool:
-    """Return True if the reader of one of our streams is gone; its pending data is then discarded."""
+    """Return True if the reader of standard output or error is gone, after discarding the data not yet written."""
     unread = [
         number for number in map(_descriptor, (sys.stdout, sys.stderr)) if number >= 0 and _unread(number)
     ]

@@ -43,7 +43,7 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
 
 
 def _remembered(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
-    """Return the cached `covering_capsules`, because a station asks for the same robot several times."""
+    """Return the result of `covering_capsules` from a cache, because a station loads the same robot several times."""
     key = b"".join(_content(shape) for shape in shown)
     if key not in _about:
         made = covering_capsules(shown)
@@ -63,8 +63,8 @@ def _content(shape: Shape) -> bytes:
 def covering_capsules(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
     """Return at most `PIECES` capsules that cover the shapes of one link; a bent link gets two instead of a thick one.
 
-    Greedy merging: each shape starts with its own capsule, and the pair whose common capsule adds the least volume is
-    merged repeatedly.
+    Greedy merging: each shape starts with its own capsule; repeatedly, the pair of capsules whose common capsule adds
+    the least volume is merged.
     """
     pieces = [[shape] for shape in shown]
     rooms = [_capsule_volume(piece) for piece in pieces]
@@ -98,9 +98,9 @@ def _capsule_volume(shown: Sequence[Shape]) -> float:
 def smallest_capsule(shown: Sequence[Shape], steps: int = _STEPS) -> Capsule:
     """Return a capsule that covers the shapes, along the longest axis of their bounding box.
 
-    Its line passes through the centre of the smallest circle around the shapes seen along that axis (more accurate
-    with more `steps`); its ends are as close as still covers them. The fit is tight for round shapes; for boxes the
-    capsule extends beyond the faces.
+    Its line passes through the centre of the smallest circle around the shapes as they appear along that axis (more
+    accurate with more `steps`); its ends are as close together as possible. The fit is tight for round shapes; for
+    boxes the capsule extends beyond the faces.
     """
     centres, sizes = _balls(shown)  # [n, 3], [n]
     lower, upper = (centres - sizes[:, None]).min(axis=0), (centres + sizes[:, None]).max(axis=0)
@@ -124,8 +124,9 @@ def _declared(table: CapsuleTable) -> Capsule:
 
 
 def _balls(shown: Sequence[Shape]) -> tuple[Float64, Float64]:
-    """Return balls whose convex hull covers the shapes, in the link's frame: centres [n, 3], radii [n]; 0 for
-    corners.
+    """Return balls whose convex hull covers the shapes: centres [n, 3] in the link's frame, and radii [n].
+
+    The corners of shapes have radius 0.
     """
     centres, sizes = [], []
     for shape in shown:
@@ -148,7 +149,7 @@ def _corners(shape: Shape) -> tuple[Float64, float]:
 
 
 def _smallest_circle(points: Float64, sizes: Float64, start: Float64, steps: int) -> Float64:
-    """Return the centre of the smallest circle around discs [n, 2], iteratively (Badoiu and Clarkson 2003)."""
+    """Return the centre of the smallest circle around discs [n, 2], computed iteratively (Badoiu and Clarkson 2003)."""
     middle, best, least = start, start, np.inf
     for step in range(1, steps + 1):
         off = points - middle

@@ -17,9 +17,10 @@ _AFTER = np.array([2, 0, 1])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingJoint:
-    """Joint that rotates about the unit vector `axis` [3], or `slides` along it, by factor * q[drive] + offset.
+    """Joint that rotates about the unit vector `axis` [3], or moves along it if it `slides`.
 
-    `origin` [4, 4] is its pose relative to the previous moving joint at the value 0.
+    Its value is factor * q[drive] + offset. `origin` [4, 4] is its pose relative to the previous moving joint at the
+    value 0.
     """
 
     origin: Float64
@@ -31,14 +32,14 @@ class MovingJoint:
 
 
 class Chain:
-    """Chain between two links of a URDF, driven by `joints` [n] (rad; prismatic: m), with all others pinned.
+    """Chain between two links of a URDF, driven by `joints` [n] (rad; prismatic: m); all other joints are pinned.
 
-    The transform of each moving joint is linear in (1, cos v, sin v, v), so that all transforms follow from one
-    product with a precomputed table. A mimic joint is driven by the joint that it follows.
+    The transform of each moving joint is linear in (1, cos v, sin v, v), so that all transforms follow from one product
+    with a precomputed table. A mimic joint is driven by the joint that it follows.
 
     Raises:
         RobotError: If a joint on the path is neither driven, pinned nor a mimic of such a joint, or a driven joint
-            moves nothing.
+        moves nothing.
     """
 
     def __init__(
@@ -101,7 +102,10 @@ class Chain:
         return pose
 
     def jacobian(self, q: Float64) -> tuple[Float64, Float64]:
-        """Return the tip [4, 4] and d(position, rotation vector)/dq [6, n] in the frame's axes, at q [n]."""
+        """Return the pose of the tip [4, 4] and its Jacobian [6, n] at joints `q` [n].
+
+        The Jacobian is d(position, rotation vector)/dq in the axes of the frame.
+        """
         steps = self._steps(q)
         frames = np.empty_like(steps)
         frames[0] = steps[0]
@@ -118,7 +122,10 @@ class Chain:
         return tip, columns if self._plain else columns @ self._coupling
 
     def _steps(self, q: Float64) -> Float64:
-        """Return the transforms [..., moving joints, 4, 4], each including the fixed joints before it."""
+        """Return the transform of each moving joint relative to the previous one, [..., moving joints, 4, 4].
+
+        Each includes the fixed joints in between.
+        """
         if q.shape[-1:] != (self.size,):
             raise RobotError(
                 f"{self._path}: the chain {self.frame} to {self.tip} was given joints of shape {q.shape}; "
@@ -162,7 +169,7 @@ class Chain:
         self._plain = square and bool((self._coupling == np.eye(self.size)).all()) and not self._offsets.any()
 
     def _drive(self, urdf: Urdf, joint: Joint, pinned: Mapping[str, float]) -> tuple[Float64, float]:
-        """Return the dependence of a joint on q as (row [n], offset): its value is row . q + offset."""
+        """Return row [n] and offset of a joint, whose value is row . q + offset."""
         row = np.zeros(self.size)
         factor, offset = 1.0, 0.0
         seen = [joint.name]
@@ -185,7 +192,7 @@ class Chain:
 
 
 def motion_table(fixed: Float64, joint: Joint) -> Float64:
-    """Return four matrices [4, 16] whose sum weighted by (1, cos v, sin v, v) is `fixed` times the joint's motion.
+    """Return four matrices [4, 16] whose sum, weighted by (1, cos v, sin v, v), is `fixed` times the joint's motion.
 
     A rotation about the unit vector a is a a^T + (I - a a^T) cos v + [a]x sin v (Rodrigues).
     """
@@ -203,7 +210,7 @@ def motion_table(fixed: Float64, joint: Joint) -> Float64:
 
 
 def motions(values: Float64, tables: Float64) -> Float64:
-    """Return the transforms [..., N, 4, 4] of joints with these values [..., N] and motion tables [N, 4, 16]."""
+    """Return the transforms [..., N, 4, 4] of joints with the given values [..., N] and motion tables [N, 4, 16]."""
     terms = np.empty((*values.shape, 1, 4))
     terms[..., 0, 0] = 1.0
     terms[..., 0, 1] = np.cos(values)

@@ -20,11 +20,11 @@ _PARALLEL = (
 
 
 def segment_distances(start: Float64, way: Float64, other: Float64, other_way: Float64) -> Float64:
-    """Return the distances [...] of segments [..., 3] from `start` along `way` to those from `other` along
+    """Return the distances [...] between the segments from `start` along `way` and those from `other` along
     `other_way`.
 
-    Closest points of the two lines, clamped to the segments one after the other (Ericson, Real-Time Collision
-    Detection, 5.1.9); segments may be points, and parallel.
+    All arguments are [..., 3]. The closest points of the two lines are clamped to the segments one after the other
+    (Ericson, Real-Time Collision Detection, 5.1.9); segments may be points, and parallel.
     """
     between = start - other
     a, e = _dot(way, way), _dot(other_way, other_way)
@@ -59,7 +59,7 @@ class Clearance:
     A pair of links occurs once per pair of their capsules. Fingers reach the table on purpose: their distance to it is
     measured from the capsules' axes, which may be slightly below it (`touch_thresholds`).
 
-    Checked are links of different arms, links of one body, and links over the table (plane z = 0 of the scene).
+    The pairs are: links of different arms, links of one body, and links with the table (plane z = 0 of the scene).
     Excluded, because they are not informative:
 
     * links with at most one of the robot's joints between them (not counting grippers and joints that no group moves);
@@ -90,7 +90,7 @@ class Clearance:
         self._select_pairs(*self._telling(robot))
 
     def distances(self, q: Float64) -> Float64:
-        """Return the distances of the pairs [m], [..., K], negative for overlap, for the robot's vector [..., D]."""
+        """Return the distances of the pairs [m], [..., K], for the robot's vector [..., D]; negative for overlap."""
         if q.ndim == 1:
             return self._distances(q)
         flat = q.reshape(-1, q.shape[-1])
@@ -112,15 +112,15 @@ class Clearance:
         return np.asarray(np.concatenate([apart, lowest], axis=-1) - self._thick)
 
     def touch_thresholds(self, margin: float) -> Float64:
-        """Return the distances [K] below which pairs count as touching: `margin`, negative for fingers over
-        the table.
+        """Return the distances [K] below which pairs count as touching: `margin`, or a negative one for fingers and
+        table.
         """
         least = np.full(len(self.pairs), margin)
         least[len(self._first) :][self._fingers[self._over]] = -_DIP
         return least
 
     def _select_pairs(self, first: _Indices, second: _Indices, over: _Indices) -> None:
-        """Set the checked pairs: capsules `first` and `second`, and capsules `over` the table."""
+        """Set the checked pairs: capsules `first` with capsules `second`, and capsules `over` with the table."""
         self._first, self._second, self._over = first, second, over
         standing = np.where(self._fingers[over], 0.0, self._radii[over])
         self._thick = np.concatenate([self._radii[first] + self._radii[second], standing])
@@ -131,7 +131,10 @@ class Clearance:
         )
 
     def _telling(self, robot: Robot) -> tuple[_Indices, _Indices, _Indices]:
-        """Return the informative pairs: their distance varies, and they are not always touching."""
+        """Return the informative pairs, as `_select_pairs` takes them.
+
+        Their links do not touch at nearly every posture, and their distance to the table varies.
+        """
         lower = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
         upper = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
         apart = self.distances(np.random.default_rng(0).uniform(lower, upper, (_POSTURES, robot.dim)))
@@ -157,13 +160,13 @@ def get_clearance(robot: Robot) -> Clearance:
 
 
 def _mirror_key(pair: tuple[str, str]) -> tuple[str, ...]:
-    """Return a key shared by the same pair in equal arms; the pair itself if it is of two arms."""
+    """Return a key that the corresponding pairs of equal arms share; for a pair of two arms, the pair itself."""
     (group, _, link), (other_group, _, other) = (name.partition("/") for name in pair)
     return (link, other or other_group) if group == other_group or not other else pair
 
 
 def _candidates(robot: Robot, body: Body, parts: _Indices) -> tuple[_Indices, _Indices, _Indices]:
-    """Return pairs of capsules that are not neighbours, and capsules that may reach the table."""
+    """Return pairs of capsules that are not neighbours (first, second), and capsules that may reach the table."""
     moved = body.moving_mask()[parts]
     grippers = np.isin(np.arange(robot.dim), robot.gripper_dims)
     reaching = np.zeros(robot.dim, dtype=bool)
@@ -204,8 +207,9 @@ def _root(body: Body, part: np.intp) -> int:
 
 
 def collision_problems(robot: Robot, margin: float = MARGIN) -> list[str]:
-    """Return the faults of the robot's [collision] as sentences: pairs that touch at a named pose, or no
-    pairs at all.
+    """Return the faults of the robot's [collision] as sentences.
+
+    A fault is a pair that touches at a named pose, or that there are no pairs at all.
     """
     clearance = Clearance(robot)
     least = dict(zip(clearance.pairs, clearance.touch_thresholds(margin).tolist(), strict=True))

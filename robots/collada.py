@@ -1,4 +1,4 @@
-"""Reader of the points of a COLLADA file, placed by its scene [m]; appearance is ignored."""
+"""Reader of the points of a COLLADA file, placed as in its scene [m]; appearance is ignored."""
 
 from __future__ import annotations
 
@@ -80,7 +80,9 @@ def _instances(
 
 
 def _motion(kind: str, numbers: Float64) -> Float64:
-    """Return the transform [4, 4] of one element of a node."""
+    """Return the transform [4, 4] of an element of that kind ("matrix", "translate", "rotate", "scale") with these
+    numbers.
+    """
     motion = np.eye(4)
     if kind == "matrix":
         return numbers.reshape(4, 4)

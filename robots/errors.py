@@ -1,4 +1,4 @@
-"""Base of all errors of robot descriptions."""
+"""Base class of all errors about robot descriptions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 
 class RobotError(Exception):
-    """A robot's folder is missing or wrong; the message names file and key, the given value, and what is allowed."""
+    """Error about a robot's folder; the message names file and key, the given value, and the allowed ones."""
 
 
 @contextmanager
 def error_context(key: str) -> Iterator[None]:
-    """Prefix errors that are raised inside with the key that refers to the URDF."""
+    """Prefix the message of each RobotError that is raised in this context with `key`."""
     try:
         yield
     except RobotError as error:

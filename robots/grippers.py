@@ -1,4 +1,4 @@
-"""Gripper of a group: its table, a deployment's choices, and the frame of its fingertips."""
+"""Gripper of a group: from its table and a deployment's choices, with the frame of its fingertips."""
 
 from __future__ import annotations
 
@@ -104,8 +104,9 @@ def _fingers(key: str, tree: Urdf, table: Mapping[str, list[float]]) -> dict[str
 
 
 def tip_frame(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
-    """Return the frame of the fingertips in `eef_link` [4, 4]: declared, else derived from the URDF; None for
-    other groups.
+    """Return the frame of the fingertips in `eef_link` [4, 4]: as declared, else derived from the URDF.
+
+    None for a group without gripper or end effector.
     """
     if table.eef_link is None or table.gripper is None:
         return None
@@ -123,9 +124,9 @@ def tip_frame(key: str, tree: Urdf, table: GroupTable) -> Float64 | None:
 
 
 def _between_fingers(tree: Urdf, link: str) -> Float64:
-    """Return the frame midway between the origins of the link's sliding children, rotated about the link's z only.
+    """Return the frame midway between the origins of the link's sliding children, rotated only about the link's z.
 
-    y is the direction in which the first of them slides; the identity if none slides across z.
+    Its y is the direction in which the first of them slides. It is the identity if none slides across z.
     """
     tip = np.eye(4)
     fingers = [joint for joint in tree.children(link) if joint.kind == "prismatic"]

@@ -25,7 +25,7 @@ GUESS = "GUESS"  # mark of unverified values in a drafted robot.toml
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """`lines` describe the declarations, `warnings` are points to verify, `errors` are faults."""
+    """Findings on a robot: `lines` describe the declarations, `warnings` are points to verify, `errors` are faults."""
 
     lines: tuple[str, ...]
     warnings: tuple[str, ...]
@@ -75,7 +75,7 @@ def _heading(robot: Robot, table: RobotTable, whole: Robot) -> Iterator[str]:
 
 
 def _standing(robot: Robot, tree: Urdf) -> Iterator[str]:
-    """Yield lines on the URDF, its copies and their poses."""
+    """Yield lines about the URDF, the copies of its tree and the copies' poses."""
     members = urdf_copies(robot.groups)
     moving = [joint.name for joint in tree.joints.values() if joint.is_independent]
     yield f"{tree.path.name}: {len(tree.links)} links from {tree.root}, {len(moving)} joints that move by themselves"
@@ -117,7 +117,7 @@ def _group(robot: Robot, group: Group, table: RobotTable) -> Iterator[str]:
 
 
 def _numbers(robot: Robot, group: Group, declared: GroupTable) -> Iterator[str]:
-    """Yield a line for each number: limits, their source, and home."""
+    """Yield a line for each number of a group: its limits, where they come from, and its value at home."""
     home = robot.poses["home"]
     overrides = {override.joint: override for override in declared.overrides}
     joints = iter(group.urdf_joints)
@@ -201,7 +201,7 @@ def _warnings(usual: Robot, whole: Robot, table: RobotTable, file: Path) -> Iter
 
 
 def _low_fingertips(robot: Robot) -> Iterator[str]:
-    """Yield warnings on fingertips below the table, which the collision check allows on purpose."""
+    """Yield warnings about fingertips below the table, which the collision check allows on purpose."""
     body = Body(robot)
     for name, q in robot.poses.items():
         for arm in robot.arms:

@@ -1,4 +1,4 @@
-"""Loading of a Robot from a folder with robot.toml and URDF, and checks of their consistency."""
+"""Loading of a Robot from a folder with robot.toml and URDF, with checks that both agree."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def robot_folders() -> tuple[Path, ...]:
 
 
 def _find_folders() -> dict[str, Path]:
-    """Return the folders by name; an included robot cannot be replaced by another of the same name."""
+    """Return the folders of all robots by name; an included robot cannot be replaced by another of the same name."""
     found: dict[str, Path] = {}
     for root in (_HERE, *robot_folders()):
         for file in sorted(root.glob(f"*/{_FILE}")):
@@ -53,11 +53,11 @@ def load_robot(
     groups: Sequence[str] | None = None,
     grippers: Mapping[str, GripperChoice] | None = None,
 ) -> Robot:
-    """Return the robot of that name or in that folder.
+    """Return the robot with that name, or in that folder.
 
     Args:
         robot: Name or folder.
-        groups: Groups that are part of it, in the description's order; None for all that are not optional.
+        groups: Groups that the robot is to have, in the description's order; None for all that are not optional.
         grippers: Choices by group.
 
     Raises:
@@ -110,7 +110,10 @@ def load_robot_with_optional_groups(robot: str | Path) -> Robot:
 
 
 def _chosen(file: Path, table: RobotTable, groups: Sequence[str] | None) -> list[GroupTable]:
-    """Return the groups that are part of the robot, in the file's order."""
+    """Return the tables of the groups that the robot is to have, in the file's order.
+
+    Raises: RobotError for unknown groups, or if there would be none.
+    """
     known = [group.name for group in table.groups]
     unknown = [name for name in groups or () if name not in known]
     if unknown or (groups is not None and not groups):
@@ -146,7 +149,10 @@ def _check_ros(file: Path, table: RobotTable) -> None:
 
 
 def _check_collision(file: Path, table: RobotTable, tree: Urdf) -> None:
-    """Raise RobotError if [collision] names unknown links; pairs may also contain GROUP/LINK and the table."""
+    """Raise RobotError if [collision] names unknown links.
+
+    Its pairs may also contain GROUP/LINK and the table.
+    """
     collision = table.collision
     groups = [group.name for group in table.groups]
     for key, named in (("capsules", list(collision.capsules)), ("without", collision.without)):

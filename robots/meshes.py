@@ -1,4 +1,4 @@
-"""Mesh files: their location for a robot, and their bounding boxes."""
+"""Mesh files: search for a robot's files, and their bounding boxes."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def mesh_roots(folder: Path) -> tuple[Path, ...]:
 
 
 def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
-    """Return the file that a URDF in `folder` names for `owner`: relative path, package://NAME/... or file://...
+    """Return the file that `filename` in a URDF in `folder` refers to: relative path, package://NAME/... or file://...
 
-    It must be within one of the `mesh_roots` after resolving links.
+    It must be within one of the `mesh_roots` after resolving links. Errors begin with `owner`.
 
     Raises:
         RobotError: If it is missing or not allowed; the message lists the searched paths.
@@ -65,7 +65,10 @@ def resolve_mesh(folder: Path, owner: str, filename: str) -> Path:
 
 
 def replacement_mesh(folder: Path, link: str) -> Path | None:
-    """Return $EVA_ROBOT_MESHES/<robot>/<link>.stl, .obj or .dae, which replaces the URDF's visuals; None if absent."""
+    """Return the mesh that replaces the URDF's visuals of a link, None if there is none.
+
+    It is $EVA_ROBOT_MESHES/<robot>/<link> with the suffix .stl, .obj or .dae.
+    """
     for root in mesh_roots(folder)[1:]:
         for suffix in SUFFIXES:
             place = (root / f"{link}{suffix}").resolve()
@@ -87,7 +90,9 @@ def mesh_bounds(path: Path) -> Bounds:
 
 
 def _places(root: Path, owner: str, filename: str) -> Iterator[Path]:
-    """Yield the paths in `root` at which the file may be; a package is the folder of its name there, or the root."""
+    """Yield the paths in `root` at which the file may be; a package is the folder with its name there, or `root`
+    itself.
+    """
     scheme, separator, rest = filename.partition("://")
     if not separator:
         yield (root / filename).resolve()
@@ -117,7 +122,7 @@ def _bounds(path: Path, _changed: int) -> Bounds:
 
 
 def _stl(content: bytes) -> Float64:
-    """Return the corners [n, 3] of an STL's triangles: binary if its length is consistent, else text."""
+    """Return the corners [n, 3] of an STL's triangles; it is read as binary if its length fits that, else as text."""
     count = int.from_bytes(content[80:84], "little")
     if len(content) >= 84 and len(content) == 84 + 50 * count:
         triangle = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -1,4 +1,4 @@
-"""Robot as used by all other code: groups of joints, cameras, poses, limits, one flat vector."""
+"""Robot as all other code uses it: groups of joints, cameras, poses, limits, one flat vector."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ EEF_FIELDS = ("x", "y", "z", "qw", "qx", "qy", "qz", "gripper")
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """Gripper: one number of a group in the robot's own `unit`; `index` is its position in the group.
+    """Gripper, i.e. one number of a group in the robot's own `unit`; `index` is its position in the group.
 
     `fingers` are URDF joints with their values [rad or m] at `lower` and at `upper`; `apart` is the distance of the
-    fingers [m] at `close` and at `open`, None if unknown. A binary gripper switches at `threshold`, with a
-    `hysteresis` as a share of its travel; else both are None.
+    fingers [m] at `close` and at `open`, None if unknown. A binary gripper switches at `threshold`, with a `hysteresis`
+    as a share of its travel; for other grippers both are None.
     """
 
     index: int
@@ -44,11 +44,11 @@ class Gripper:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Joints that are sent together; `joints` are names on the wire, `slice` their place in the robot's vector.
+    """Joints that are sent together; `joints` are their names in messages, `slice` their indices in the robot's vector.
 
-    `urdf_joints` name the same joints in the URDF, without the gripper, "" for numbers that move no link. An arm has
-    an end effector `eef_link`, whose pose is given in `frame`. Its `chain` of own joints begins at `frame` or, if
-    other groups move joints in between (a torso), at the end of `carrier`, which begins at `frame` and is driven by
+    `urdf_joints` name the same joints in the URDF, without the gripper, "" for numbers that move no link. An arm has an
+    end effector `eef_link`, whose pose is stated in `frame`. Its `chain` of own joints begins at `frame` or, if other
+    groups move joints in between (a torso), at the end of `carrier`, which begins at `frame` and is driven by
     `carrier_dims` of the robot's vector. `mount` [7] (x, y, z, qw, qx, qy, qz) is the pose of the root of the group's
     URDF copy in the robot's mount frame. `tip` [4, 4] is the frame between the fingertips in `eef_link`, z in the
     direction in which they point, y in the opening direction; None without a gripper.
@@ -84,13 +84,15 @@ class Group:
         return _dims(self.slice.start, self.slice.stop, -1 if self.gripper is None else self.gripper.index)
 
     def carried(self, q: Float64) -> Float64:
-        """Return the start of the chain in `frame` as transforms [..., 4, 4], for the robot's vector [..., D]."""
+        """Return the pose of the start of the chain in `frame`, as transforms [..., 4, 4], for the robot's vector [...,
+        D].
+        """
         if self.carrier is None:
             return np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
         return self.carrier.forward(q[..., self.carrier_dims])
 
     def transform(self, q: Float64) -> Float64:
-        """Return the end effector in `frame` [..., 4, 4], for the robot's vector [..., D].
+        """Return the pose of the end effector in `frame`, as transforms [..., 4, 4], for the robot's vector [..., D].
 
         Raises:
             RobotError: If the group has no end effector.
@@ -101,14 +103,19 @@ class Group:
         return own if self.carrier is None else self.carried(q) @ own
 
     def pose(self, q: Float64) -> Float64:
-        """Return the end effector in `frame` [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >= 0."""
+        """Return the pose of the end effector in `frame` [..., 7] = x, y, z [m], unit quaternion w, x, y, z with w >=
+        0.
+        """
         transform = self.transform(q)
         return np.concatenate([transform[..., :3, 3], quaternion_of_matrix(transform[..., :3, :3])], axis=-1)
 
 
 @functools.cache
 def _dims(start: int, stop: int, without: int) -> NDArray[np.intp]:
-    """Return the indices from `start` to `stop` without one; cached, because it is used at every step of every arm."""
+    """Return the indices from `start` to before `stop`, except the one at position `without` in that range.
+
+    They are cached, because they are used at every step of every arm.
+    """
     dims = np.array([start + place for place in range(stop - start) if place != without], dtype=np.intp)
     dims.flags.writeable = False
     return dims
@@ -124,7 +131,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """Robot description; vectors are in group order, in rad and rad/s, grippers in their own unit.
+    """Robot; vectors are in the order of its groups, in rad and rad/s, grippers in their own unit.
 
     `lower`, `upper`, `velocity` and every pose are read-only float64 [dim]. `overrides` are sentences, one per limit
     that differs from the URDF. `mount_frame` is the frame of the mounts, and `stand` [7] its pose in the scene, whose
@@ -156,7 +163,7 @@ class Robot:
 
     @property
     def arms(self) -> tuple[Group, ...]:
-        """Groups with an end effector; each has an 8-vector, whose last number is 0 without a gripper."""
+        """Groups with an end effector; each has a vector of eight numbers, the last of which is 0 without a gripper."""
         return tuple(group for group in self.groups if group.chain is not None)
 
     @property
@@ -187,9 +194,7 @@ class Robot:
 
     @property
     def speed_dims(self) -> tuple[int, ...]:
-        """Indices of numbers that are speeds instead of positions: those of a base that move no link; 0 is
-        standstill.
-        """
+        """Indices of the numbers that are speeds instead of positions, where 0 is standstill: those of a base."""
         return tuple(
             int(dim)
             for group in self.groups
@@ -199,7 +204,7 @@ class Robot:
         )
 
     def group(self, name: str) -> Group:
-        """Return the group of that name.
+        """Return the group with that name.
 
         Raises:
             RobotError: If it does not exist; the message lists the names.
@@ -212,7 +217,7 @@ class Robot:
         )
 
     def split(self, vector: ArrayLike) -> dict[str, NDArray[Any]]:
-        """Return views of [..., dim] by group, each [..., dof]."""
+        """Return views [..., dof] of the vector [..., dim] by group."""
         array = np.asarray(vector)
         if array.shape[-1:] != (self.dim,):
             raise RobotError(
@@ -221,7 +226,7 @@ class Robot:
         return {group.name: array[..., group.slice] for group in self.groups}
 
     def join(self, parts: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
-        """Return the float32 vector [..., dim] of parts [..., dof] by group; every group exactly once."""
+        """Return the float32 vector [..., dim] of the values [..., dof] in `parts`, which must have every group."""
         if set(parts) != {group.name for group in self.groups}:
             allowed = ", ".join(group.name for group in self.groups)
             raise RobotError(
@@ -237,7 +242,9 @@ class Robot:
 
 
 def urdf_copies(groups: Sequence[Group]) -> list[list[Group]]:
-    """Return the groups by copy of the URDF, such that each joint is moved at most once per copy."""
+    """Return the groups for each copy of the URDF; copies are made so that each joint is moved at most once per
+    copy.
+    """
     found: list[tuple[set[str], list[Group]]] = []
     for group in groups:
         joints = {*filter(None, group.urdf_joints), *(group.gripper.fingers if group.gripper else ())}
@@ -252,5 +259,5 @@ def urdf_copies(groups: Sequence[Group]) -> list[list[Group]]:
 
 
 def copy_of(group: Group, groups: Sequence[Group]) -> list[Group]:
-    """Return the groups of the copy to which `group` belongs."""
+    """Return the groups that share a copy of the URDF with `group`, including itself."""
     return next(members for members in urdf_copies(groups) if group in members)

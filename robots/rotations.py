@@ -91,7 +91,7 @@ def quaternion_of_matrix(matrix: Float64) -> Float64:
 
 
 def rotation_vector(matrix: Float64) -> Float64:
-    """Return axis times angle [..., 3] of rotations [..., 3, 3], with the angle in [0, pi] rad."""
+    """Return the rotation vectors [..., 3] (axis times angle, in [0, pi] rad) of rotations [..., 3, 3]."""
     quaternion = quaternion_of_matrix(matrix)
     imaginary = quaternion[..., 1:]
     sine = np.sqrt(np.sum(imaginary * imaginary, axis=-1, keepdims=True))
@@ -101,7 +101,7 @@ def rotation_vector(matrix: Float64) -> Float64:
 
 
 def quaternion_product(left: Float64, right: Float64) -> Float64:
-    """Return the rotation `left` after the rotation `right`, as unit quaternions [..., 4]."""
+    """Return the rotation `right` followed by the rotation `left`, as unit quaternions [..., 4]."""
     aw, ax, ay, az = np.moveaxis(left, -1, 0)
     bw, bx, by, bz = np.moveaxis(right, -1, 0)
     terms = (
@@ -114,10 +114,10 @@ def quaternion_product(left: Float64, right: Float64) -> Float64:
 
 
 def slerp(start: Float64, end: Float64, part: Float64) -> Float64:
-    """Return the unit quaternions [..., 4] at `part` [...] of the shorter path from `start` to `end`, in the
-    hemisphere of `start`.
+    """Return the unit quaternions [..., 4] at the share `part` [...] of the shorter path from `start` to `end`.
 
-    Shoemake 1985; the angle by atan2, because the arc cosine of a number near 1 loses half its digits.
+    Their signs are those of the hemisphere of `start`. Shoemake 1985, with the angle by atan2, because the arc cosine
+    of a number near 1 loses half its digits.
     """
     end = np.where(np.sum(start * end, axis=-1, keepdims=True) < 0, -end, end)
     apart, along = np.linalg.norm(end - start, axis=-1), np.linalg.norm(end + start, axis=-1)

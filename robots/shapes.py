@@ -74,8 +74,9 @@ def read_shapes(path: Path) -> tuple[Shape, ...]:
 
 
 def displayed_shapes(path: Path) -> tuple[Shape, ...]:
-    """Return the shapes for drawing: every link with a mesh of its name under $EVA_ROBOT_MESHES is shown as
-    that mesh.
+    """Return the shapes for drawing.
+
+    A link with a mesh of its name under $EVA_ROBOT_MESHES is shown as that mesh.
     """
     return _read(path, everywhere=True)
 
@@ -126,7 +127,7 @@ def _shape(path: Path, link: str, visual: ET.Element, materials: Mapping[str, Co
 
 
 def size_of(path: Path, owner: str, element: ET.Element) -> tuple[float, ...]:
-    """Return the lengths [m], for a mesh the scale factors (default 1; negative values mirror)."""
+    """Return the lengths of a shape [m]; for a mesh the scale factors (default 1; negative values mirror)."""
     if element.tag == "mesh":
         text = element.get("scale", "1 1 1")
         scale = numbers(path, owner, "mesh scale", text, 3)
@@ -161,10 +162,10 @@ def _material(path: Path, owner: str, visual: ET.Element, materials: Mapping[str
 
 
 def colour_of(path: Path, owner: str, element: ET.Element) -> Colour:
-    """Return the colour of a <color>.
+    """Return the four numbers of a <color> element.
 
     Raises:
-        RobotError: If it is not four numbers from 0 to 1.
+        RobotError: If they are not four numbers from 0 to 1.
     """
     red, green, blue, opacity = numbers(path, owner, "color rgba", text_of(path, element, "rgba"), 4)
     colour = (red, green, blue, opacity)

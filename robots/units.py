@@ -8,7 +8,7 @@ from robots.urdf import Urdf
 
 
 def units_of(robot: Robot) -> tuple[str, ...]:
-    """Return a unit for every number: "rad", "m" for prismatic joints, a gripper's own, "" if it moves no link."""
+    """Return the unit of every number: "rad", "m" for prismatic joints, a gripper's own, "" if it moves no link."""
     tree = urdf.read(robot.urdf)
     return tuple(unit for group in robot.groups for unit in _units(group, tree))
 

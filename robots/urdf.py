@@ -1,5 +1,6 @@
-"""Reader of the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics; shapes are in another
-module.
+"""Reader of the kinematic tree of a URDF: links, joints, origins, axes, limits, mimics.
+
+Shapes are read by another module.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _ENCODING = re.compile(rb"""\s*<\?xml[^>]*?\sencoding\s*=\s*["']([^"']*)["'][^>]
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """Mimic: the joint's position is multiplier * (position of `joint`) + offset."""
+    """Dependence of a joint that follows another: its position is multiplier * (position of `joint`) + offset."""
 
     joint: str
     multiplier: float
@@ -36,7 +37,7 @@ class Mimic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """Joint; `origin` [4, 4] is its pose in the parent link, `axis` a unit vector [3] there.
+    """Joint of a URDF; `origin` [4, 4] is its pose in the parent link, `axis` a unit vector [3] in its own frame.
 
     Limits are in rad and rad/s (prismatic: m and m/s), None if not declared, infinite if continuous.
     """
@@ -54,7 +55,7 @@ class Joint:
 
     @property
     def is_independent(self) -> bool:
-        """Whether it moves by itself: neither fixed nor a mimic."""
+        """Whether the joint moves by itself: it is neither fixed nor a mimic."""
         return self.kind != "fixed" and self.mimic is None
 
 
@@ -72,7 +73,7 @@ class Urdf:
     held: tuple[str, ...]
 
     def joint(self, name: str) -> Joint:
-        """Return the joint of that name.
+        """Return the joint with that name.
 
         Raises:
             RobotError: If it does not exist; the message lists the names.
@@ -82,15 +83,15 @@ class Urdf:
         return self.joints[name]
 
     def above(self, link: str) -> Joint | None:
-        """Return the joint that carries a link; None for the root."""
+        """Return the joint whose child is `link`; None for the root."""
         return next((joint for joint in self.joints.values() if joint.child == link), None)
 
     def children(self, link: str) -> tuple[Joint, ...]:
-        """Return the joints that a link carries, in the file's order."""
+        """Return the joints whose parent is `link`, in the file's order."""
         return tuple(joint for joint in self.joints.values() if joint.parent == link)
 
     def between(self, frame: str, tip: str) -> tuple[Joint, ...]:
-        """Return the joints from link `frame` out to link `tip`.
+        """Return the joints on the path from link `frame` outwards to link `tip`.
 
         Raises:
             RobotError: If a link does not exist, or `tip` is not a descendant of `frame`.
@@ -119,8 +120,9 @@ class Urdf:
         return tuple(order)
 
     def master(self, joint: Joint) -> tuple[Joint, float, float]:
-        """Return the joint that this one follows (itself, unless it is a mimic): value = factor * its value +
-        offset.
+        """Return the joint that `joint` finally follows, factor and offset; `joint` itself unless it is a mimic.
+
+        The value of `joint` is factor * (value of the returned joint) + offset.
         """
         factor, offset, seen = 1.0, 0.0, [joint.name]
         while joint.mimic is not None:
@@ -133,7 +135,7 @@ class Urdf:
         return joint, factor, offset
 
     def masters(self) -> set[str]:
-        """Return the names of the joints that mimics follow."""
+        """Return the names of the joints that mimic joints follow."""
         return {self.master(joint)[0].name for joint in self.joints.values() if joint.mimic is not None}
 
 
@@ -158,7 +160,7 @@ def read(path: Path) -> Urdf:
 
 
 def document(path: Path) -> ET.Element:
-    """Return the outermost element of the file, <robot>.
+    """Return the root element of the file, <robot>.
 
     Raises:
         RobotError: If it is not a URDF.
@@ -173,7 +175,7 @@ def document(path: Path) -> ET.Element:
 
 
 def parsed(path: Path, comments: bool = False) -> ET.Element:
-    """Return the outermost element of an XML file in any encoding that Python knows, with `comments` if requested.
+    """Return the root element of an XML file in any encoding that Python knows, with `comments` if requested.
 
     Raises:
         RobotError: If it cannot be read.
@@ -202,7 +204,7 @@ def parsed(path: Path, comments: bool = False) -> ET.Element:
 
 
 def _is_xacro(robot: ET.Element) -> bool:
-    """Return True if it contains macros or placeholders."""
+    """Return True if the document contains macros or placeholders of xacro."""
     return any(
         "xacro" in element.tag or any("${" in value or "$(" in value for value in element.attrib.values())
         for element in robot.iter()
@@ -235,7 +237,7 @@ def _joint(path: Path, element: ET.Element) -> Joint:
 
 
 def text_of(path: Path, element: ET.Element, key: str) -> str:
-    """Return a required attribute.
+    """Return the required attribute `key` of an element.
 
     Raises:
         RobotError: If it is missing.
@@ -257,7 +259,7 @@ def numbers(path: Path, owner: str, what: str, text: str, count: int) -> list[fl
     """Return `count` finite numbers from `text`.
 
     Raises:
-        RobotError: If it has others; the message names file, owner and attribute.
+        RobotError: If `text` is anything else; the message names file, owner and attribute.
     """
     try:
         values = [float(part) for part in text.split()]
@@ -311,7 +313,10 @@ def _refuse_twice(path: Path, what: str, names: list[str]) -> None:
 
 
 def _root(path: Path, links: list[str], joints: list[Joint]) -> str:
-    """Return the only link without a parent, after checking that the joints form one tree."""
+    """Return the only link without a parent.
+
+    Raises: RobotError if the joints do not form one tree.
+    """
     children = [joint.child for joint in joints]
     _refuse_twice(path, "the joint above link", children)
     names = {joint.name for joint in joints}

@@ -18,7 +18,7 @@ _THINNEST = 1e-4  # [m] least thickness of the box around a flat mesh
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visual:
-    """Shape: `kind` box (x, y, z), cylinder (radius, length along z) or sphere (radius,), in m, or mesh.
+    """Shape for drawing: box (x, y, z), cylinder (radius, length along z) or sphere (radius,), in m, or mesh.
 
     `part` is the index of its part, `origin` float64 [4, 4] the pose of its centre in that part, `colour` red, green,
     blue, opacity, 0 to 1. A mesh is the content of `file`, scaled by `size` (x, y, z).
@@ -36,7 +36,7 @@ class Visual:
         return shapes.shape_bounds(self.kind, self.size, self.file)
 
     def simple(self) -> Visual:
-        """Return the shape, with a mesh replaced by its bounding box, for renderers without meshes."""
+        """Return the shape itself, or the bounding box of a mesh, for renderers that cannot draw meshes."""
         if self.kind != "mesh":
             return self
         lower, upper = self.bounds()

@@ -1,1 +1,1 @@
-"""The robot process: control loop, inference, recording, and the bus the web talks to."""
+"""Station of a robot: control loop, inference, recording, and the bus to which clients connect."""

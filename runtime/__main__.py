@@ -1,6 +1,6 @@
-"""`python -m runtime DEPLOYMENT`: check, run in lockstep, or start a station's family of processes.
+"""`python -m runtime DEPLOYMENT`: check a deployment, run it in lockstep, or start the processes of a station.
 
-`--from-run UUID` takes the deployment of an earlier run from its manifest in the place of a file.
+`--from-run UUID` uses the deployment in the manifest of an earlier run instead of a file.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where all went well, 1 where the run failed, 2 where the deployment is wrong."""
+    """Run as the command line demands; return 0 on success, 1 if the run failed, 2 if the deployment is invalid."""
     given = _parser().parse_args(arguments)
     log.configure_logging("supervisor")
     try:
@@ -90,7 +90,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _resolved(given: argparse.Namespace) -> Resolved:
-    """The deployment of the file or of the run; what differs from that run is printed."""
+    """Return the deployment of the file, or of the earlier run, whose differences from that run are printed.
+
+    Raises: ConfigurationError.
+    """
     if (given.deployment is None) == (given.from_run is None):
         raise ConfigurationError("give one of the two: a deployment file, or --from-run UUID")
     if given.from_run is None and given.data_dir is not None:
@@ -103,7 +106,7 @@ def _resolved(given: argparse.Namespace) -> Resolved:
 
 
 def _require_encoder(made: StationSpec) -> None:
-    """The encoder of the recording is missed here, not by the first run; ConfigurationError."""
+    """Raise ConfigurationError if the encoder of the recording is missing, before the first run would need it."""
     from runtime.recording import encoder_check
 
     if made.deployment.recording.enabled:
@@ -120,7 +123,10 @@ def _check(made: StationSpec) -> int:
 
 
 def run_in_lockstep(made: StationSpec, peers: Peers | None = None) -> int:
-    """Run, print how it went, export it, publish what ended well; returns the exit code. `peers` as by `Lockstep`."""
+    """Run in lockstep, print the result, export the episode and publish it if the run succeeded; return the exit code.
+
+    `peers` are those of `Lockstep`.
+    """
     from runtime.ipc.session_state import SessionState
     from runtime.processes.lockstep import lockstep
 

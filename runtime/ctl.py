@@ -1,4 +1,4 @@
-"""`python -m runtime.ctl STATION COMMAND`: command and watch a station from a terminal."""
+"""`python -m runtime.ctl STATION COMMAND`: command and observe a station from a terminal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,11 @@ _RELEASE_S = 2.0
 
 @exit_on_broken_pipe
 def main(words: Sequence[str] | None = None) -> int:
-    """Exit code 0 where it was done, 1 refused or failed, 3 where no answer came, 141 where nobody reads on."""
+    """Run one command.
+
+    Return 0 on success, 1 if the command was refused or failed, 3 if there was no answer, 141 if the output is no
+    longer read.
+    """
     given = parse(sys.argv[1:] if words is None else words)
     client = StationClient(Path(given.data_dir).expanduser().absolute() / "stations" / given.station)
     try:
@@ -64,7 +68,10 @@ def _follow(client: StationClient, given: argparse.Namespace) -> int:
 def _run_and_wait(
     client: StationClient, given: argparse.Namespace, kind: str, said: dict[str, Any], wants: str = ""
 ) -> int:
-    """Give one command; with --wait stay until it is over. `wants`: the event that then belongs to it."""
+    """Send one command and return the exit code; with --wait, wait until the command has ended.
+
+    `wants` is the event without which the command has failed, "" if none is needed.
+    """
     before = client.status()
     client.command(kind, **said)
     if not getattr(given, "wait", False):
@@ -91,7 +98,7 @@ def _print_event(event: dict[str, Any]) -> None:
 
 
 def _silent(what: object) -> None:
-    """A program reads: the outcome is all there is to say."""
+    """Ignore an event: a program that reads the output needs only the outcome."""
 
 
 def _show(status: dict[str, Any], as_json: bool) -> None:
@@ -130,7 +137,10 @@ def _move(client: StationClient, given: argparse.Namespace) -> int:
 
 
 def _jog(client: StationClient, given: argparse.Namespace) -> int:
-    """Aim, say what it comes to, and go there: to where the aim is as it was shown, and nowhere else."""
+    """Show the result of an aim, and move there: exactly to the joints that were shown.
+
+    Raises: Refused if they are not the requested pose, unless --nearest is given.
+    """
     aim = client.query("aim", **aim_text.aim_arguments(client, given)).data
     _show_aim(client, aim, given)
     short = aim_text.aim_problem(aim)

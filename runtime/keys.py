@@ -16,7 +16,7 @@ from runtime.link.enrolment import enrol
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 0 where it was done, 1 where it was not: the sentence says why."""
+    """Run one command; return 0 on success, 1 on failure, after printing the reason."""
     given = _parser().parse_args(arguments)
     data = Path(given.data_dir or os.environ.get("EVA_DATA_DIR") or "data").expanduser().absolute()
     try:

@@ -1,7 +1,6 @@
 """`python -m benchmarks.attacks NAME READY_FILE DATA`: one attack on the lab that is described in READY_FILE.
 
-Prints a line of JSON when the attack has begun and, after the end of standard input, a line with counts of what it
-did.
+Prints a line of JSON when the attack has begun and, after the end of standard input, a line with counts of its actions.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _NICE = 19
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Attack until standard input ends."""
+    """Run the attack until standard input ends."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.attacks", description=__doc__)
     parser.add_argument("name", choices=sorted(ATTACKS))
     parser.add_argument("ready_file", type=Path, help="of benchmarks.estop_lab")

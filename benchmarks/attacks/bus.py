@@ -1,4 +1,4 @@
-"""Client that floods a station with requests, and ignores the answers."""
+"""Attack by a client that floods a station with requests, and ignores the answers."""
 
 from __future__ import annotations
 

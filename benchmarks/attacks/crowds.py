@@ -1,4 +1,4 @@
-"""Loads on the web's event loop, each allowed or cheap in itself: pings, handshakes, pages, REST."""
+"""Loads on the web's event loop, each of which is allowed or cheap by itself: pings, handshakes, pages, REST."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _Then = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[object]
 
 
 def pings(target: Target) -> Counter[str]:
-    """Ping from logged-in sockets as fast as they are read; closed sockets are reopened."""
+    """Send pings from logged-in websockets as fast as they are read; closed websockets are reopened."""
     return asyncio.run(_crowd(target, _PINGS, _head(target, _socket(target)), _pings))
 
 
@@ -32,7 +32,7 @@ def handshakes(target: Target) -> Counter[str]:
 
 
 def pages(target: Target) -> Counter[str]:
-    """Open the station's page from many clients, repeatedly."""
+    """Request the station's page from many clients, repeatedly."""
     head = _head(
         target, f"GET /stations/{PRESSED}/debug/ HTTP/1.1\r\n{_session(target)}Connection: close\r\n"
     )
@@ -40,7 +40,7 @@ def pages(target: Target) -> Counter[str]:
 
 
 def rest_clients(target: Target) -> Counter[str]:
-    """Request the station over REST from many clients, repeatedly."""
+    """Request the station's state over REST from many clients, repeatedly."""
     head = _head(
         target, f"GET /api/v1/stations/{PRESSED} HTTP/1.1\r\n{_session(target)}Connection: close\r\n"
     )
@@ -65,7 +65,10 @@ def _head(target: Target, lines: str) -> bytes:
 
 
 async def _crowd(target: Target, size: int, head: bytes, then: _Then) -> Counter[str]:
-    """Keep `size` connections open, replacing each that ends; return the number of answers by kind."""
+    """Keep `size` connections open, and replace each that ends; return the number of answers by kind.
+
+    Each sends `head`, and `then` uses it after the answer.
+    """
     done: Counter[str] = Counter()
     answered = [asyncio.Event() for _ in range(target.part(size))]
     tasks = [asyncio.create_task(_over_and_over(target, head, then, done, one)) for one in answered]
@@ -100,7 +103,7 @@ async def _over_and_over(
 
 
 async def _no_more(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Do nothing after the answer."""
+    """Do nothing with a connection after the answer to its first request."""
 
 
 async def _whole(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -1,4 +1,4 @@
-"""Database that does not respond."""
+"""Attack in which the database does not respond."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages that flood with messages: to a dead station, and without permission."""
+"""Attacks by pages that send many messages: to a dead station, or without permission."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _QUIET_S = 5.0  # time without an answer after which no more are expected
 
 
 class _Page(LivePage):
-    """Page that only counts acknowledgements."""
+    """Page that counts acknowledgements and does nothing else."""
 
     def __init__(self, visitor: RestClient, station: str) -> None:
         self.answered = 0
@@ -37,12 +37,12 @@ class _Page(LivePage):
         return bool(self._failure)
 
     def send(self, message: Mapping[str, Any], times: int) -> None:
-        """Send a message `times` times, each with its own uuid."""
+        """Send a message `times` times, each time with a new uuid."""
         for _ in range(times):
             self._send({**message, "uuid": str(uuid4())})
 
     def shout(self, text: str) -> None:
-        """Send a text unchanged."""
+        """Send a text as a message without changing it."""
         try:
             self._socket.send(text)
         except ConnectionClosed as error:
@@ -60,7 +60,7 @@ def dead_station(target: Target) -> Counter[str]:
 
 
 def viewer_stops(target: Target) -> Counter[str]:
-    """Send stops as a user who may not command the station."""
+    """Send stop commands as a user who may not command the station."""
     return _waves(target, PRESSED, {"type": "stop", "epoch": 0}, target.part(_STOPS))
 
 
@@ -82,7 +82,7 @@ def slow_frames(target: Target) -> Counter[str]:
 
 @contextmanager
 def _stopped(target: Target, *processes: str) -> Iterator[None]:
-    """Stop processes of the other station (SIGSTOP) for the duration of the block."""
+    """Pause processes of the other station (SIGSTOP) within the context."""
     found = Endpoints(target.data / "stations" / OTHER).read("supervisor")
     pids = [int(found[process]) for process in processes]
     for pid in pids:
@@ -95,7 +95,10 @@ def _stopped(target: Target, *processes: str) -> Iterator[None]:
 
 
 def _waves(target: Target, station: str, message: Mapping[str, Any], times: int) -> Counter[str]:
-    """Send `times` messages, wait for the answers, and repeat; a closed page is reopened."""
+    """Send `times` messages, wait for the answers, and repeat; a closed page is reopened.
+
+    Return the number of pages, messages, answers and refused connections.
+    """
     done: Counter[str] = Counter()
     visitor = target.visitor("viewer")
     while not target.ended.is_set():
@@ -116,7 +119,7 @@ def _waves(target: Target, station: str, message: Mapping[str, Any], times: int)
 
 
 def _await(target: Target, page: _Page, sent: int) -> None:
-    """Wait until all messages are answered, or no more answers come."""
+    """Wait until all `sent` messages are answered, or until no more answers arrive."""
     answered, since = page.answered, time.monotonic()
     while page.answered < sent and not page.closed and not target.ended.wait(0.05):
         if page.answered != answered:

@@ -1,4 +1,4 @@
-"""Requests to the process for stops: presses with unknown tokens, and halts of an operator."""
+"""Attacks on the process for stops: presses with unknown tokens, and halts by an operator."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def unknown_tokens(target: Target) -> Counter[str]:
 
 
 def halts(target: Target) -> Counter[str]:
-    """Halt without a lease from 32 clients of one operator, repeatedly."""
+    """Send halts without a lease from 32 clients of one operator, repeatedly."""
     operator = target.visitor(Role.OPERATOR)
     headers = {"Cookie": operator.cookies, "X-CSRFToken": operator.csrf_token}
 

@@ -31,7 +31,7 @@ _OPENING_S = 5.0  # longest wait until all connections are open
 
 
 def half_open(target: Target) -> Counter[str]:
-    """Hold connections that send nothing or half a request; closed ones are reopened."""
+    """Hold connections that send nothing or half a request; closed connections are reopened."""
     return asyncio.run(_half_open(target))
 
 
@@ -94,7 +94,7 @@ def _body(target: Target, number: int) -> str:
 
 
 def toml(target: Target) -> Counter[str]:
-    """Import a file with a key, or a table, of twenty thousand parts, as an administrator."""
+    """Import, as an administrator, a file with a key, or a table, of twenty thousand parts."""
     visitor = target.visitor("admin")
     return again_and_again(target, 1, partial(_import, visitor))
 
@@ -134,7 +134,7 @@ def exports(target: Target) -> Counter[str]:
 
 
 def _seed(target: Target) -> None:
-    """Fill the lab's database with evaluations as after years."""
+    """Fill the lab's database with as many evaluations as after years of use."""
     import django
 
     os.environ |= {"EVA_DATA_DIR": str(target.data), "DJANGO_SETTINGS_MODULE": "evaweb.settings"}
@@ -145,7 +145,7 @@ def _seed(target: Target) -> None:
 
 
 def slow_json(target: Target) -> Counter[str]:
-    """Post JSON that is slow to parse to the process for stops, without a login, from eight clients."""
+    """Post JSON that takes long to parse to the process for stops, without a login, from eight clients."""
     address = urlsplit(target.stops)
 
     def post(target: Target, number: int) -> str:
@@ -159,7 +159,10 @@ def slow_json(target: Target) -> Counter[str]:
 
 
 def long_to_parse(size: int, number: int) -> str:
-    """Return about `size` bytes of JSON with many objects, or with long numbers, alternately."""
+    """Return about `size` bytes of JSON that take long to parse.
+
+    For odd `number` they contain many objects, for even `number` long numbers.
+    """
     part = "[]" if number % 2 else "9" * 4000
     return f'{{"type": "watch", "streams": [{",".join([part] * (size // (len(part) + 1)))}]}}'
 

@@ -1,4 +1,4 @@
-"""Target of an attack: the lab, and the signals of the attack's begin and end."""
+"""Target of an attack: the lab, with the signals for the attack's begin and end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evaweb.lab.rest_client import RestClient
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Lab of `benchmarks.estop_lab`; `share` scales the attack, so that tests can use a small one."""
+    """Lab of `benchmarks.estop_lab` as target; `share` scales the attack, so that tests can use a weak one."""
 
     url: str
     stops: str  # address of its process for stops
@@ -31,11 +31,11 @@ class Target:
         return found.hostname or "", found.port or 80
 
     def part(self, whole: int) -> int:
-        """Return the scaled number, at least 1."""
+        """Return `whole` multiplied by `share`, at least 1."""
         return max(1, round(self.share * whole))
 
     def visitor(self, username: str) -> RestClient:
-        """Return a logged-in client."""
+        """Return a client that is logged in as that user."""
         found = RestClient(self.url)
         found.login(username, self.passwords[username])
         return found

@@ -1,1 +1,1 @@
-"""Random scenarios, each determined by a seed, and the violations they find: `once(seed)` of each module."""
+"""Random scenarios, each determined by a seed, with checks for violations: the function `once(seed)` of each module."""

@@ -1,4 +1,4 @@
-"""Policy servers that randomly answer twice: no answer may be taken for that to another request."""
+"""Policy servers that sometimes answer twice: no answer may be mistaken for the answer to another request."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _VIEWS = [camera.key for camera in _ROBOT.cameras]
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """Kind and settings of a client, and its server."""
+    """Protocol under test: kind and settings of the client, and function that makes the server."""
 
     kind: str
     server: Callable[[], WebsocketServer]
@@ -56,7 +56,7 @@ _PROTOCOLS = (
 
 
 def once(seed: int) -> list[str]:
-    """Send requests to the server of this seed; return each violation as a sentence."""
+    """Send requests to the server that the seed determines; return each violation as a sentence."""
     random = np.random.default_rng(seed)
     chosen = _PROTOCOLS[int(random.integers(len(_PROTOCOLS)))]
     values = random.permutation(np.linspace(0.1, 1.3, _QUESTIONS))
@@ -76,7 +76,7 @@ def once(seed: int) -> list[str]:
 
 
 def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
-    """Return the violations, request by request."""
+    """Return the violations found when `policy` is asked about each of `values` in turn."""
     found: list[str] = []
     for value in values.tolist():
         near = np.clip(value, _ROBOT.lower, _ROBOT.upper)
@@ -92,7 +92,10 @@ def _asked(policy: Policy, values: np.ndarray[Any, Any]) -> list[str]:
 
 
 def _doubling(server: WebsocketServer, random: np.random.Generator) -> Callable[[], int]:
-    """Make the server repeat some answers, at once or at the next request; return a function that counts them."""
+    """Make the server repeat some answers, at once or at the next request.
+
+    Return a function that returns the number of repeated answers.
+    """
     send, before, count = server._send, dict[Any, Frames](), 0
 
     def sending(connection: Any, reply: Frames, number: int) -> bool:

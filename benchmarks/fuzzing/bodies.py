@@ -1,4 +1,4 @@
-"""Robots for fuzzers: limits of their numbers, with all groups, and joints without limits."""
+"""Robots for fuzzers: the limits of their numbers, sometimes with all groups, or with joints without limits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WHOLE = (
 
 
 class Body(NamedTuple):
-    """Limits of a robot, its non-blending dimensions, binary grippers, and ready pose [D]."""
+    """Limits of a robot, its dimensions that do not blend linearly, its binary grippers, and its ready pose [D]."""
 
     name: str
     limits: Limits
@@ -51,7 +51,7 @@ def drawn(rng: np.random.Generator) -> Body:
 
 
 def _endless(made: Body, rng: np.random.Generator) -> Body:
-    """Return the robot with two joints without limits, near half a turn, where encoder readings wrap."""
+    """Return the robot with two joints without limits whose ready pose is near half a turn, where readings wrap."""
     turning = np.sort(rng.choice(np.flatnonzero(made.limits.position_mask), 2, replace=False))
     lower, upper, ready = made.limits.lower.copy(), made.limits.upper.copy(), made.ready.copy()
     lower[turning], upper[turning] = -np.inf, np.inf

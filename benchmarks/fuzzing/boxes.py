@@ -1,4 +1,4 @@
-"""Policies that move near the walls of a workspace box: no command may put the end effector outside."""
+"""Policies that move near the walls of a workspace box: no command may put the end effector outside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arm with a steady error under load: nothing that happens while it stands may move it."""
+"""Arm with a steady error under load: while it holds, nothing that happens may move it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def once(seed: int) -> list[str]:
 
 
 def _move(bench: Compliant, rng: np.random.Generator, run: int) -> None:
-    """Move elsewhere, by a motion or by chunks, perhaps stopped on the way; then stand for two seconds."""
+    """Move elsewhere, by a motion or by chunks, sometimes stopped on the way; then hold for two seconds."""
     here = np.array(bench.status["commanded"], np.float64)
     if rng.random() < 0.5:
         bench.say("motion", goal=rng.uniform(-0.8, 0.8, 2), speed=1.0)

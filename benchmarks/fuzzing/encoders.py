@@ -25,7 +25,7 @@ _JITTER = 0.05  # [rad] of a noisy encoder
 
 
 class Scenario(Bench):
-    """Robot that follows its commands with a delay, seen through encoders that sometimes fail.
+    """Robot that follows its commands with a delay, observed by encoders that sometimes fail.
 
     Joints without limits are read within one turn, or over several. In node-driven mode the robot moves by itself.
     """
@@ -53,7 +53,7 @@ class Scenario(Bench):
         self.violations: list[str] = []
 
     def _stand(self) -> None:
-        """Stand until it is known that the encoders are never still."""
+        """Let the robot hold until the monitor has learnt that its encoders are never still."""
         for _ in range(3 * _SOUND):
             self.observe(qpos=self.read().astype(np.float32))
             self.tick(self.step, self.clock.now())
@@ -62,7 +62,7 @@ class Scenario(Bench):
     # --- events -------------------------------------------------------------------------------------------------
 
     def act(self) -> None:
-        """Cause a random event, occasionally."""
+        """Cause a random event in some ticks."""
         if self.rng.random() < 0.06:
             kinds = ["follow", "follow", "motion", "hold", "estop", "push", "sim", "yield", "lock"]
             stopped = self.shared.estop is EStop.LATCHED and self.rng.random() < 0.5
@@ -88,7 +88,7 @@ class Scenario(Bench):
         )
 
     def _anything(self, reach: float) -> Float64:
-        """Return random joints with grippers and speeds at any value within their limits."""
+        """Return random joints within `reach`, with grippers and speeds at any value within their limits."""
         place, free = self._somewhere(reach), ~self.places
         place[free] = self.rng.uniform(self.limits.lower[free], self.limits.upper[free])
         return place
@@ -168,7 +168,7 @@ class Scenario(Bench):
         self._move()
 
     def _move(self) -> None:
-        """Move the robot for one tick, by command, hand, or its own node."""
+        """Move the robot for one tick, by its command, by hand, or by its own node."""
         led = self.behaviour == "yield"
         if led and self.rng.random() < 0.05:
             self.wish = self._somewhere(0.5)
@@ -187,7 +187,7 @@ class Scenario(Bench):
 
     @property
     def _known(self) -> Float64:
-        """Joints as far as the runtime can know them: external motion during a frozen encoder is invisible."""
+        """Joints as far as the runtime can know them: motion during a frozen encoder is invisible."""
         return self.kept if self.fault == "frozen" else self.body
 
     def check(self, sent: list[Float64]) -> None:
@@ -211,7 +211,11 @@ class Scenario(Bench):
         self.previous = told
 
     def _check_grippers(self, told: Float64, stopped: bool) -> None:
-        """Check that e-stops and the hold after them leave grippers as they are, and that switches are rare."""
+        """Check that grippers are commanded open or closed, and do not switch too often.
+
+        In between is allowed if the command does not change, or if the first command is that of an e-stop (`stopped`).
+        `told` [D] is the command of this tick.
+        """
         for dim, ends in self.ends.items():
             before = None if self.previous is None else self.previous[dim]
             switches = not np.isclose(told[dim], told[dim] if before is None else before)
@@ -256,7 +260,7 @@ class Scenario(Bench):
 
 
 class EncoderOffsetScenario(Bench):
-    """Standing robot with one faulty joint encoder: it must not run away, and no run may begin meanwhile."""
+    """Robot at rest with one faulty joint encoder: it must not run away, and no run may begin meanwhile."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -302,7 +306,7 @@ class EncoderOffsetScenario(Bench):
         return [f"{self.name}, encoder of {joint}: {self._fault}: {what}" for what in sorted(found)]
 
     def _read(self, since: float) -> Float64:
-        """Return the readings of the encoders [D], `since` [s] after the fault began."""
+        """Return the readings of the encoders [D] at `since` [s] after the fault began."""
         read = self.body.copy()
         if self._fault == "no number":
             read[self._joint] = np.nan
@@ -315,7 +319,7 @@ class EncoderOffsetScenario(Bench):
         return read
 
     def _wrong(self, read: Float64) -> set[str]:
-        """Return the violations in the tick in which the joints were `read` [D]."""
+        """Return the violations in the tick in which the encoders' readings were `read` [D]."""
         found, told, places = set[str](), self.sent[-1], self.limits.position_mask
         if not np.isfinite(told).all() or (self.limits.excess(told) > 1e-5 * self.limits.radian_scale).any():
             found.add("told beyond the limits, or no number")
@@ -327,7 +331,7 @@ class EncoderOffsetScenario(Bench):
         return found
 
     def _bound(self, begins: Float64) -> float:
-        """Return the largest trusted displacement [rad]: the following error plus the encoder's offset."""
+        """Return the largest displacement [rad] that may be trusted: the following error plus the encoder's offset."""
         scaled = abs((self._scale - 1.0) * begins[self._joint])
         return float(self.safety.following_error + abs(self._offset) + scaled + 0.1)
 

@@ -1,4 +1,4 @@
-"""Encoder faults: readings instead of `joints` [D], `since` samples after the fault began."""
+"""Encoder faults, each a function that returns readings instead of `joints` [D], `since` samples after it began."""
 
 from __future__ import annotations
 

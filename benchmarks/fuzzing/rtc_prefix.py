@@ -1,8 +1,8 @@
-"""RTC: rows that a request declares as fixed are exactly those that control plans for these steps, whatever happens.
+"""RTC: rows that a request declares as fixed must be exactly those that control plans for their steps.
 
 A complete station on the virtual clock, a robot that reaches each command at once, and a policy whose answers disagree
-and which honours the contract of real-time chunking, or does not. Answers are late or lost at random, and the run is
-halted, resumed, tuned and restarted.
+and which either honours the contract of real-time chunking or does not. Answers are late or lost at random, and the run
+is halted, resumed, tuned and restarted.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _KINDS = ("rtc", "rtc", "rtc", "async", "naive", "ensemble", "sync")
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Scenario of a seed."""
+    """Parameters of a scenario."""
 
     robot: str
     control_hz: float
@@ -61,7 +61,7 @@ class Scenario:
 
 
 def scenario(seed: int) -> Scenario:
-    """Return the scenario of a seed."""
+    """Return the parameters of the scenario of `seed`."""
     random = np.random.default_rng(seed)
     control = float(random.choice([20.0, 30.0, 50.0]))
     least = int(random.integers(1, 6))
@@ -98,7 +98,7 @@ def scenario(seed: int) -> Scenario:
 
 
 def once(seed: int) -> list[str]:
-    """Run the scenario of a seed on the virtual clock; return each violation as a sentence."""
+    """Run the scenario of `seed` on the virtual clock; return each violation as a sentence."""
     made, random = scenario(seed), np.random.default_rng([seed, 1])
     with tempfile.TemporaryDirectory() as folder:
         spec = _plan(Path(folder), made)
@@ -121,7 +121,7 @@ class RandomDelayRunner(LockstepRunner):
 
 
 class SlowlyObservedRobot(InstantRobot):
-    """Robot that starts at `position`, and is observed every few ticks."""
+    """Robot that starts at `position`, and sends an observation only every few ticks."""
 
     def __init__(self, robot: Robot, clock: Clock, position: Float64, every: int) -> None:
         super().__init__(robot, clock)
@@ -129,14 +129,14 @@ class SlowlyObservedRobot(InstantRobot):
         self._every, self._looked = every, 0
 
     def receive(self, timeout: float) -> Observation | None:
-        """Return an observation at the robot's own rate, else None."""
+        """Return an observation if one is due at the robot's own rate, else None."""
         self._looked += 1
         return super().receive(timeout) if self._looked % self._every == 0 else None
 
 
 @dataclass(frozen=True, slots=True)
 class DeclaredPrefix:
-    """Fixed rows [d, W] of a request, the first for control step `step`."""
+    """Rows [d, W] that a request declared as fixed; the first is for control step `step`."""
 
     step: int
     rows: Float64
@@ -162,7 +162,7 @@ class PrefixKeepingPolicy(Policy):
         return PolicyInfo("keeper", horizon=self._made.horizon, rate=self._made.action_hz, supports_rtc=True)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return the rows.
+        """Return rows around the posture; if the contract is honoured, the committed rows come first.
 
         Raises:
             PolicyLostError: At random.
@@ -186,16 +186,16 @@ class PrefixKeepingPolicy(Policy):
         )
 
     def reset(self) -> None:
-        """Do nothing: there is no state."""
+        """Do nothing, because there is no state."""
 
     def close(self) -> None:
-        """Do nothing: there are no resources."""
+        """Do nothing, because there are no resources."""
 
     def apart(self, row: Float64, at: float, planned: dict[int, Float64], missed: float) -> str:
-        """Return the deviation of a fixed row for control step `at` from the plan as text, "" if there is none.
+        """Return as text how a fixed row for control step `at` deviates from the plan, "" if it does not.
 
-        Between two steps the row is compared with both, with the plan's curvature as tolerance; for poses the error
-        `missed` of inverse kinematics is added.
+        Between two steps the row is compared with their interpolation, with the plan's curvature as tolerance; for
+        poses the error `missed` of inverse kinematics is added.
         """
         before, part = math.floor(at + _HAIR), at - math.floor(at + _HAIR)
         steps = [before, before + 1] if part > _HAIR else [before]
@@ -215,14 +215,14 @@ class PrefixKeepingPolicy(Policy):
         return f"is {off[worst]:.2e} off in number {worst}, allowed {allowed[worst]:.2e}"
 
     def _bend(self, before: int, planned: dict[int, Float64]) -> Float64:
-        """Return the curvature of the plan around a step: the error of interpolation between two steps."""
+        """Return the curvature of the plan around a step: the largest second difference of the planned rows there."""
         rows = [self._of(planned[step]) for step in range(before - 2, before + 4) if step in planned]
         steps = [self._difference(later, sooner) for sooner, later in pairwise(rows)]
         bends = [np.abs(later - sooner) for sooner, later in pairwise(steps)]
         return np.max(bends, axis=0, initial=0.0) if bends else np.zeros(len(rows[0]))
 
     def _of(self, joints: Float64) -> Float64:
-        """Return planned joints in the space of the rows."""
+        """Return planned joints in the space of the rows: as they are, or as poses."""
         return self._eef.eef_of(joints).astype(np.float64) if self._made.space == "eef" else joints
 
     def _difference(self, one: Float64, other: Float64) -> Float64:
@@ -250,7 +250,9 @@ class PrefixKeepingPolicy(Policy):
         return np.asarray(joints)
 
     def _continued(self, rows: Float64, left: Float64, fixed: int) -> Float64:
-        """Return the rows with the fixed ones in place, and a transition to its own rows within 6 more."""
+        """Return the rows with the `fixed` first ones from `left`, and a transition to their own values within
+        6 more.
+        """
         count = min(len(left), len(rows), fixed + 6)
         weights = np.clip((fixed + 6 - np.arange(count)) / 7.0, 0.0, 1.0)
         weights[:fixed] = 1.0
@@ -280,7 +282,7 @@ def _plan(data: Path, made: Scenario) -> StationSpec:
 
 @dataclass(slots=True)
 class Planned:
-    """Planned actions by control step, before safety, and steps without a run."""
+    """Actions planned by control step, before safety, and the steps without a run."""
 
     rows: dict[int, Float64]
     held: set[int]
@@ -290,11 +292,16 @@ class Planned:
     end: int
 
     def arrived_for(self, step: int) -> int:
-        """Return when the first answer to a request from `step` on is the plan; lost answers fix nothing."""
+        """Return from which step on the first answer to a request at `step` or later is the plan.
+
+        Without such an answer, return the end of the run: lost answers fix nothing.
+        """
         return min((at for asked, at in self.arrived.items() if asked >= step), default=self.end)
 
     def missed_before(self, step: int, horizon: int) -> float:
-        """Return the largest error of the answers that may contribute to this step and those after it."""
+        """Return the largest error of inverse kinematics in answers that may contribute to this step or the
+        next ones.
+        """
         return max((off for at, off in self.missed.items() if step - 2 * horizon <= at <= step), default=0.0)
 
 
@@ -338,7 +345,7 @@ def _run(
 
 
 def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -> None:
-    """Do what an operator might do now."""
+    """Do something at random that an operator might do now."""
     state = station.coordinator.session.state
     if state is SessionState.READY:
         station.command("run")
@@ -352,7 +359,9 @@ def _interfere(station: Lockstep, made: Scenario, random: np.random.Generator) -
 
 
 def _violations(made: Scenario, keeper: PrefixKeepingPolicy, planned: Planned) -> list[str]:
-    """Return each fixed row that differs from the plan for its step by more than the arithmetic tolerance."""
+    """Return each fixed row that differs from the plan for its step by more than the arithmetic tolerance, as a
+    sentence.
+    """
     found: list[str] = []
     pace = (made.action_hz or made.control_hz) / made.control_hz
     binding = made.keeps and made.action_hz is None and "k_max" not in made.strategy

@@ -13,7 +13,7 @@ from types import ModuleType
 
 
 class _Broken(MetaPathFinder):
-    """Finder that refuses modules of these names."""
+    """Import finder that refuses the modules with these names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names

@@ -30,7 +30,7 @@ _QUARTER = (0.7071067811865476, 0.0, 0.0, 0.7071067811865476)  # the robot's x p
 
 @dataclass(frozen=True, slots=True)
 class PoseDraft:
-    """Pose: x, y, z [m] and unit quaternion w, x, y, z; checked when the written sheet is loaded."""
+    """Pose: x, y, z [m] and unit quaternion w, x, y, z; checked when the written robot.toml is loaded."""
 
     xyz: tuple[float, float, float]
     wxyz: tuple[float, float, float, float]
@@ -38,7 +38,7 @@ class PoseDraft:
 
 @dataclass(frozen=True, slots=True)
 class GroupDraft:
-    """Group of a draft; `numbers` are names on the wire, the gripper's last. `rest` are its values at home."""
+    """Group of a draft; `numbers` are its names in messages, with the gripper's last. `rest` are its values at home."""
 
     name: str
     kind: Kind
@@ -56,7 +56,7 @@ class GroupDraft:
 
 @dataclass(frozen=True, slots=True)
 class RobotDraft:
-    """Complete draft; `unassigned_joints` are not moved by any group, `held` joints are floating or planar."""
+    """Complete draft; no group moves the `unassigned_joints`; `held` joints are floating or planar."""
 
     title: str
     urdf: str
@@ -136,7 +136,7 @@ def _rest_joints(tree: Urdf, joints: Sequence[str]) -> tuple[float, ...]:
 
 
 def _ends(tree: Urdf, name: str) -> tuple[float, float]:
-    """Return the position limits of a joint in the draft."""
+    """Return lower and upper position limit of a joint, or placeholders if the URDF's are unusable."""
     joint = tree.joint(name)
     instead = placeholder_limits(joint)
     if instead is not None and instead.lower is not None and instead.upper is not None:
@@ -147,8 +147,9 @@ def _ends(tree: Urdf, name: str) -> tuple[float, float]:
 
 
 def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[str, float]:
-    """Return non-zero rest values of joints of optional groups, for drawing while they do not move; on the
-    first arm only.
+    """Return the non-zero rest values of the joints of optional groups, for drawing while those groups do not move.
+
+    Only the first arm gets them; {} for every other limb.
     """
     if limb.kind != "arm" or limb is not next(other for other in limbs if other.kind == "arm"):
         return {}
@@ -162,7 +163,7 @@ def _pinned(tree: Urdf, limb: GroupGuess, limbs: Sequence[GroupGuess]) -> dict[s
 
 
 def _speeds(limb: GroupGuess) -> GroupDraft:
-    """Return a base on wheels: numbers that move no joint of the URDF."""
+    """Return the group of a base on wheels, whose numbers are speeds and move no joint of the URDF."""
     overrides = tuple(
         OverrideTable(
             joint=name,
@@ -191,7 +192,7 @@ def _speeds(limb: GroupGuess) -> GroupDraft:
 
 
 def _copy(group: GroupDraft, index: int, copies: int) -> GroupDraft:
-    """Return the group for one of several equal arms, side by side, the first on the left."""
+    """Return the group for arm `index` of `copies` equal arms, which are side by side, the first on the left."""
     side = ("left", "right")[index] if copies == 2 else ""
     name = f"{side}_{group.name}" if side else f"{group.name}{index + 1}"
     x = round((index - (copies - 1) / 2) * _SPACING, 4)
@@ -199,13 +200,13 @@ def _copy(group: GroupDraft, index: int, copies: int) -> GroupDraft:
 
 
 def _cameras(arms: Sequence[str]) -> dict[str, str]:
-    """Return one camera over the table and one per wrist, with the names common in training data."""
+    """Return one camera above the table and one per wrist, by name, with the names that are common in training data."""
     sides = [name.replace("arm", "wrist") for name in arms]
     return {"front": "cam_high"} | {side: f"cam_{side}" for side in sides}
 
 
 def _root_pose(tree: Urdf, limbs: Sequence[GroupGuess]) -> PoseDraft:
-    """Return the pose of the root such that the arms reach over the table: on it, or on the floor in front of it."""
+    """Return the pose of the root with which the arms reach over the table: on it, or on the floor in front of it."""
     at = places(tree, {})
     shoulders: list[Float64] = [
         at[tree.joint(limb.joints[0]).child][:3, 3] for limb in limbs if limb.kind == "arm" and limb.joints

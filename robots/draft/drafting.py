@@ -1,4 +1,6 @@
-"""Drafting of a robot's folder: robot.toml, URDF, meshes and README, loaded as a test before it is moved into place."""
+"""Drafting of a robot's folder: robot.toml, URDF, meshes and README; it is loaded as a test before it is moved into
+place.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ _MOST = 8  # greatest number of copies of one arm
 
 @dataclass(frozen=True, slots=True)
 class DraftResult:
-    """New `folder` of a robot, what happened to its shapes, and the findings of its inspection."""
+    """Result of drafting: the new `folder` of a robot, a report on its shapes, and the findings of its inspection."""
 
     folder: Path
     pictures: MeshCopyReport
@@ -80,7 +82,7 @@ def _free(name: str, into: Path) -> Path:
 
 
 def _write(folder: Path, guessed: RobotDraft) -> None:
-    """Write robot.toml, first with every group at rest, then with postures in which nothing touches."""
+    """Write robot.toml: first with every group at rest, then again with postures in which nothing touches."""
     file = folder / "robot.toml"
     home = {group.name: group.rest for group in guessed.groups}
     file.write_text(render_robot_toml(guessed, {"home": home}, ()), "utf-8")

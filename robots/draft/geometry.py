@@ -1,4 +1,4 @@
-"""Poses of a URDF's links and extents of their shapes, before there is a robot."""
+"""Poses of a URDF's links and extents of their shapes, computed before there is a robot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from robots.urdf import Urdf
 
 
 def places(tree: Urdf, values: Mapping[str, float]) -> dict[str, Float64]:
-    """Return root <- link [4, 4] by link, for values of independent joints [rad or m]; missing ones are 0."""
+    """Return the transform root <- link [4, 4] by link, for values of independent joints [rad or m]; missing ones are
+    0.
+    """
     found = {tree.root: np.eye(4)}
     for joint in tree.outwards():
         here = joint.origin
@@ -26,7 +28,7 @@ def places(tree: Urdf, values: Mapping[str, float]) -> dict[str, Float64]:
 
 
 def corners(shapes: Iterable[Shape]) -> dict[str, Float64]:
-    """Return the corners [n, 3] of the bounding boxes of each link's shapes, in the link."""
+    """Return by link the corners [n, 3] of the bounding boxes of its shapes, in the link's frame."""
     found: dict[str, list[Float64]] = {}
     for shape in shapes:
         found.setdefault(shape.link, []).append(

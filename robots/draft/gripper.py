@@ -24,10 +24,11 @@ _PREFERRED = (*_GRASPS, "tool0", "ee", "tip", "flange", "hand")
 
 @dataclass(frozen=True, slots=True)
 class GripperDraft:
-    """Suggested gripper: its number is the position of `driver`; `fingers` are values at `lower` and at `upper`.
+    """Suggested gripper: its number is the position of `driver`; `fingers` are the joints' values at `lower` and
+    `upper`.
 
-    `apart` is the distance by which they part [m] from `close` to `open`, None if they do not; `tip` [7] is in the end
-    effector. `placeholder_notes` are sentences about placeholders.
+    `apart` is the distance [m] by which the fingers part from `close` to `open`, None if they do not; `tip` [7] is in
+    the end effector. `placeholder_notes` are sentences about placeholders.
     """
 
     driver: str
@@ -44,8 +45,10 @@ class GripperDraft:
 
 
 def end_link(tree: Urdf, limb: GroupGuess) -> str:
-    """Return an arm's end effector: a leaf after its last joint with a typical name, else the link that
-    carries the fingers.
+    """Return the end effector of an arm.
+
+    With fingers it is a link after the last joint that is named as for grasping, else the link that carries the
+    fingers. Without, it is a leaf after the last joint with a typical name, else the link that the last joint moves.
     """
     last = tree.joint(limb.joints[-1]).child
     if limb.fingers:
@@ -55,7 +58,9 @@ def end_link(tree: Urdf, limb: GroupGuess) -> str:
 
 
 def _hand(tree: Urdf, limb: GroupGuess, last: str) -> str:
-    """Return a frame for grasping after the last joint, else the link that carries the fingers."""
+    """Return a link after the last joint that is named like a frame for grasping, else the link that carries the
+    fingers.
+    """
     rigid = _behind(tree, last, rigid=True)
     named = (link for word in _GRASPS for link in rigid if word in link.lower())
     return next(named, tree.joint(limb.fingers[0]).parent)
@@ -64,7 +69,10 @@ def _hand(tree: Urdf, limb: GroupGuess, last: str) -> str:
 def guess_gripper(
     tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]
 ) -> GripperDraft:
-    """Return the gripper of an arm with fingers; `corners` [n, 3] are those of links with real shapes."""
+    """Return the gripper of an arm with fingers.
+
+    `corners` [n, 3] are those of the links that have real shapes.
+    """
     followed = tree.masters()
     driver = tree.joint(
         max(limb.fingers, key=lambda name: (name in followed, tree.joint(name).kind == "prismatic"))
@@ -108,13 +116,13 @@ def _velocity(joint: Joint, way: float, doubts: list[str]) -> float:
 
 
 def _independent_fingers(tree: Urdf, limb: GroupGuess, driver: str) -> dict[str, tuple[float, float]]:
-    """Return the limits of the fingers that move independently of the driver and have limits."""
+    """Return the limits by name of the finger joints that have limits and move independently of the driver."""
     joints = [tree.joint(name) for name in limb.fingers if name != driver]
     return {joint.name: _range(joint, []) for joint in joints if joint.kind != "continuous"}
 
 
 class _Jaws:
-    """Branches of the fingers, with a point near the end of each, in the end effector."""
+    """Fingers of a gripper as branches of the tree, each with a point near its end, in the end effector's frame."""
 
     def __init__(self, tree: Urdf, limb: GroupGuess, eef_link: str, corners: Mapping[str, Float64]) -> None:
         self._tree = tree
@@ -139,7 +147,10 @@ class _Jaws:
     def closing_values(
         self, driver: str, ends: tuple[float, float], others: Mapping[str, tuple[float, float]]
     ) -> dict[str, tuple[float, float]]:
-        """Return every finger's values at the driver's limits, with the directions in which the fingers part most."""
+        """Return the values of every finger joint at the driver's lower and upper limit.
+
+        Of the possible directions of the other fingers those are chosen in which the fingers part most.
+        """
         choices = [
             {driver: ends} | dict(zip(others, turned, strict=True))
             for turned in product(*((way, way[::-1]) for way in others.values()))
@@ -149,8 +160,10 @@ class _Jaws:
     def opening(
         self, fingers: Mapping[str, tuple[float, float]], lower: float, upper: float
     ) -> tuple[float | None, dict[str, float], float]:
-        """Return the distance by which the fingers part [m], their values when closed, and the driver's value
+        """Return the distance by which the fingers part [m], the joints' values when closed, and the driver's value
         when open.
+
+        The distance is None if they do not part.
         """
         partings = self._partings(fingers)
         pair = self._pairs[int(np.argmax(partings))]
@@ -164,11 +177,10 @@ class _Jaws:
         return (opened, at_upper, lower) if gaps[0] > gaps[1] else (opened, at_lower, upper)
 
     def tip(self, closed: Mapping[str, float], *, named: bool) -> Float64:
-        """Return the frame [7] between the fingertips in the end effector: z pointing ahead, y in the opening
-        direction.
+        """Return the frame [7] between the fingertips in the end effector: z ahead, y in the opening direction.
 
-        Its position comes from the fingers' shapes; without shapes, it is that of an end effector with a grasp-like
-        name.
+        Its position comes from the fingers' shapes; without shapes it is that of the end effector, if that has a name
+        as for grasping.
         """
         at = self._in_eef(closed)
         points = [self._point(index, at) for index in range(len(self._ends))]
@@ -197,7 +209,7 @@ class _Jaws:
         return _along(np.mean(reaching, axis=0))
 
     def _end(self, branch: list[str], at: Mapping[str, Float64]) -> tuple[str, Float64]:
-        """Return the link of a branch that extends farthest, and the centre of its far end in that link."""
+        """Return the link of a branch that extends farthest, and the centre of that link's far end in its own frame."""
         seen = {link: self._points_in_eef(link, at) for link in branch}
         link = max(branch, key=lambda name: float((seen[name] @ self._z).max()))
         along = seen[link] @ self._z
@@ -206,13 +218,13 @@ class _Jaws:
         return link, np.linalg.inv(at[link]) @ np.append(end, 1.0)
 
     def _partings(self, fingers: Mapping[str, tuple[float, float]]) -> list[float]:
-        """Return the relative motion [m] of each pair of branches between the limits."""
+        """Return for each pair of branches how much it parts between the limits [m]."""
         at_lower, at_upper = ({name: ends[end] for name, ends in fingers.items()} for end in (0, 1))
         ways = [self._between(pair, at_upper) - self._between(pair, at_lower) for pair in self._pairs]
         return [float(np.linalg.norm(way)) for way in ways]
 
     def _opens_along(self, closed: Mapping[str, float]) -> Float64:
-        """Return the direction in the end effector in which the fingers begin to part."""
+        """Return the direction in the end effector in which the fingers begin to part when they open."""
         step = {name: value + 1e-3 for name, value in closed.items()}
         ways = [self._between(pair, step) - self._between(pair, closed) for pair in self._pairs]
         return max(ways, key=lambda way: float(np.linalg.norm(way)))
@@ -232,7 +244,9 @@ class _Jaws:
         return {link: back @ place for link, place in at.items()}
 
     def _points_in_eef(self, link: str, at: Mapping[str, Float64]) -> Float64:
-        """Return the corners [n, 3] of a link's shapes in the end effector, or its origin if it has none."""
+        """Return the corners [n, 3] of a link's shapes in the end effector's frame, or the link's origin if it has
+        none.
+        """
         shapes = self._corners.get(link, np.zeros((1, 3)))
         return np.asarray(shapes @ at[link][:3, :3].T + at[link][:3, 3])
 
@@ -241,13 +255,13 @@ class _Jaws:
         return np.asarray((seen.min(axis=0) + seen.max(axis=0)) / 2)
 
     def _reach(self, at: Mapping[str, Float64]) -> float | None:
-        """Return the extent of the fingers' shapes along z, None without shapes."""
+        """Return how far the fingers' shapes extend along z, None if there are no shapes."""
         shown = [link for branch in self._branches for link in branch if link in self._corners]
         return max((float((self._points_in_eef(link, at) @ self._z).max()) for link in shown), default=None)
 
 
 def _behind(tree: Urdf, link: str, *, rigid: bool = False) -> list[str]:
-    """Return the link and all its descendants, outwards; with `rigid` only those that are fixed to it."""
+    """Return the link and all its descendants, from it outwards; with `rigid` only those that are fixed to it."""
     found = [link]
     for here in found:  # the list grows during the loop
         found += [joint.child for joint in tree.children(here) if not rigid or joint.kind == "fixed"]

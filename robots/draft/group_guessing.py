@@ -1,4 +1,4 @@
-"""Groups that a URDF suggests, by names and structure of the tree: arms, hands, torso, head, base."""
+"""Groups that a URDF suggests by names and by the structure of its tree: arms, hands, torso, head, base."""
 
 from __future__ import annotations
 
@@ -42,8 +42,7 @@ _SIDEWAYS = 0.01  # [m] distance from the middle from which an arm is on a side
 
 @dataclass(frozen=True, slots=True)
 class GroupGuess:
-    """Suggested group: `joints` of the URDF outwards, `fingers` of its gripper, and the link `above` on which it
-    begins.
+    """Suggested group: `joints` of the URDF outwards, `fingers` of its gripper, and the link `above`, where it begins.
 
     `side` is "left", "right" or "". `wheels` are joints that roll and are not commanded individually: a base with
     wheels is commanded by speeds.
@@ -80,7 +79,7 @@ def guess_groups(tree: Urdf) -> tuple[GroupGuess, ...]:
 
 
 class _Skeleton:
-    """Joints that move by themselves, and their tree."""
+    """Tree of the joints that move independently."""
 
     def __init__(self, tree: Urdf, moving: Sequence[Joint]) -> None:
         self.tree = tree
@@ -89,20 +88,22 @@ class _Skeleton:
         self.masters = tree.masters()
 
     def children(self, name: str | None, without: Iterable[str] = ()) -> list[str]:
-        """Return the joints directly after `name`, without `without`; None for those on the root."""
+        """Return the joints directly after `name`, except those in `without`; if `name` is None, those after
+        the root.
+        """
         return [child for child in self.names if self.parent[child] == name and child not in without]
 
     def descendants(self, name: str) -> set[str]:
-        """Return all joints after `name`."""
+        """Return all joints that are further out than `name` in its branch."""
         below = self.children(name)
         return set(below).union(*(self.descendants(child) for child in below))
 
     def depth(self, name: str | None) -> int:
-        """Return the number of joints from the root to this one."""
+        """Return the number of joints from the root to `name`."""
         return 0 if name is None else 1 + self.depth(self.parent[name])
 
     def fingers(self, wheels: set[str]) -> dict[str, str | None]:
-        """Return the joints of fingers, each with the joint that carries its hand (None: the root)."""
+        """Return by finger joint the joint that carries its hand, None if that is the root."""
         found: set[str] = set()
         for name in reversed(self.names):  # from the tips inwards
             if name not in wheels and found.issuperset(self.children(name)) and self._is_finger(name):
@@ -117,7 +118,7 @@ class _Skeleton:
         return carriers
 
     def runs(self, without: set[str]) -> list[tuple[tuple[str, ...], bool]]:
-        """Return the unbranched rows of joints, outwards, each with whether the tree ends there."""
+        """Return the unbranched rows of joints, outwards, each with whether its branch of the tree ends with it."""
         found: list[tuple[tuple[str, ...], bool]] = []
         starts = self.children(None, without)
         for start in starts:  # the list grows during the loop
@@ -157,8 +158,9 @@ class _Skeleton:
 def _limbs(
     skeleton: _Skeleton, run: tuple[tuple[str, ...], bool], fingers: dict[str, str | None], *, alone: bool
 ) -> list[GroupGuess]:
-    """Return the limbs of a row of joints; a torso or base that leads to an arm without branching is a
-    separate limb.
+    """Return the limbs that an unbranched row of joints forms.
+
+    A torso or base that leads to an arm without branching is a separate limb.
     """
     joints, ends = run
     own = tuple(name for name, carrier in fingers.items() if carrier == joints[-1])
@@ -192,7 +194,7 @@ def _limb(skeleton: _Skeleton, kind: Kind, joints: tuple[str, ...]) -> GroupGues
 
 
 def _base(tree: Urdf) -> str:
-    """Return the base link: the root, or the link fixed to a root that only represents the world."""
+    """Return the base link: the root, or the link that is fixed to a root that only represents the world."""
     behind = tree.children(tree.root)
     if tree.root in ("world", "map", "odom", "ground") and len(behind) == 1 and behind[0].kind == "fixed":
         return behind[0].child
@@ -200,14 +202,14 @@ def _base(tree: Urdf) -> str:
 
 
 def _one_gripper(skeleton: _Skeleton, fingers: Sequence[str]) -> bool:
-    """Return True if the fingers open and close by one number; more or jointed fingers are a hand."""
+    """Return True if one number opens and closes the fingers; more fingers, or jointed ones, are a hand."""
     return 0 < len(fingers) <= _FORK and not any(skeleton.parent[name] in fingers for name in fingers)
 
 
 def _loose(
     skeleton: _Skeleton, limbs: Sequence[GroupGuess], fingers: dict[str, str | None]
 ) -> list[GroupGuess]:
-    """Return the hands: fingers that are not an arm's gripper, by what carries them."""
+    """Return the hands: one group for all fingers with the same carrier that are not part of an arm's gripper."""
     taken = {name for limb in limbs for name in limb.fingers}
     hands: dict[str | None, list[str]] = {}
     for name, carrier in fingers.items():
@@ -217,7 +219,7 @@ def _loose(
 
 
 def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
-    """Return the limbs with torso parts merged to one torso, and base parts to one base."""
+    """Return the limbs with all parts of the torso merged into one, and all parts of the base into one."""
     found: list[GroupGuess] = []
     for limb in limbs:
         same = next(
@@ -232,7 +234,7 @@ def _merge_trunks(limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
 
 
 def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
-    """Return the limbs with two unnamed arms assigned to left and right by where they begin (y is left)."""
+    """Return the limbs; if there are two arms without a side, with left and right by where they begin (y is left)."""
     arms = [limb for limb in limbs if limb.kind == "arm"]
     if len(arms) != 2 or any(arm.side for arm in arms):
         return list(limbs)
@@ -245,7 +247,7 @@ def _assign_sides(tree: Urdf, limbs: Sequence[GroupGuess]) -> list[GroupGuess]:
 
 
 def _named(limbs: Sequence[GroupGuess]) -> tuple[GroupGuess, ...]:
-    """Return the limbs with unique names: left_arm, torso, other2; arms first, left before right."""
+    """Return the limbs with unique names, e.g. left_arm, torso, other2: arms first, left before right."""
     ordered = sorted(limbs, key=lambda limb: (_ORDER.index(limb.kind), limb.side != "left", limb.side == ""))
     plain = ["_".join(filter(None, (limb.side, limb.kind))) for limb in ordered]
     names = []
@@ -268,14 +270,14 @@ def _kind_of(name: str) -> Kind | None:
 
 
 def _kind(joints: Sequence[str]) -> Kind | None:
-    """Return the kind that at least half of the names indicate."""
+    """Return the kind that at least half of the joints' names indicate, None if there is none."""
     kinds = [_kind_of(name) for name in joints]
     likely = max(dict.fromkeys(kinds), key=kinds.count)
     return likely if 2 * kinds.count(likely) >= len(kinds) else None
 
 
 def _side(tree: Urdf, joints: Sequence[str]) -> str:
-    """Return the side that the names of most joints, or else of their child links, indicate."""
+    """Return the side that the names of most joints indicate, or else the names of their child links."""
     for names in (joints, [tree.joint(name).child for name in joints]):
         told = np.array(
             [[bool(_name_parts(name) & words) for words in _SIDES.values()] for name in names]

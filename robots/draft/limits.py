@@ -1,4 +1,4 @@
-"""Placeholders for limits that a URDF lacks, or gives with unrealistic values."""
+"""Placeholders for limits that a URDF lacks, or states with unrealistic values."""
 
 from __future__ import annotations
 

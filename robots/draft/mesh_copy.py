@@ -1,4 +1,6 @@
-"""Copy of a URDF with its visuals into a robot's folder: meshes beside it, stand-ins for what cannot be shown."""
+"""Copy of a URDF with its visuals into a robot's folder, with its meshes, and with stand-ins for shapes that cannot be
+shown.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ _COLOUR = "0.55 0.58 0.63 1"
 
 @dataclass(frozen=True, slots=True)
 class MeshCopyReport:
-    """Result for the shapes: `copied` files, and `missing` meshes that were not found or are unreadable.
+    """Report on the shapes: `copied` files, and `missing` meshes that were not found or are unreadable.
 
     `drawn` are links shown by stand-ins; `plain` are links whose material was not declared, or has no valid colour.
     """
@@ -43,10 +45,10 @@ class MeshCopyReport:
 
 
 def copy_urdf(tree: Urdf, target: Path) -> MeshCopyReport:
-    """Write the URDF to `target`, and its meshes to the folder meshes/ beside it.
+    """Write the URDF to `target`, and its meshes to the folder meshes/ next to it.
 
     If everything can be shown, the URDF is copied unchanged. Otherwise visuals of missing meshes are replaced by
-    cylinders from joint to joint; if nothing can be shown, this applies to all links.
+    cylinders from joint to joint; if nothing can be shown, the visuals of all links are.
     """
     robot = parsed(tree.path, comments=True)
     work = _UrdfCopy(tree, target, robot)
@@ -82,7 +84,7 @@ class _UrdfCopy:
         return bool(self.copied or self.drawn or self.plain or self._bare or self._recoloured)
 
     def meshes(self) -> None:
-        """Copy readable meshes and point to the copies; remove visuals that cannot be shown."""
+        """Copy readable meshes and let visuals refer to the copies; remove visuals that cannot be shown."""
         for link in self._robot.findall("link"):
             for visual in link.findall("visual"):
                 geometry = visual.find("geometry")
@@ -97,7 +99,7 @@ class _UrdfCopy:
                     self._bare.append(link)
 
     def _sized(self, shape: ET.Element) -> bool:
-        """Return True if the shape has positive lengths, or non-zero factors."""
+        """Return True if the shape has valid sizes: lengths above zero, or for a mesh factors that are not zero."""
         try:
             shapes.size_of(self._tree.path, "a visual", shape)
         except RobotError:
@@ -105,7 +107,7 @@ class _UrdfCopy:
         return True
 
     def colours(self) -> None:
-        """Remove invalid colours: all except four numbers from 0 to 1."""
+        """Remove colours that are not four numbers from 0 to 1."""
         for link in self._robot.findall("link"):
             for material in link.iter("material"):
                 if self._without_odd_colour(material):
@@ -141,7 +143,7 @@ class _UrdfCopy:
                 self.drawn += [link.get("name", "")] if shown else []
 
     def materials(self) -> None:
-        """Remove undeclared materials: such shapes get the plain colour."""
+        """Remove references to undeclared materials; such shapes get the plain colour."""
         declared = {
             material.get("name")
             for material in self._robot.iter("material")
@@ -171,7 +173,7 @@ class _UrdfCopy:
         return True
 
     def _sticks(self, link: str) -> Iterator[ET.Element]:
-        """Yield visuals from the link's origin to each of its joints; a sphere at the end of a chain."""
+        """Yield cylinders from the link's origin to each of its joints, or a sphere if the chain ends with the link."""
         above = self._tree.above(link)
         ways = [joint.origin[:3, 3] for joint in self._tree.children(link) if not self._is_frame(joint)]
         long = [way for way in ways if np.linalg.norm(way) >= _SHORTEST]
@@ -185,7 +187,7 @@ class _UrdfCopy:
             yield _visual(way / 2, f"0 {pitch:.6f} {yaw:.6f}", stick)
 
     def _is_frame(self, joint: Joint) -> bool:
-        """Return True if the joint leads to a mere frame, such as that between fingertips."""
+        """Return True if the joint leads to a link that is only a frame, such as the frame between fingertips."""
         link = next(link for link in self._robot.findall("link") if link.get("name") == joint.child)
         return joint.kind == "fixed" and not self._tree.children(joint.child) and link.find("visual") is None
 
@@ -200,7 +202,7 @@ def _visual(centre: Float64, rpy: str, shape: ET.Element) -> ET.Element:
 
 
 def _names(file: Path) -> Iterator[str]:
-    """Yield names for a copy, until the caller finds an unused one."""
+    """Yield file names for a copy, from which the caller uses the first that is free."""
     yield file.name
     yield f"{file.parent.name}_{file.name}"
     for number in itertools.count(2):
@@ -208,7 +210,7 @@ def _names(file: Path) -> Iterator[str]:
 
 
 def _places(source: Path, named: str) -> Iterator[Path]:
-    """Yield paths at which a mesh of the URDF `source` may be: beside it, or in its package above or beside."""
+    """Yield paths at which a mesh of the URDF `source` may be: next to it, or in its package above it or next to it."""
     scheme, separator, rest = named.partition("://")
     folder = source.resolve().parent
     if not separator:

@@ -1,4 +1,6 @@
-"""Home and ready poses for a robot of which only the URDF is known: clear of itself and of the table."""
+"""Home and ready poses for a robot of which only the URDF is known, in which it touches neither itself nor the
+table.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ _NEAR, _ALIKE = 0.02, 1e-3  # [m], cosine: tolerances for two arms that mirror e
 
 
 def rest_posture(lower: Float64, upper: Float64) -> Float64:
-    """Return zero, or the nearest value with a margin of a twentieth of the range to both limits."""
+    """Return zero, or the nearest value whose distance to both limits is at least a twentieth of the range."""
     return np.clip(np.zeros_like(lower), *_inner_range(lower, upper))
 
 
@@ -39,7 +41,7 @@ def _inner_range(lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
 
 
 class PostureSearch:
-    """Search for postures of the robot's arms; all other groups, and grippers, stay as at home."""
+    """Search for postures of the robot's arms; all other groups, and grippers, stay at their home values."""
 
     def __init__(self, robot: Robot, tree: Urdf) -> None:
         self._robot = robot
@@ -78,7 +80,7 @@ class PostureSearch:
         return best
 
     def _plain(self, q: Float64, home: Float64, fewest: int) -> Float64:
-        """Return the posture with every joint reset to home if this adds no touching pair."""
+        """Return the posture after moving every joint back to home for which this adds no touching pair."""
         for dim in self._dims():
             tried = q.copy()
             tried[dim] = home[dim]
@@ -89,7 +91,9 @@ class PostureSearch:
         return q
 
     def ready(self, home: Float64) -> Float64:
-        """Return a posture with every arm over its side of the table, fingers down; as at home if none is reachable."""
+        """Return a posture with every arm over its side of the table, fingers down; an arm that cannot reach it is at
+        home.
+        """
         ready = home.copy()
         for arm in self._arms:
             found = self._mirrored(arm, ready)
@@ -99,7 +103,7 @@ class PostureSearch:
         return ready
 
     def touching(self, poses: dict[str, Float64]) -> tuple[tuple[str, str], ...]:
-        """Return the pairs that touch at these postures."""
+        """Return the pairs of links that touch at one of these poses."""
         found = {
             pair
             for q in poses.values()
@@ -109,12 +113,14 @@ class PostureSearch:
         return tuple(sorted(found))
 
     def _touching(self, q: Float64) -> NDArray[np.intp]:
-        """Return the number of pairs that are too close, plus that of arms that are too low [...]."""
+        """Return the number of pairs that are too close plus the number of arms that are too low, for postures [...,
+        D].
+        """
         near = (self._clearance.distances(q) < CLEAR).sum(axis=-1)
         return np.asarray(near + (self._heights(q) < _LOWEST).sum(axis=-1))
 
     def _heights(self, q: Float64) -> Float64:
-        """Return the heights of the fingertips over the table [..., arms]; they are not checked as pairs."""
+        """Return the heights of the fingertips over the table [..., arms], which are not among the checked pairs."""
         return (
             np.stack([self._tips(arm, q)[..., 2, 3] for arm in self._arms], axis=-1) if self._arms else _NONE
         )
@@ -133,9 +139,10 @@ class PostureSearch:
         return bool(self._apart(way).min() >= min(MARGIN, float(self._apart(home))) and high.all())
 
     def _search(self, arm: Group, start: Float64, home: Float64) -> Float64:
-        """Return the best posture of one arm with a clear straight path from home; `start` if none is found.
+        """Return the best posture found for one arm that a straight path from home reaches clear of collisions.
 
-        Cross-entropy method: sample, keep the best, sample around them; restarted from random centres.
+        `start` if none is found. Cross-entropy method: sample postures, keep the best, sample around them; restarted
+        from random centres.
         """
         for _ in range(_STARTS):
             best = self._refined(arm, start, home)
@@ -163,8 +170,9 @@ class PostureSearch:
         return np.asarray(best.round(3))
 
     def _costs(self, arm: Group, q: Float64, home: Float64) -> Float64:
-        """Return the cost of postures: position and direction of the fingertips, joints near limits, distance
-        from home.
+        """Return the cost of postures.
+
+        It depends on position and direction of the fingertips, on joints near limits, and on the distance from home.
         """
         at = self._tips(arm, q)
         wanted = np.array([self._side(arm) * _ASIDE, _AHEAD, _HEIGHT])
@@ -178,7 +186,7 @@ class PostureSearch:
         return np.asarray(away + 4 * upright + 4 * tight + turned)
 
     def _obstacles(self, q: Float64, home: Float64) -> Float64:
-        """Return a cost for the depth of collisions, or of fingertips too low, at the posture and on the path to it."""
+        """Return a cost for how deep links collide, or fingertips are too low, at the posture and on the path to it."""
         way = home + _LOOKED_AT[:, None, None] * (q - home)
         deep = np.maximum(2 * CLEAR - self._apart(way), 0.0) + np.maximum(
             _LOWEST - self._heights(way), 0.0
@@ -196,8 +204,9 @@ class PostureSearch:
         return 1.0 if x > _NEAR else -1.0
 
     def _mirrored(self, arm: Group, q: Float64) -> Float64:
-        """Return the postures [..., D] with this arm mirroring the first one, within its limits, if they are
-        mirrored.
+        """Return the postures [..., D] with this arm as the mirror image of the first one, within its limits.
+
+        They are unchanged if the two arms are not mirror images of each other.
         """
         if arm.name not in self._signs:
             return q
@@ -207,8 +216,10 @@ class PostureSearch:
         return found
 
     def _mirroring(self, first: Group, second: Group) -> Float64 | None:
-        """Return for each joint 1 or -1 by which values of `first` are mirrored in `second` (y inverted);
-        None if not mirrored.
+        """Return for each joint the factor, 1 or -1, by which the values of `first` become those of `second` mirrored
+        in y.
+
+        None if the arms are not mirror images of each other.
         """
         if len(first.urdf_joints) != len(second.urdf_joints):
             return None

@@ -1,4 +1,4 @@
-"""Text of a draft: robot.toml with a comment at every guess, and a README of what to verify."""
+"""Text of a draft: robot.toml with a comment at every guess, and a README with a list of things to verify."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ _LIMITS = "joints: position and velocity limits of the URDF; placeholders, as ov
 def render_robot_toml(
     sheet: RobotDraft, poses: Mapping[str, Mapping[str, Sequence[float]]], touching: Sequence[tuple[str, str]]
 ) -> str:
-    """Return the text of robot.toml; `poses` are vectors by group, `touching` pairs are ignored in collisions."""
+    """Return the text of robot.toml.
+
+    `poses` are vectors by group; `touching` are the pairs of links that the collision check is to ignore.
+    """
     lines = [
         "# Drafted from a URDF. What was guessed says so in capitals: verify it on the robot, then delete the word.",
         f"title = {_text(sheet.title)}",
@@ -109,7 +112,7 @@ def _tip(tip: Float64) -> Iterator[str]:
 
 
 def _unit(wxyz: Sequence[float]) -> list[float]:
-    """Return the quaternion normalised again after rounding."""
+    """Return the quaternion divided by its length, which rounding changed."""
     length = sum(value * value for value in wxyz) ** 0.5
     return [value / length for value in wxyz]
 
@@ -140,7 +143,7 @@ def _numbers(numbers: Iterable[float]) -> str:
 
 
 def render_readme(name: str, sheet: RobotDraft, pictures: MeshCopyReport) -> str:
-    """Return the README with a checklist of guesses to verify."""
+    """Return the text of the README, with a checklist of guesses to verify."""
     numbers = sum(len(group.numbers) for group in sheet.groups if not group.optional)
     lines = [
         f"# {sheet.title}",

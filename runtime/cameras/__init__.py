@@ -1,4 +1,6 @@
-"""Cameras that the deployment opens itself, one module per kind; they join the observations of any transport."""
+"""Cameras that the deployment opens itself, one module per kind; their pictures are added to the observations of any
+transport.
+"""
 
 # Module of each kind. It is imported only if a deployment names it.
 KINDS = {

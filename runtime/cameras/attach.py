@@ -34,7 +34,7 @@ def check(cameras: Mapping[str, Any], robot: Robot) -> None:
 def attach_cameras(source: Source, cameras: Mapping[str, Any], clock: Clock) -> Source:
     """Return `source` with these cameras added; `source` itself if there are none.
 
-    With a virtual clock only files can be played: SetupError for a live camera.
+    Raises SetupError for a live camera with a virtual clock, with which only files can be played.
     """
     if not cameras:
         return source

@@ -22,7 +22,7 @@ Offset = Annotated[int, Field(ge=0, le=8192)]
 
 
 class CameraError(TransportError):
-    """Error about a camera that cannot be opened, is lost, or sends unusable pictures; the message is the finding."""
+    """Error about a camera that cannot be opened, is lost, or sends unusable pictures; its message states the cause."""
 
 
 class CameraSettings(Settings):
@@ -94,7 +94,7 @@ class CameraHealth:
 
 
 class Camera(ABC):
-    """One camera. No method waits for the camera, whatever its state."""
+    """One camera. None of its methods waits for the device."""
 
     key: str
     kind: str
@@ -106,7 +106,7 @@ class Camera(ABC):
 
     @abstractmethod
     def latest(self) -> CapturedImage | None:
-        """Return the newest picture, again and again until there is a newer one; None before the first."""
+        """Return the newest picture, the same one until there is a newer one; None before the first."""
 
     @abstractmethod
     def health(self) -> CameraHealth:
@@ -121,10 +121,10 @@ class Camera(ABC):
         """Stop reading and wait briefly for the end. Safe to call twice."""
 
     def begin_run(self) -> None:  # noqa: B027  # not abstract: a live camera needs nothing
-        """Start a run; a file plays from its first picture."""
+        """Start a run; a camera that plays a file starts from its first picture."""
 
     def end_run(self) -> None:  # noqa: B027
-        """End the run; a file returns to its first picture."""
+        """End the run; a camera that plays a file returns to its first picture."""
 
     def faults(self) -> dict[str, int]:
         """Return the count of each fault since the start."""
@@ -137,7 +137,10 @@ NOT_LIVE = Pattern("cameras.not_live", "camera {camera} ({source}) is {condition
 def describe_camera_problems(
     cameras: Mapping[str, Mapping[str, Any]], keys: Iterable[str] | None = None
 ) -> list[str]:
-    """Return a sentence for each camera, or each of `keys`, that is not live: camera, source, condition, reason."""
+    """Return a sentence (camera, source, condition, reason) for each camera that is not live.
+
+    Only the cameras in `keys` are described if `keys` is given.
+    """
     chosen = cameras if keys is None else [key for key in keys if key in cameras]
     return [
         NOT_LIVE(camera=key, source=told["source"], condition=told["condition"], why=told["why"])

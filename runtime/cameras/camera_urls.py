@@ -1,4 +1,6 @@
-"""URLs of network cameras: their check, and passwords that come from the environment and are never recorded."""
+"""URLs of network cameras: checks, and insertion of passwords, which come from the environment and are never
+recorded.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,10 @@ def check_url(key: str, url: str, schemes: tuple[str, ...]) -> str:
 
 
 def with_password(url: str, user: str | None, variable: str | None) -> str:
-    """Return `url` with the user, and with the password of the environment variable. Raises ConfigurationError."""
+    """Return `url` with the user, and with the password in the environment variable `variable`.
+
+    Raises ConfigurationError.
+    """
     if user is None:
         return url
     name = quote(user, safe="")

@@ -1,4 +1,4 @@
-"""Video file as a camera: paced by our clock in its own thread, or step by step on a virtual clock."""
+"""Video file as a camera: played by a thread in step with our clock, or step by step on a virtual clock."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _JOIN_S = 0.3
 
 
 class FilePlayer:
-    """Pictures of a file at their due times; the next one is decoded in advance.
+    """Pictures of a file, each from its due time on; the next one is decoded in advance.
 
     Before `start`, and after `reset`, the first picture is repeated at the file's own rate with new capture times.
     """
@@ -40,12 +40,12 @@ class FilePlayer:
         self._rewind(now)
 
     def reset(self, now: float) -> None:
-        """Repeat the first picture from now on."""
+        """Return to the first picture and repeat it from `now` on."""
         self._begun, self.over = None, False
         self._rewind(now)
 
     def frame_at(self, now: float) -> CapturedImage | None:
-        """Return the newest picture that is due and not yet returned, else None.
+        """Return the newest picture that is due and was not returned yet, else None.
 
         Raises CameraError for an unreadable file.
         """
@@ -64,7 +64,7 @@ class FilePlayer:
             self._feed = None
 
     def _rewind(self, due: float) -> None:
-        """Make the first picture the next one, due at `due`."""
+        """Return to the first picture, and let it be due at `due`."""
         self.close()
         self._feed = VideoStream(file.address(self._config), self._config.open_s, self._config.read_s)
         first = self._feed.read()
@@ -89,14 +89,20 @@ class FilePlayer:
             self.over, self.due = True, math.inf
 
     def _offset(self, frame: DecodedFrame, period: float) -> float:
-        """Return its due time after the first picture [s]: by its stamp, else one period after the previous."""
+        """Return the frame's due time after the first picture [s].
+
+        It follows from the frame's stamp; without one it is `period` after the previous frame.
+        """
         if frame.stamp is None or self._first.stamp is None:
             return self.due - self._since + period
         return frame.stamp - self._first.stamp
 
 
 class FileCamera(Camera):
-    """Camera that plays a file. `threaded`: a thread decodes, so that `latest` does not wait; else `latest` does."""
+    """Camera that plays a file.
+
+    If `threaded`, a thread decodes, so that `latest` does not wait; otherwise `latest` decodes.
+    """
 
     kind = "file"
 
@@ -167,9 +173,9 @@ class FileCamera(Camera):
         return self.health().condition in (CameraCondition.LIVE, CameraCondition.ENDED)
 
     def _step(self) -> None:
-        """Publish the picture that is due; an error of the file becomes the camera's health.
+        """Publish the picture that is due; an error in the file becomes the camera's health.
 
-        A file that breaks while it plays stays lost until a run begins or ends; otherwise it would restart by itself.
+        A file that breaks while it plays remains lost until a run begins or ends; otherwise it would restart by itself.
         """
         with self._lock:
             asked, self._asked = self._asked, None

@@ -9,14 +9,20 @@ from runtime.core.types import UInt8
 
 
 class ImageTransform:
-    """Transformation of one camera's pictures. The size of the first is fixed: recordings and policies depend on it."""
+    """Transformation of one camera's pictures.
+
+    All pictures must have the size of the first one: recordings and policies depend on it.
+    """
 
     def __init__(self, settings: CameraSettings) -> None:
         self._settings = settings
         self._source: tuple[int, int] | None = None  # width, height of the first picture
 
     def __call__(self, picture: UInt8) -> UInt8:
-        """Return `picture` [H, W, 3] transformed, contiguous, read-only. Raises CameraError if it cannot be used."""
+        """Return `picture` [H, W, 3] transformed, contiguous and read-only.
+
+        Raises CameraError if the picture cannot be used.
+        """
         import cv2
 
         settings = self._settings

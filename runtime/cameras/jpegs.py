@@ -1,4 +1,4 @@
-"""Extraction of whole JPEG pictures from a byte stream, whatever a camera writes between them."""
+"""Extraction of whole JPEG pictures from a byte stream, whatever a camera sends between them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _WITHOUT_LENGTH = frozenset(
 
 
 class Jpegs:
-    """JPEG pictures found by their markers, each as soon as its last byte has arrived; part headers are not used.
+    """JPEG pictures of a stream, found by their markers, each as soon as its last byte has arrived.
 
     Boundaries, content types and lengths of parts are skipped: cameras write them wrongly or not at all. Thumbnails
-    inside a picture belong to it.
+    inside a picture are part of it.
     """
 
     def __init__(self) -> None:
@@ -31,7 +31,9 @@ class Jpegs:
         self._beside = 0  # bytes outside pictures since the last whole picture
 
     def add(self, piece: bytes) -> Iterator[bytes]:
-        """Yield the pictures that end in this piece. Raises ValueError if a picture has no end within MOST_BYTES."""
+        """Yield the pictures that are completed by `piece`. Raises ValueError if a picture has no end within
+        MOST_BYTES.
+        """
         self._head += piece[: _HEAD - len(self._head)]
         self._held += piece
         while (picture := self._whole()) is not None:
@@ -43,12 +45,12 @@ class Jpegs:
 
     @property
     def is_single(self) -> bool:
-        """True if the stream was one picture so far, without a part header before it."""
+        """True if the stream so far was exactly one picture, without a part header before it."""
         return self._pictures == 1 and self._head.startswith(_BEGIN)
 
     @property
     def is_not_mjpeg(self) -> bool:
-        """True if more bytes than headers came since the last whole picture, and none was a picture."""
+        """True if more bytes outside pictures have arrived since the last whole picture than headers can have."""
         return self._beside > _SHORTEST
 
     @property
@@ -86,7 +88,10 @@ class Jpegs:
         return None
 
     def _drop(self, until: int) -> None:
-        """Drop the bytes before a picture's start; if there is none (-1), all that cannot belong to a start."""
+        """Drop the bytes before a picture's start at `until`.
+
+        If there is no start (-1), drop all bytes that cannot be the beginning of one.
+        """
         self._begun = until >= 0
         dropped = until if self._begun else max(0, len(self._held) - len(_BEGIN) + 1)
         self._beside += dropped

@@ -1,4 +1,4 @@
-"""Live camera, read by its own thread, which opens it again when it is lost; its stream's time on our clock."""
+"""Live camera, read by a thread that opens it again when it is lost, and conversion of its time stamps to our clock."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from runtime.core.clock import Clock, ClockMap
 class StreamTime:
     """Map from one stream's stamps to our clock, by the smallest (arrival - stamp) over a window.
 
-    A stamp that goes back begins a new map; a stamp that runs ahead is itself the smallest offset. `jumps` counts both.
-    Returned times always increase, because pictures are distinguished by them.
+    A stamp that goes back begins a new map; a stamp that jumps ahead takes effect at once, because its offset is the
+    smallest. `jumps` counts both. Returned times always increase, because pictures are distinguished by them.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class StreamTime:
         self._begin()
 
     def reset(self) -> None:
-        """Begin a new map: a stream that was opened again starts with any stamp."""
+        """Begin a new map, because the stamps of a stream that was opened again start anywhere."""
         self._begin()
 
     def to_monotonic(self, stamp: float | None, arrived: float) -> float:
@@ -65,7 +65,10 @@ _JOIN_S = 0.3
 
 
 class LiveCamera(Camera):
-    """Camera of which only the newest picture is stored. `health` also detects a reader that is stuck in a driver."""
+    """Camera that is read by a thread; only its newest picture is stored.
+
+    `health` also detects a thread that is stuck in a driver.
+    """
 
     def __init__(self, key: str, kind: str, settings: CameraSettings, address: Address, clock: Clock) -> None:
         self.key, self.kind, self.shown = key, kind, address.shown
@@ -103,21 +106,21 @@ class LiveCamera(Camera):
         return health
 
     def faults(self) -> dict[str, int]:
-        """Return `camera_clock_jumped_KEY`: number of jumps of the stream's time."""
+        """Return the number of jumps of the stream's time as `camera_clock_jumped_<key>`; {} if there were none."""
         return {f"camera_clock_jumped_{self.key}": self._time.jumps} if self._time.jumps else {}
 
     def request_stop(self) -> None:
         self._ending.set()
 
     def close(self) -> None:
-        """Request the end; a thread that waits for a mute camera ends by its own deadline."""
+        """Request the end of reading; a thread that waits for a silent camera ends at its own deadline."""
         self.request_stop()
         if self._thread is not None:
             self._thread.join(_JOIN_S)
             self._thread = None
 
     def _run(self) -> None:
-        """Run the thread. No error may end it, because nothing else reads the camera."""
+        """Run the reader thread; no error may end it, because nothing else reads the camera."""
         realtime.leave_realtime()  # decoding must not delay the processes that can stop the robot
         while not self._ending.is_set():
             try:
@@ -130,7 +133,7 @@ class LiveCamera(Camera):
             self._ending.wait(self._back_off.remaining_delay(self._clock.now()))
 
     def _read_until_lost(self) -> None:
-        """Open the camera and read until it is lost. Raises CameraError."""
+        """Open the camera and read it until it is lost, which raises CameraError."""
         feed = VideoStream(self._address, self._settings.open_s, self._settings.read_s)
         try:
             self._time.reset()

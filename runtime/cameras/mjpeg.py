@@ -28,7 +28,7 @@ class Config(CameraSettings):
 
 
 def address(config: Config) -> Address:
-    """Return the address; `rw_timeout` [us] bounds each read and write. These streams carry no time of their own."""
+    """Return the camera's address; `rw_timeout` [us] bounds each read and write. These streams have no time stamps."""
     options = {"rw_timeout": str(int(max(config.open_s, config.read_s) * 1e6))}
     url = with_password(config.url, config.user, config.password_env)
     return Address(url, config.url, "mpjpeg", options, stamped=False)

@@ -1,4 +1,4 @@
-"""Explanations of camera errors, in terms on which an operator can act."""
+"""Explanations of camera errors that tell an operator what to do."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def explain_open_error(
         address: Address of the camera.
         waited: Time until the error [s].
         allowed: Deadline [s].
-        opening: True if no picture has come yet; False if a running stream broke.
+        opening: True if no picture has arrived yet; False if a running stream broke.
     """
     import av.error
 
@@ -69,7 +69,10 @@ def ended(address: Address, single: bool, stated: str) -> str:
 
 
 def undecodable_text(allowed: float, stated: str) -> str:
-    """Return one clause about data that was not a picture for `allowed` [s]; `stated` is its declared content type."""
+    """Return one clause about a stream that had no decodable picture for `allowed` [s].
+
+    `stated` is the content type that it declares.
+    """
     kind = f": parts of type {stated}, no JPEG" if _is_other(stated) else ""
     return f"what it sent for {allowed:g} s cannot be decoded{kind}"
 

@@ -1,4 +1,4 @@
-"""Camera with RTSP, its pictures over the same TCP connection."""
+"""Camera that is read by RTSP, with the pictures over the same TCP connection."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ class Config(CameraSettings):
 
 
 def address(config: Config) -> Address:
-    """Return the address: video only, over TCP, because UDP loses packets; `timeout` [us] is FFmpeg's RTSP option."""
+    """Return the camera's address with FFmpeg's options: video only, over TCP because UDP loses packets.
+
+    `timeout` [us] is FFmpeg's RTSP option.
+    """
     options = {
         "rtsp_transport": "tcp",
         "allowed_media_types": "video",

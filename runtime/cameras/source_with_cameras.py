@@ -81,7 +81,7 @@ class SourceWithCameras(Source):
         return {camera.key: self._health_dict(camera) for camera in self._cameras}
 
     def pop_events(self) -> list[Event]:
-        """Return the source's events, and one for each camera that was lost, ended, is back or cannot be opened."""
+        """Return the source's events, and one for each camera that was lost, ended, returned or cannot be opened."""
         events = self._source.pop_events()
         for camera in self._cameras:
             health, before = camera.health(), self._said.get(camera.key)
@@ -112,7 +112,7 @@ class SourceWithCameras(Source):
         return Event(kind, text, self._clock.now(), data={"camera": camera.key, **self._health_dict(camera)})
 
     def _warning(self, camera: Camera) -> Event:
-        """Return the warning that a policy receives a video instead of the robot's surroundings."""
+        """Return the warning that the policy receives a video instead of this camera's view of the robot."""
         text = _PLAYS_VIDEO(camera=camera.key, video=camera.shown)
         return Event("camera_is_a_video", text, self._clock.now(), data={"camera": camera.key})
 

@@ -1,4 +1,4 @@
-"""Open connection to one camera: decoded RGB pictures in sequence, each within a deadline."""
+"""Open connection to one camera, which returns decoded RGB pictures in sequence, each within a deadline."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PARTS = "mpjpeg"  # FFmpeg's name; its own reader refuses streams with incorrec
 
 @dataclass(frozen=True, slots=True)
 class DecodedFrame:
-    """Decoded picture uint8 [H, W, 3] RGB, with the stream's own time [s] or None."""
+    """Decoded picture uint8 [H, W, 3] RGB, with its time in the stream [s] if the stream has time stamps, else None."""
 
     picture: UInt8
     stamp: float | None
@@ -39,8 +39,8 @@ class Backlog:
     def should_skip(self, waited: float) -> bool:
         """Return True if a packet that took `waited` [s] to arrive can be skipped because newer packets are queued.
 
-        The first few are used, because two packets may arrive together; so is every hundredth, so that a stream that
-        never pauses still yields pictures.
+        The first few such packets are used, because two may arrive together; so is every hundredth, so that a stream
+        that never pauses still yields pictures.
         """
         self._waiting = self._waiting + 1 if waited < _THERE_S else 0
         return self._waiting > _AT_ONCE and self._waiting % _SHOWN != 0
@@ -49,9 +49,9 @@ class Backlog:
 class VideoStream:
     """Stream opened with PyAV, for use by one thread. Waiting happens in FFmpeg, without the interpreter lock.
 
-    FFmpeg enforces the deadlines while it waits (PyAV's `timeout`); packets that never become a picture are bounded
-    here. For JPEG pictures in multipart streams, FFmpeg only fetches the bytes. Opening raises CameraError with the
-    finding.
+    FFmpeg enforces the deadlines while it waits (PyAV's `timeout`); the time in which packets yield no picture is
+    bounded here. For JPEG pictures in multipart streams, FFmpeg only fetches the bytes. Opening raises CameraError with
+    the cause.
     """
 
     def __init__(self, address: Address, open_s: float, read_s: float) -> None:
@@ -129,12 +129,12 @@ class VideoStream:
         return DecodedFrame(picture, None if stamp is None else float(stamp))
 
     def close(self) -> None:
-        """Close the stream with its decoder now: generator and object form a cycle that is collected late."""
+        """Close the stream and its decoder explicitly: generator and object form a cycle that is collected late."""
         self._frames = iter(())
         self._container.close()
 
     def _decoded(self) -> Iterator[Any]:
-        """Yield decoded frames; packets that cannot be decoded are skipped until a picture is overdue.
+        """Yield decoded frames; packets that cannot be decoded are skipped until the deadline for a picture.
 
         The first picture may take as long as opening, because many cameras send a key frame only every few seconds.
         """
@@ -164,7 +164,7 @@ class VideoStream:
         return self._read_s if self._seen else max(self._open_s, self._read_s)
 
     def _too_large(self) -> str:
-        """Return a sentence if the newest picture is too large, else ""."""
+        """Return a sentence if a picture is too large, else ""."""
         width, height = self._stream.width, self._stream.height
         if self._stream.codec_context.name == "mjpeg" and self._newest is not None:
             import simplejpeg

@@ -1,1 +1,1 @@
-"""Deployment files: schema, loader, reference."""
+"""Deployment files: their schema, their loader, and the reference of their keys."""

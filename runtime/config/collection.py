@@ -78,7 +78,7 @@ class CollectionSettings(Settings):
         return self.primary_camera or (kept[0] if kept else "")
 
     def manifest_entry(self, cameras: tuple[str, ...]) -> dict[str, Any]:
-        """Return these settings in the form of a manifest; `cameras` are the station's."""
+        """Return these settings as a manifest has them; `cameras` are the station's."""
         kept = [key for key in cameras if self.cameras is None or key in self.cameras]
         return {
             **self.model_dump(mode="json", exclude={"leader", "max_age_s"}),
@@ -89,7 +89,7 @@ class CollectionSettings(Settings):
 
 
 def check(settings: CollectionSettings | None, cameras: tuple[str, ...]) -> None:
-    """Raise ConfigurationError if it names cameras that the station lacks."""
+    """Raise ConfigurationError if the settings name cameras that the station lacks."""
     if settings is None:
         return
     unknown = [key for key in settings.cameras or () if key not in cameras]

@@ -1,4 +1,4 @@
-"""First deployment file from a few choices: the available choices and the text of the file."""
+"""First deployment file from a few choices: the choices that there are, and the text of the file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Entry:
 
     @property
     def address(self) -> bool:
-        """Whether it is an address or similar, which has no useful default and is therefore asked first."""
+        """Whether the key is an address or similar, which has no useful default, so that its value is asked first."""
         return (
             self.required
             or self.key in ("url", "network", "master", "address", "domain", "user")
@@ -39,7 +39,7 @@ class Entry:
         )
 
     def value(self, typed: str) -> Any:
-        """Return the value of typed text. Raises ConfigurationError with the allowed values."""
+        """Convert typed text to the key's value. Raises ConfigurationError with the allowed values."""
         if self.type == "yes":
             return _one_of(self.key, typed, {"yes": True, "no": False})
         if self.type == "choice":
@@ -54,12 +54,18 @@ class Entry:
 
 
 def kinds(part: str) -> dict[str, str]:
-    """Return the kinds of a part (a key of PACKAGES), each with its description, or why it cannot be loaded here."""
+    """Return the description of each kind of a part (a key of PACKAGES).
+
+    A kind that cannot be loaded here has the reason instead.
+    """
     return {kind: _about(part, kind) for kind in variants(PACKAGES[part])}
 
 
 def entries(part: str, kind: str) -> tuple[Entry, ...]:
-    """Return the keys of a part of that kind, its own keys first. Raises ConfigurationError with the known kinds."""
+    """Return the keys of the table of a part of that kind, those that only this kind has first.
+
+    Raises ConfigurationError, which lists the known kinds.
+    """
     known = variants(PACKAGES[part])
     if kind not in known:
         raise ConfigurationError(f"{part}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
@@ -67,7 +73,7 @@ def entries(part: str, kind: str) -> tuple[Entry, ...]:
 
 
 def table(part: str, kind: str, typed: Mapping[str, str]) -> dict[str, Any]:
-    """Return the table of a part from typed text, without keys that are empty or equal to their default."""
+    """Return the table of a part with the values in `typed`, without keys that are empty or equal to their default."""
     found: dict[str, Any] = {"kind": kind}
     for entry in entries(part, kind):
         given = typed.get(entry.key, "").strip()

@@ -34,7 +34,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """Valid deployment, its canonical form and the digest of that."""
+    """Valid deployment, with its canonical form and the digest of that form."""
 
     deployment: Deployment
     tree: Mapping[str, Any]
@@ -42,7 +42,7 @@ class Resolved:
 
 
 def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
-    """Load the deployment of `path` with `key=value` assignments on top. Raises ConfigurationError.
+    """Load the deployment of `path`, changed by `key=value` assignments. Raises ConfigurationError.
 
     A `kind` is assigned before all other keys, because a new kind replaces its whole table.
     """
@@ -51,14 +51,14 @@ def load(path: Path, assignments: Sequence[str] = ()) -> Resolved:
 
 
 def tree_of(path: Path) -> dict[str, Any]:
-    """Return the content of a file merged with the files that it extends, unchecked. Raises ConfigurationError."""
+    """Return the unchecked content of a file merged over the files that it extends. Raises ConfigurationError."""
     return _read(path, ())[0]
 
 
 def apply_assignments(
     tree: dict[str, Any], origin: dict[Key, str], source: str, assignments: Sequence[str]
 ) -> Resolved:
-    """Return the deployment in `tree`, which is modified, with `key=value` assignments on top, as in `load`."""
+    """Return the deployment in `tree`, which is modified, changed by `key=value` assignments as in `load`."""
     parsed = [(*_assignment(text), f"--set {text}") for text in assignments]
     for key, value, option in sorted(parsed, key=lambda one: one[0][-1] != "kind"):
         _set_key(tree, key, value, option)
@@ -72,9 +72,10 @@ def apply_assignments(
 def resolve_deployment(
     tree: Mapping[str, Any], origin: Mapping[Key, str], source: str, unread: Collection[str] = ()
 ) -> Resolved:
-    """Check a tree of settings; `origin` names the file or option that each key came from.
+    """Return the deployment in a tree of settings after checking it.
 
-    Tables whose kinds are in one of the packages `unread` stay plain tables. Raises ConfigurationError.
+    `origin` names the file or option that each key came from, for errors. Tables whose kind is a module of one of the
+    packages in `unread` remain plain tables. Raises ConfigurationError.
     """
     try:
         deployment = Deployment.model_validate(tree, context={"unread": unread})
@@ -95,9 +96,9 @@ def config_digest(canonical: Mapping[str, Any]) -> str:
 
 
 def apply_changes(resolved: Resolved, changes: Mapping[str, Any], source: str) -> Resolved:
-    """Return `resolved` with the tables of `changes` merged on top, as those of a file that extends another.
+    """Return `resolved` with the tables of `changes` merged over it, as if a file with them extended it.
 
-    Raises ConfigurationError, which names `source` for keys of the changes.
+    Raises ConfigurationError, which names `source` as the origin of the changed keys.
     """
     tree = deepcopy(dict(resolved.tree))
     _merge(tree, deepcopy(dict(changes)))
@@ -107,8 +108,8 @@ def apply_changes(resolved: Resolved, changes: Mapping[str, Any], source: str) -
 def server_address(settings: Deployment) -> str:
     """Return host and port of the policy's server in a canonical spelling; "" for a policy without a server.
 
-    Two deployments on one machine use the same server if these are equal. Behind a tunnel it is the address at the far
-    end.
+    Two deployments on one machine use the same server if these are equal. Behind a tunnel, host and port are those at
+    the far end, followed by the tunnel's host.
     """
     policy = settings.policy
     url = urlsplit(str(getattr(policy, "url", "")))

@@ -47,7 +47,7 @@ def render_reference() -> str:
 
 
 def _tables(path: str, annotation: Any, kind: str = "") -> Iterator[str]:
-    """Yield the sections of the tables possible at `path`, one per kind, each followed by its nested tables."""
+    """Yield the sections of the tables that are possible at `path`, each followed by those of its nested tables."""
     for place, model in _models(path, annotation):
         own = _kind(model) or kind
         yield from _section(f"`[{place}]`" + (f" of kind `{own}`" if own else ""), model)
@@ -56,7 +56,7 @@ def _tables(path: str, annotation: Any, kind: str = "") -> Iterator[str]:
 
 
 def _models(path: str, annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]:
-    """Yield the models of tables that are possible at `path`."""
+    """Yield path and model of each table that is possible at `path`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield path, annotation
     elif get_origin(annotation) is dict:
@@ -67,7 +67,7 @@ def _models(path: str, annotation: Any) -> Iterator[tuple[str, type[BaseModel]]]
 
 
 def _kind(model: type[BaseModel]) -> str:
-    """Return the kind of this variant, "" for a table without variants."""
+    """Return the kind that a model of a table is for, "" if the table has no kinds."""
     field = model.model_fields.get("kind")
     return str(field.default) if field and get_args(field.annotation) == (field.default,) else ""
 
@@ -89,7 +89,7 @@ def _section(title: str, model: type[BaseModel]) -> Iterator[str]:
 
 
 def own_first(model: type[BaseModel]) -> list[tuple[str, FieldInfo]]:
-    """Return a table's own keys, then those that it shares with others."""
+    """Return a table's own keys, then those that it shares with other tables."""
     own = model.__annotations__
     return sorted(model.model_fields.items(), key=lambda key: key[0] not in own)
 
@@ -100,7 +100,7 @@ def first_line(model: type[BaseModel]) -> str:
 
 
 def _type(schema: Schema) -> str:
-    """Return a JSON schema in words."""
+    """Return the description of a JSON schema in words."""
     if "const" in schema:
         return f"`{json.dumps(schema['const'])}`"
     if "enum" in schema:
@@ -138,7 +138,9 @@ def _default(field: FieldInfo) -> str:
 
 
 def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
-    """Return the meaning of a key: its docstring, else the first line of its table's."""
+    """Return the meaning of a key: its docstring, else the first line of the docstring of the table that it
+    contains.
+    """
     for owner in model.__mro__:
         if name in inspect.get_annotations(owner) and (said := _key_docstrings(owner).get(name)):
             return " ".join(said.split())
@@ -148,7 +150,10 @@ def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
 
 @functools.cache  # cache: of sources, which do not change while this runs
 def _key_docstrings(model: type) -> dict[str, str]:
-    """Return the docstrings of a model's own keys. Read only here, so that station processes need not read sources."""
+    """Return the docstrings of a model's own keys.
+
+    They are read from the source only here, so that station processes need not do it.
+    """
     (table,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(table, ast.ClassDef)
     return {

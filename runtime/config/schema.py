@@ -339,7 +339,10 @@ class Deployment(Settings):
         return self
 
     def heartbeat_timeout_s(self, process: str) -> float:
-        """Return the silence after which `process` counts as dead [s]; shortest for those that stop the robot."""
+        """Return the time without heartbeat after which `process` counts as dead [s].
+
+        It is shortest for the processes that stop the robot.
+        """
         if process == "media":
             return self.recording.heartbeat_timeout_s
         return (

@@ -19,7 +19,9 @@ from runtime.datasets.publishing import publish
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return 0 if all is well, 1 if a check found a problem or the command was refused."""
+    """Run the command that `arguments` name; return 0 on success, 1 if a check found a problem or the command was
+    refused.
+    """
     options = _parser().parse_args(arguments)
     try:
         return int(options.run(options))
@@ -156,7 +158,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def renamed(pairs: Sequence[str]) -> dict[str, str]:
-    """Parse OLD=NEW pairs into new names by old names. Raises: RecordingError."""
+    """Parse pairs OLD=NEW; return the new name by old name. Raises: RecordingError."""
     found = [pair.partition("=") for pair in pairs]
     for old, sign, new in found:
         if not (old and sign and new):
@@ -223,7 +225,7 @@ def episodes(text: str, most: int = MOST) -> list[int]:
 
 
 def is_index(text: str) -> bool:
-    """Return True if the text is an index of an episode."""
+    """Return True if the text can be an index of an episode: at most 9 decimal digits."""
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
@@ -246,7 +248,9 @@ def _report(dataset: Path, problems: list[str]) -> int:
 
 
 def _describe_features(info: layout.Info) -> list[str]:
-    """Return lines with the inputs and outputs of a policy, which LeRobot identifies by the prefixes of names."""
+    """Return two lines with the features that a policy reads and writes, which LeRobot finds by their names'
+    prefixes.
+    """
     names = {
         "inputs": [key for key in info["features"] if key.startswith("observation")],
         "outputs": [key for key in info["features"] if key.startswith("action")],

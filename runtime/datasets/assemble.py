@@ -1,4 +1,6 @@
-"""Assembly of a new dataset from episodes of others, in either version: for convert, merge, split and delete."""
+"""Assembly of a new dataset from episodes of other datasets, in either version: for convert, merge, split and
+delete.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,7 @@ ProgressCallback = Callable[[str], None]  # receives the progress as text
 
 
 def ignore_progress(progress: str) -> None:
-    """Ignore the progress."""
+    """Do nothing; used as the callback if the caller needs no progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,10 @@ class SourceDataset:
 
     @classmethod
     def open(cls, root: Path, names: ColumnRenaming | None = None) -> SourceDataset:
-        """Open a dataset. Raises: RecordingError if there is none or the renaming does not fit."""
+        """Open the dataset in `root` with the new `names` of its features.
+
+        Raises: RecordingError if there is no dataset or the names do not fit.
+        """
         dataset = open_dataset(root)
         names = names or ColumnRenaming({})
         names.require(dataset.features)
@@ -106,7 +111,10 @@ class SourceDataset:
         return self.names.rename_keys(self.dataset.features)
 
     def episode_refs(self, indices: Sequence[int] | None = None) -> list[EpisodeRef]:
-        """Return all episodes, or those of `indices`. Raises: RecordingError if one does not exist."""
+        """Return the episodes with these indices, or all if `indices` is None.
+
+        Raises: RecordingError if an episode does not exist.
+        """
         if indices is None:
             return [EpisodeRef(self, listed.index) for listed in self.dataset.episodes]
         return [EpisodeRef(self, self.dataset.entry(index).index) for index in indices]
@@ -114,7 +122,10 @@ class SourceDataset:
 
 @dataclass(frozen=True, slots=True)
 class AssemblyResult:
-    """Result of an assembly. `encoded`: videos encoded anew; `left_out`: content that was not copied."""
+    """Result of an assembly.
+
+    `encoded` names the videos that were encoded anew, `left_out` the content that was not copied.
+    """
 
     dataset: Path
     version: str
@@ -135,7 +146,7 @@ def assemble(
 ) -> AssemblyResult:
     """Write the dataset `target` with `parts` as its episodes 0, 1, ...; it appears complete or not at all.
 
-    Rows, statistics and tasks are those of the sources. Encoded images are copied, one video per episode.
+    Rows, statistics and tasks are copied from the sources. Encoded images are copied, one video per episode.
 
     Args:
         target: Folder of the new dataset.
@@ -235,7 +246,10 @@ class _Assembly:
         self._encoded: list[str] = []
 
     def _common(self) -> dict[str, Any]:
-        """Return the keys of info.json on which all sources agree; others are reported as left out."""
+        """Return the entries of info.json that are equal in all sources.
+
+        Other entries, unless they belong to the format, are reported as left out.
+        """
         said = [source.dataset.info for source in self._sources]
         for info, source in zip(said, self._sources, strict=True):
             for key in sorted(set(info) - layout.INFO_KEYS):
@@ -246,7 +260,9 @@ class _Assembly:
         return {key: value for key, value in said[0].items() if all(one.get(key) == value for one in said)}
 
     def _splits(self) -> dict[str, str]:
-        """Return the sources' splits with the new indices; without any, all episodes are for training."""
+        """Return the sources' splits with the episodes' new indices; episodes of a source without splits are for
+        training.
+        """
         found: dict[str, list[int]] = {}
         for source in self._sources:
             named, given = {}, source.dataset.info.get("splits") or {}
@@ -267,7 +283,9 @@ class _Assembly:
         return written(found)
 
     def _episode_lines(self, lines: Sequence[Line]) -> list[Line]:
-        """Return the lines of the list of episodes, with those own keys of the sources that can be written."""
+        """Return the lines of the list of episodes, with the keys that only the sources' writers know, if they can be
+        written.
+        """
         v30 = self._info["codebase_version"] == layout.V30
         owns = [part.source.lines.get(part.index, {}) for part in self._parts]
         kept: list[Line] = [{} for _ in owns]
@@ -329,7 +347,7 @@ class _Assembly:
         return single_file_line(self._info, index, list(listed.tasks), listed.length, first)
 
     def _episode(self, part: EpisodeRef, line: Line, first: int) -> dict[str, Statistic]:
-        """Write rows and videos of one episode; return its statistics."""
+        """Write rows and videos of one episode; return the episode's statistics."""
         placed = entry(self._root, self._info, line)
         table = self._table(part, line, first)
         placed.data.parent.mkdir(parents=True, exist_ok=True)
@@ -355,7 +373,7 @@ class _Assembly:
         return [*layout.video_keys(self._features), *layout.image_keys(self._features)]
 
     def _source_statistics(self, part: EpisodeRef) -> dict[str, Statistic]:
-        """Return the source's statistics of an episode, except those that are computed anew."""
+        """Return the statistics that the source has for an episode, without those that are computed anew."""
         found = {}
         for key, statistic in part.source.statistics.get(part.index, {}).items():
             if key not in self._features or key in _PLACED:
@@ -379,7 +397,7 @@ class _Assembly:
         return column_statistics(columns, {key: self._features[key] for key in columns})
 
     def _table(self, part: EpisodeRef, line: Line, first: int) -> pa.Table:
-        """Return the rows of an episode with its new indices: exactly the declared columns."""
+        """Return the rows of an episode with its new indices, with exactly the declared columns."""
         import pyarrow as pa
 
         source, index = part.source, part.index
@@ -469,9 +487,9 @@ class _Assembly:
             shutil.copyfile(path, target)
 
     def _copy_other_files(self) -> None:
-        """Copy files beyond the format and the episodes if there is a single source; report them otherwise.
+        """Copy files that belong neither to the format nor to an episode if there is a single source; else report them.
 
-        The list of subtasks is copied from the first source, and modality.json unless features are renamed.
+        The list of subtasks is copied from the first source, and so is modality.json unless features are renamed.
         """
         first = self._sources[0]
         for source in self._sources:
@@ -494,7 +512,7 @@ class _Assembly:
                     self._left_out[str(path)] = None
 
     def _carry(self, source: SourceDataset) -> None:
-        """Copy everything of the replaced folder except the format's own files and those of episodes."""
+        """Copy all files of the replaced folder except those of the format itself and those of its episodes."""
         root = source.dataset.root
         listed = source.dataset.episodes
         known = {root / name for name in _OURS} | {root / LOCK}
@@ -518,7 +536,9 @@ class _Assembly:
 
 
 def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
-    """Return our lines by episode. Raises: RecordingError if two lines are about the same episode."""
+    """Return the lines by the index of their episode. Raises: RecordingError if two lines are about the same
+    episode.
+    """
     found = {line["episode_index"]: line for line in lines}
     if len(found) < len(lines):
         counts = Counter(line["episode_index"] for line in lines)
@@ -530,14 +550,16 @@ def _each_once(root: Path, lines: Sequence[Line]) -> dict[int, Line]:
 
 
 def _is_its_own(path: Path, root: Path) -> bool:
-    """Return True if a link leads into the dataset, or into the cache in which a hub keeps a snapshot's files."""
+    """Return True if `path` leads into the dataset, or into the cache in which a hub keeps a snapshot's files."""
     here = root.resolve()
     places = (here, here.parent.parent / "blobs")
     return any(path.resolve().is_relative_to(place) for place in places)
 
 
 def _changed(given: pa.Array, made: pa.Array) -> str:
-    """Describe the first value that a cast changed by more than float32 rounds; "" if there is none."""
+    """Return a sentence on the first value that a cast to another type changed by more than float32 rounds; "" if
+    none.
+    """
     before, after = (np.asarray(_leaves(array).to_numpy(zero_copy_only=False)) for array in (given, made))
     if before.dtype == after.dtype or not all(
         np.issubdtype(one.dtype, np.number) or one.dtype == bool for one in (before, after)
@@ -577,7 +599,7 @@ def _is_json(values: Sequence[Any]) -> bool:
 
 
 def _folders(source: SourceDataset) -> set[str]:
-    """Return the folders of a dataset whose contents belong to episodes."""
+    """Return the names of a dataset's folders that contain only files of the format and of episodes."""
     root = source.dataset.root
     listed = source.dataset.episodes
     files = [path for one in listed for path in (one.data, *(span.path for span in one.videos.values()))]
@@ -585,7 +607,9 @@ def _folders(source: SourceDataset) -> set[str]:
 
 
 def _of_three(statistic: Statistic) -> Statistic:
-    """Repeat the figures of a single channel three times: readers of v2.1 refuse any other number."""
+    """Return a statistic with the single channel's figures repeated three times: readers of v2.1 refuse other
+    numbers.
+    """
     figures = (name for name in statistic if name != "count")
     return statistic | {name: (statistic[name] * 3)[:3] for name in figures}
 
@@ -593,5 +617,5 @@ def _of_three(statistic: Statistic) -> Statistic:
 def _fill_statistics(
     given: Mapping[str, Statistic], computed: Mapping[str, Statistic]
 ) -> dict[str, Statistic]:
-    """Return the given figures, completed from those computed for each column."""
+    """Return the statistic of each column: figures of `given`, and the computed ones for those that are missing."""
     return {key: {**statistic, **given.get(key, {})} for key, statistic in computed.items()}

@@ -1,4 +1,4 @@
-"""Metadata of a dataset under publication: the committed state, and the state with one more episode."""
+"""Metadata of a dataset under publication: as committed, and as it will be with one more episode."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from runtime.datasets.stats import Statistic, aggregate_statistics, fault
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """info.json and the lists of the metadata, without entries that info.json does not count yet.
+    """Contents of info.json and of the metadata's lists, without entries that info.json does not count yet.
 
     info.json is written last, so its `total_episodes` decides which episodes belong to the dataset.
     """
@@ -40,7 +40,10 @@ class Catalog:
 
     @classmethod
     def read(cls, root: Path) -> Catalog:
-        """Read the catalog committed in `root`. Raises: RecordingError if incomplete or of a read-only version."""
+        """Read the catalog that is committed in `root`.
+
+        Raises: RecordingError if it is incomplete or of a version that cannot be written.
+        """
         if not (root / layout.INFO).exists():
             return cls(root, {}, (), (), (), ())
         info = layout.read_info(root)
@@ -104,14 +107,17 @@ class Catalog:
         return sum(line["length"] for line in self.episodes[:episode_index])
 
     def task_index(self, task: str) -> int:
-        """Return the index of `task`, a new one if the dataset does not have the task."""
+        """Return the index of `task`; if the dataset does not have the task, the next free index."""
         for line in self.tasks:
             if line["task"] == task:
                 return int(line["task_index"])
         return max((int(line["task_index"]) for line in self.tasks), default=-1) + 1
 
     def require_same(self, robot: str, fps: float, features: Features) -> None:
-        """Check that such an episode fits. Raises: RecordingError with every difference."""
+        """Check that an episode with these properties fits the dataset.
+
+        Raises: RecordingError, whose message names every difference.
+        """
         if not self.info:
             return
         found = [
@@ -127,13 +133,13 @@ class Catalog:
             raise RecordingError(f"{self.root} holds other data: {'; '.join(found)}. Publish elsewhere")
 
     def with_info(self, robot: str, fps: float, features: Features, version: str) -> Catalog:
-        """Return the catalog with an info.json: the existing one, or a new one."""
+        """Return the catalog with its info.json; if there is none yet, with a new one that has these properties."""
         if self.info:
             return self
         return replace(self, info=new_info({}, robot=robot, fps=fps, features=features, version=version))
 
     def line(self, index: int, tasks: Sequence[str], length: int) -> Line:
-        """Return the line of episode `index` in the list of episodes: its files and its content."""
+        """Return the line of episode `index` for the list of episodes: its tasks, its length, and its files in v3.0."""
         if index < len(self.episodes):
             return self.episodes[index] | {"tasks": list(tasks), "length": length}
         last = self.episodes[-1] if self.episodes else {}
@@ -142,7 +148,9 @@ class Catalog:
         return made | {"episode_index": index} | (lists if self.version == layout.V30 else {})
 
     def _next_file(self) -> int:
-        """Return the number of the next file: in v3.0 after all existing files, in v2.1 that of the episode."""
+        """Return the number of the new episode's file: in v3.0 the next after all files, in v2.1 the episode's
+        index.
+        """
         size = int(self.info.get("chunks_size") or layout.CHUNKS_SIZE)
         taken = [
             int(line[name]) * size + int(line[name.replace("chunk_index", "file_index")])
@@ -153,7 +161,10 @@ class Catalog:
         return max(taken, default=len(self.episodes) - 1) + 1
 
     def entry(self, line: Line) -> EpisodeEntry:
-        """Return the files of an episode. Raises: RecordingError if they hold others too, as those stay unchanged."""
+        """Return the files of the episode of `line`.
+
+        Raises: RecordingError if they also contain other episodes, because such files must not change.
+        """
         made = entry(self.root, self.info, line)
         if not made.shared or made.index == len(self.episodes):
             return made
@@ -204,7 +215,11 @@ class Catalog:
         }
 
     def documents_before_data(self) -> dict[str, bytes]:
-        """Return files that may name more than exists; an existing modality.json is kept, as users may edit it."""
+        """Return the content by name of the files that are written before the data, since they may list more than
+        exists.
+
+        An existing modality.json is left as it is, because users may edit it.
+        """
         v30 = self.version == layout.V30
         documents = (
             {layout.TASKS_V30: parquet_lists.tasks_file(self.tasks)}
@@ -217,7 +232,8 @@ class Catalog:
         return documents
 
     def documents_after_data(self) -> dict[str, bytes]:
-        """Return files that declare the content, in the order of writing; info.json is the last.
+        """Return the content by name of the files that declare the data, in the order of writing; info.json is the
+        last.
 
         Raises:
             RecordingError: Statistics cannot be written or aggregated; names the episode and the feature.
@@ -251,7 +267,7 @@ class Catalog:
 
 
 def single_file_line(info: layout.Info, number: int, tasks: Sequence[str], length: int, first: int) -> Line:
-    """Return the line of episode `number` in files of its own; its rows start at `first`."""
+    """Return the line of an episode whose files, with number `number`, contain no other; its rows start at `first`."""
     line: Line = {"episode_index": number, "tasks": list(tasks), "length": length}
     if info["codebase_version"] != layout.V30:
         return line
@@ -280,7 +296,7 @@ def new_info(
     features: Mapping[str, Mapping[str, Any]],
     version: str,
 ) -> dict[str, Any]:
-    """Return info.json of a dataset without episodes; keys of `given` beyond the format are added."""
+    """Return info.json of a dataset without episodes; keys of `given` that the format does not define are added."""
     v30 = version == layout.V30
     info: dict[str, Any] = {
         "codebase_version": version,
@@ -306,7 +322,7 @@ def new_info(
 
 
 def modality(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return GR00T's meta/modality.json: parts of state and action by actuator group, cameras, task.
+    """Return GR00T's meta/modality.json: the parts of state and action by actuator group, the cameras and the task.
 
     {} if the dataset has no state or action under the usual names, or their dimensions have no names.
     """
@@ -323,7 +339,9 @@ def modality(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _groups(names: list[str]) -> dict[str, dict[str, int]]:
-    """Return slices of a vector, grouped by the part of the dimensions' names before the last dot."""
+    """Return start and end of each group of dimensions; a group is the part of a dimension's name before the
+    last dot.
+    """
     groups: dict[str, dict[str, int]] = {}
     for position, name in enumerate(names):
         group = groups.setdefault(name.rpartition(".")[0] or "robot", {"start": position, "end": position})

@@ -28,7 +28,7 @@ class ColumnRenaming:
         return self.new_by_old.get(old, old)
 
     def old_name(self, new: str) -> str:
-        """Return the previous name of `new`."""
+        """Return the old name of the column whose new name is `new`."""
         return next((old for old, name in self.new_by_old.items() if name == new), new)
 
     def rename_keys(self, mapping: Mapping[str, Value]) -> dict[str, Value]:
@@ -36,7 +36,7 @@ class ColumnRenaming:
         return {self.new_name(key): value for key, value in mapping.items()}
 
     def require(self, features: Mapping[str, object]) -> None:
-        """Check that such features can be renamed. Raises: RecordingError."""
+        """Check that the columns of `features` can be renamed without a conflict. Raises: RecordingError."""
         for old, new in self.new_by_old.items():
             if old not in features:
                 raise RecordingError(f"there is no feature {old!r} to rename, there are {sorted(features)}")

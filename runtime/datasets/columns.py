@@ -44,7 +44,7 @@ TIMESTAMP_TOLERANCE = (
 
 
 def column_features(journal: FinishedEpisode, with_success: bool) -> Features:
-    """Return the declared features of the episode's columns, without its videos."""
+    """Return the declared features of all columns of an episode; videos are not among them."""
     robot = journal.manifest["robot"]
     features: Features = {
         "observation.state": vector(robot["joint_names"]),
@@ -78,7 +78,7 @@ def _later(journal: FinishedEpisode) -> list[str]:
 
 
 def without_later(features: Features, known: Collection[str]) -> Features:
-    """Return `features` without those flags of LATER_FLAGS that a dataset with the features `known` lacks."""
+    """Return `features` without those of LATER_FLAGS that are missing in the features `known` of an older dataset."""
     return {
         key: feature
         for key, feature in features.items()
@@ -88,7 +88,7 @@ def without_later(features: Features, known: Collection[str]) -> Features:
 
 
 def recorded_columns(journal: FinishedEpisode, features: Mapping[str, Feature]) -> Columns:
-    """Return the columns of `features` that the journal holds or that follow from the grid.
+    """Return the values of those columns in `features` that the journal contains or that follow from the grid.
 
     Non-finite numbers in observations become 0 and their rows are flagged.
 
@@ -122,7 +122,7 @@ def recorded_columns(journal: FinishedEpisode, features: Mapping[str, Feature]) 
 def position_columns(
     columns: Columns, *, episode_index: int, first_index: int, task_index: int, success: bool | None
 ) -> Columns:
-    """Return `columns` and those that depend on the episode's position; `success` None: without that column."""
+    """Return `columns` with the columns of indices added, and with the success column unless `success` is None."""
     frames = len(columns["frame_index"])
     placed = columns | {
         "episode_index": np.full(frames, episode_index, dtype=np.int64),
@@ -137,7 +137,7 @@ def position_columns(
 def timestamps(frames: int, fps: float) -> NDArray[np.float32]:
     """Return frame / fps as float32 [N].
 
-    float32 is too coarse for LeRobot's check of neighbouring rows after about 17 minutes.
+    After about 17 minutes float32 is too coarse for LeRobot's check that the steps between rows are even.
 
     Raises:
         RecordingError: LeRobot would refuse the timestamps as uneven.
@@ -168,10 +168,10 @@ def table(columns: Columns, features: Mapping[str, Feature]) -> pa.Table:
 
 
 def column_statistics(columns: Columns, features: Mapping[str, Feature]) -> dict[str, Statistic]:
-    """Return the statistics of every stored column that has any.
+    """Return the statistics of every stored column that can have them.
 
-    Strings have none. A column with "image" in its name gets none either: LeRobot treats such an entry as one of
-    images and refuses the dataset if its shape differs.
+    Strings cannot. A column with "image" in its name gets none either: LeRobot treats such an entry as one of images
+    and refuses the dataset if its shape differs.
     """
     statistics = {}
     for key, feature in stored_features(features).items():

@@ -49,12 +49,12 @@ _ROUNDING = 2.0**-24  # relative rounding error of single precision
 
 
 class _Remark(str):
-    """Remark on a finding that is not damage."""
+    """Sentence about something in a dataset that is unusual without being damage."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Findings, one sentence each: `problems` contradict the metadata, `remarks` are not damage."""
+    """Result of a check, in sentences: `problems` contradict the metadata, `remarks` are not damage."""
 
     problems: list[str]
     remarks: list[str]
@@ -66,7 +66,7 @@ def check(dataset: Path) -> list[str]:
 
 
 def check_with_remarks(dataset: Path) -> CheckResult:
-    """Do as `check`, and return remarks as well."""
+    """Return the contradictions that `check` finds, and also remarks."""
     said = _problems(Path(dataset))
     return CheckResult(
         [one for one in said if not isinstance(one, _Remark)],
@@ -132,7 +132,9 @@ def _splits(info: layout.Info, listed: set[int]) -> Iterator[str]:
 
 
 def _places(info: layout.Info, episodes: list[Line]) -> Iterator[str]:
-    """Yield contradictions in v3.0's list of episodes, whose rows and videos must follow each other."""
+    """Yield contradictions in v3.0's list of episodes: rows must follow each other, and videos must be as long as
+    rows.
+    """
     first = 0
     for line in episodes:
         given = line["dataset_from_index"], line["dataset_to_index"]
@@ -237,7 +239,7 @@ def _timestamps(table: pa.Table, info: layout.Info) -> Iterator[str]:
 
 
 def _values(table: pa.Table, info: layout.Info) -> Iterator[str]:
-    """Yield columns with values that no loader converts to numbers: null, infinite, of another type."""
+    """Yield a sentence per column with values that no loader converts to numbers: null, infinite, of another type."""
     for key, feature in stored_features(info["features"]).items():
         if key not in table.column_names or feature["dtype"] in ("image", LANGUAGE):
             continue
@@ -372,10 +374,11 @@ def _column_statistic(
 def is_rounding_error(
     name: str, given: np.ndarray[Any, Any], value: np.ndarray[Any, Any], known: np.ndarray[Any, Any]
 ) -> bool:
-    """Return True if single precision explains a difference: LeRobot sums float32, with variance E[x^2] - E[x]^2.
+    """Return True if LeRobot's use of single precision explains the difference between two statistics.
 
-    Source: the sum of n numbers in sequence has an error of at most n u sum|x|, u = 2^-24 (Higham, Accuracy and
-    Stability of Numerical Algorithms, 2002, section 4.2). The variance has three such factors.
+    LeRobot sums float32, with variance E[x^2] - E[x]^2. Source: the sum of n numbers in sequence has an error of at
+    most n u sum|x|, u = 2^-24 (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section 4.2). The variance
+    has three such factors.
     """
     share = len(known) * _ROUNDING
     if name == "mean":
@@ -408,7 +411,9 @@ def _video(span: Span, key: str, info: layout.Info, length: int) -> Iterator[str
 
 
 def _uncounted_files(root: Path, info: layout.Info, entries: list[EpisodeEntry]) -> Iterator[str]:
-    """Yield data files of episodes that are not counted: LeRobot reads every parquet file below data/."""
+    """Yield a sentence per data file that belongs to no counted episode: LeRobot reads every parquet file below
+    data/.
+    """
     cut_off, total = publishing(root), int(info["total_episodes"])
     counted = {listed.data for listed in entries if listed.index != cut_off or listed.index < total}
     for path in sorted((root / "data").rglob("*.parquet")):

@@ -15,7 +15,7 @@ from runtime.datasets.layout import Info, Line
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Location of the images of one episode and camera."""
+    """Location of the images of one camera in one episode."""
 
     path: Path
     start: float | None = None  # time of the first image [s]; None: the file has only this episode
@@ -23,7 +23,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeEntry:
-    """One episode as the metadata list it."""
+    """One episode with its files, as the metadata list it."""
 
     index: int
     length: int  # rows
@@ -39,7 +39,7 @@ def episode_lines(root: Path, info: Info) -> list[Line]:
     An episode whose publication is in progress or was interrupted is excluded.
 
     Raises:
-        RecordingError: The list has other episodes than info.json counts, so that some would be lost silently.
+        RecordingError: The list does not have the episodes that info.json counts, so that some would be lost unnoticed.
     """
     v30 = info["codebase_version"] == layout.V30
     path = root / (parquet_lists.EPISODES_FOLDER if v30 else layout.EPISODES)
@@ -65,7 +65,7 @@ def episode_lines(root: Path, info: Info) -> list[Line]:
 
 
 def of_episodes(lines: Iterable[Line], episodes: Iterable[Line]) -> list[Line]:
-    """Return those of `lines` that are about one of `episodes`, ordered by index."""
+    """Return the lines that are about one of `episodes`, ordered by index."""
     listed = {_index(line) for line in episodes}
     return sorted((line for line in lines if _index(line) in listed), key=_index)
 
@@ -75,7 +75,7 @@ def _index(line: Line) -> int:
 
 
 def publishing(root: Path) -> int | None:
-    """Return the episode whose publication is in progress or was interrupted; None if there is none."""
+    """Return the index of the episode whose publication is in progress or was interrupted; None if there is none."""
     path = root / layout.PUBLISHING_PLAN
     try:
         index = layout.read_json(path).get("episode_index")
@@ -126,12 +126,14 @@ _PLACES = re.compile(
 
 
 def own_keys(line: Line) -> Line:
-    """Return the keys of a line of the list of episodes beyond the format, known only to its writer."""
+    """Return the entries of an episode's line that the format does not define, whose meaning only their writer
+    knows.
+    """
     return {key: line[key] for key in line if key not in _OF_FORMAT and not _PLACES.fullmatch(key)}
 
 
 def entry(root: Path, info: Info, line: Line) -> EpisodeEntry:
-    """Return the entry of a line of the list of episodes. Raises: RecordingError if the line is incomplete."""
+    """Return the entry of the episode of `line`. Raises: RecordingError if the line is incomplete."""
     v30 = info["codebase_version"] == layout.V30
     try:
         index = int(line["episode_index"])

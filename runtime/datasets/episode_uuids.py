@@ -40,7 +40,8 @@ def copy_with_uuids(
     reencode: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> Dataset:
-    """Return the dataset at `target`, with a uuid for each episode: a copy, or `dataset` itself if both are one folder.
+    """Return the dataset at `target` with a uuid for each episode: a copy of `dataset`, or itself if both are one
+    folder.
 
     A copy keeps the version, except that v2.0 becomes v2.1; it appears complete or not at all. An existing `target` is
     used if its episodes have the same uuids.
@@ -71,14 +72,14 @@ def copy_with_uuids(
 
 
 def uuids_of(dataset: Path) -> dict[int, str]:
-    """Return the uuid of each episode that has one, by index."""
+    """Return by index the uuid of each episode that has one."""
     return {int(line["episode_index"]): str(line["uuid"]) for line in _recorded_lines(dataset)}
 
 
 def content_uuid(dataset: Dataset, index: int, place: int | None = None) -> str:
-    """Return a uuid derived from the episode's content: columns by name, tasks, encoded images. Raises: RecordingError.
+    """Return a uuid derived from the episode's content: columns by name, tasks, encoded images.
 
-    `place`: index of the episode in a copy without gaps.
+    `place` is the index that the episode has in a copy without gaps, None if it is `index`. Raises: RecordingError.
     """
     entry, table = dataset.entry(index), dataset.table(index)
     stored = layout.image_keys(dataset.features)
@@ -120,7 +121,7 @@ def _digest(parts: Iterable[bytes]) -> str:
 
 
 def _identity_of_numbers(dataset: Dataset, index: int, place: int) -> str:
-    """Return the uuid that earlier versions assigned, derived only from columns of floats."""
+    """Return the uuid that earlier versions assigned to an episode; only its columns of floats decide it."""
     digests = []
     table = dataset.table(index)
     for name in table.column_names:
@@ -163,7 +164,7 @@ def _copy(
 
 
 def _name(root: Path, sources: Mapping[int, tuple[Dataset, int]] | None = None) -> None:
-    """Write a line for each episode without one; `sources`: the episode that each was copied from."""
+    """Write a line with a uuid for each episode that has none; `sources` has the episode that each was copied from."""
     dataset, told = open_dataset(root), {int(line["episode_index"]): line for line in _recorded_lines(root)}
     lines = []
     for entry in dataset.episodes:
@@ -214,7 +215,10 @@ def _recorded_lines(root: Path) -> list[dict[str, Any]]:
 
 
 def _names_episode(line: Mapping[str, Any]) -> bool:
-    """Return True if the line has a valid uuid: it becomes a folder's name and comes from a foreign dataset."""
+    """Return True if the line has a valid uuid.
+
+    The uuid comes from a foreign dataset and becomes the name of a folder.
+    """
     try:
         return "episode_index" in line and str(UUID(line["uuid"])) == line["uuid"]
     except (AttributeError, KeyError, TypeError, ValueError):

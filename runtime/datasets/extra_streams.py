@@ -16,7 +16,7 @@ from runtime.datasets.reader import Dataset
 
 
 class _Kind(NamedTuple):
-    """Origin of a recorded stream: its keys in a mapping and in an episode, and candidate names of its column."""
+    """Kind of extra stream: its attributes in a mapping and in an episode, and candidate names of its column."""
 
     mapped: str
     read: str
@@ -34,7 +34,7 @@ _POSES = ("eef", "eef_action")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtraStreams:
-    """Vectors [N, W] and columns by stream, the names of poses, and why others are left out."""
+    """Vectors [N, W] and column name by stream, the poses' dimension names, and why other streams are left out."""
 
     vectors: Mapping[str, Float32]
     columns: Mapping[str, str]
@@ -42,7 +42,7 @@ class ExtraStreams:
     left_out: Sequence[str]
 
     def row(self, index: int) -> dict[str, Any]:
-        """Return the vectors of one row, for a Row; None for a vector without any known value."""
+        """Return the vectors of row `index` by stream, as arguments of a Row; a vector of only NaN becomes None."""
         given = {stream: vectors[index] for stream, vectors in self.vectors.items()}
         return {stream: None if np.isnan(vector).all() else vector for stream, vector in given.items()}
 
@@ -94,7 +94,10 @@ def _pose_names(dataset: Dataset, column: str, others: Sequence[str]) -> list[st
 
 
 def _read(dataset: Dataset, index: int, state: str, kind: _Kind, column: str, width: int) -> Float32:
-    """Read the column's rows, as wide as the poses' names or, without names (0), as the state."""
+    """Return the values of `column` in episode `index`. Raises: RecordingError if its rows have another width.
+
+    The required width is `width`, or that of the state if `width` is 0.
+    """
     episode = dataset.episode(
         index,
         ColumnMapping.model_validate({"state": state, "action": None, "videos": {}, kind.mapped: column}),

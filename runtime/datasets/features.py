@@ -58,7 +58,7 @@ def video(height: int, width: int, fps: float, codec: str, pixels: str) -> Featu
 
 
 def whole_rate(fps: float) -> int | float:
-    """Return a whole rate as int, which other readers expect."""
+    """Return a rate without a fractional part as int, which other readers expect."""
     return int(fps) if float(fps).is_integer() else float(fps)
 
 
@@ -68,7 +68,7 @@ def stored_features(features: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapp
 
 
 def picture_size(feature: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Return declared height, width and channels, in whichever order they are declared.
+    """Return declared height, width and channels, whatever the order in which they are declared.
 
     Raises:
         RecordingError: The shape does not have three axes.
@@ -94,7 +94,7 @@ def is_depth(feature: Mapping[str, Any]) -> bool:
 
 
 def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes that a feature's minimum, maximum, mean and standard deviation may have."""
+    """Return the shapes that minimum, maximum, mean and standard deviation of a feature may have."""
     if feature["dtype"] in ("video", "image"):
         return ((3, 1, 1), (1, 1, 1)) if is_depth(feature) else ((3, 1, 1),)
     shape = tuple(feature["shape"]) or (1,)
@@ -102,7 +102,7 @@ def figure_shapes(feature: Mapping[str, Any]) -> tuple[tuple[int, ...], ...]:
 
 
 def shape_problem(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) -> str:
-    """Return a sentence if rows of several axes differ from the declared shape, else ""."""
+    """Return a sentence if rows of several axes, of shape `found`, differ from the declared shape, else ""."""
     declared = list(feature["shape"])
     if len(declared) < 2 or not found or list(found) == declared:
         return ""
@@ -110,7 +110,7 @@ def shape_problem(key: str, feature: Mapping[str, Any], found: tuple[int, ...]) 
 
 
 def holds_nothing(feature: Mapping[str, Any]) -> bool:
-    """Return True for a shape with an axis of length 0: no loader reads such a column."""
+    """Return True if the shape has an axis of length 0; no loader reads such a column."""
     return 0 in list(feature["shape"])
 
 
@@ -152,7 +152,7 @@ def arrow_type(key: str, feature: Mapping[str, Any]) -> pa.DataType:
 
 
 def is_language(kind: pa.DataType) -> bool:
-    """Return True for the type of a column of LeRobot's language annotations."""
+    """Return True if it is the type of a column with LeRobot's language annotations."""
     import pyarrow as pa
 
     rows = kind.value_type if pa.types.is_list(kind) or pa.types.is_large_list(kind) else None
@@ -162,7 +162,7 @@ def is_language(kind: pa.DataType) -> bool:
 def arrow_schema(
     features: Mapping[str, Mapping[str, Any]], given: Mapping[str, pa.DataType] | None = None
 ) -> pa.Schema:
-    """Return the schema of an episode's parquet file, with metadata that tell the package `datasets` its features.
+    """Return the schema of an episode's parquet file; its metadata declare the features to the package `datasets`.
 
     Language columns get the types in `given`.
     """

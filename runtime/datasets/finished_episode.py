@@ -1,4 +1,4 @@
-"""Closed episode as publication reads it, with its columns as arrays."""
+"""Closed episode as publication reads it, with the columns of its rows as arrays."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class FinishedEpisode:
 
     @property
     def frames(self) -> int:
-        """Rows of the dataset grid; each has one image per camera."""
+        """Number of rows of the dataset grid; each row has one image per camera."""
         return self.episode.frames
 
     @property
     def cameras(self) -> Mapping[str, tuple[int, int]]:
-        """(height, width) by camera key."""
+        """Height and width of the images by camera key."""
         return self.episode.layout.cameras
 
     def has_stream(self, name: str) -> bool:
@@ -67,7 +67,10 @@ class FinishedEpisode:
         return values
 
     def finite_vectors(self, name: str) -> Float32:
-        """Return column `name` as float32 [N, W]. Raises: RecordingError naming the first non-finite row."""
+        """Return column `name` as float32 [N, W].
+
+        Raises: RecordingError, which names the first row that is not finite.
+        """
         values = self.vectors(name)
         broken = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(broken):
@@ -76,9 +79,10 @@ class FinishedEpisode:
         return values
 
     def observed(self, name: str) -> tuple[Float32, NDArray[np.bool_]]:
-        """Return column `name` as float32 [N, W], and which rows [N] had non-finite values, replaced by 0.
+        """Return column `name` as float32 [N, W] with non-finite values replaced by 0, and bool [N]: which rows had
+        them.
 
-        Rows without a value are NaN and are not marked.
+        Rows without a value are NaN and do not count as such rows.
         """
         values = self.vectors(name)
         known = np.asarray(self._column(name).is_valid().to_numpy(zero_copy_only=False), dtype=np.bool_)
@@ -87,11 +91,13 @@ class FinishedEpisode:
         return values, np.any(broken, axis=1)
 
     def flags(self, name: str) -> NDArray[np.bool_]:
-        """Return column `name` as booleans [N]; False in rows of older recorders, which did not write it."""
+        """Return column `name` as booleans [N]; in recordings of older recorders, which did not write it, all are
+        False.
+        """
         return np.asarray(self._column(name).fill_null(False).to_numpy(zero_copy_only=False), dtype=np.bool_)
 
     def scalars(self, name: str) -> np.ndarray[Any, Any]:
-        """Return column `name` as an array [N]. Raises: RecordingError if it has gaps."""
+        """Return column `name` as an array [N]. Raises: RecordingError if a row has no value."""
         column = self._column(name)
         if column.null_count:
             raise RecordingError(f"{self.folder}: {name} is missing in {column.null_count} rows")
@@ -102,7 +108,7 @@ class FinishedEpisode:
 
 
 def read_finished_episode(folder: Path) -> FinishedEpisode:
-    """Read the closed episode in `folder`. Raises: RecordingError if it is none or still open."""
+    """Read the closed episode in `folder`. Raises: RecordingError if there is no episode or it is still open."""
     episode = open_episode(folder)
     if episode.outcome is None:
         raise RecordingError(f"{folder} has no outcome.json: it is being recorded, or wants repair")

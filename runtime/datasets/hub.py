@@ -19,7 +19,8 @@ _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.
 def push(
     dataset: Path, repository: str, *, private: bool = True, tell: ProgressCallback = ignore_progress
 ) -> str:
-    """Upload `dataset` as `repository` ("owner/name"), tagged with the version of its format, for which LeRobot looks.
+    """Upload `dataset` as `repository` ("owner/name"), with a tag for the version of its format, which LeRobot looks
+    for.
 
     Files of an older upload in the folders of a dataset are replaced. The client uses its stored login.
 

@@ -1,6 +1,6 @@
-"""Import of a dataset's episode into a lab: the same numbers and images in a folder like those of its own episodes.
+"""Import of a dataset's episode into a lab: its numbers and images in a folder like those of the lab's own episodes.
 
-The dataset stays authoritative: its images are encoded anew for the folder, its numbers are copied.
+The dataset remains the original: its images are encoded anew for the folder, its numbers are copied.
 """
 
 from __future__ import annotations
@@ -39,13 +39,15 @@ ACTION = "action"
 
 @dataclass(frozen=True, slots=True)
 class SourceRobot:
-    """Facts that a dataset lacks: `state`, the column of measured joints; `robot`, the robot they belong to."""
+    """Facts that a dataset lacks: `state` is its column of measured joints, `robot` the robot that they belong to."""
 
     state: str = ""
     robot: str = ""
 
     def names(self, dataset: Dataset) -> list[str]:
-        """Return the names of the state's dimensions. Raises: RecordingError if the robot has another number."""
+        """Return the names of the state's dimensions. Raises: RecordingError if `robot` has another number of
+        joints.
+        """
         feature = dataset.features[self.state]
         width = int(feature["shape"][0])
         if self.robot:
@@ -60,7 +62,10 @@ class SourceRobot:
 
 
 def resolve_source_robot(dataset: Dataset, state: str = "", robot: str = "") -> SourceRobot:
-    """Check column and robot; find the column if none is given. Raises: RecordingError, naming valid choices."""
+    """Return column and robot after a check; without `state`, the first column with a usual name is chosen.
+
+    Raises: RecordingError, whose message names the valid choices.
+    """
     vectors = [name for name, feature in dataset.features.items() if _is_vector(feature)]
     found = state or next((name for name in STATES if name in vectors), "")
     if found not in vectors:
@@ -87,7 +92,7 @@ def import_episode(dataset: Dataset, index: int, episodes: Path, told: SourceRob
 
     Raises:
         RecordingError: The episode cannot be read or written.
-        DamagedError: The folder exists and differs from what was imported.
+        DamagedError: The folder exists and differs from the imported data.
     """
     uuid = uuids_of(dataset.root)[index]
     folder, drafts = episodes / uuid, episodes.parent / f".{IMPORTED}"
@@ -204,7 +209,7 @@ def _tick(episode: RecordedEpisode, row: int) -> ExecutedTick:
 
 
 def _action(episode: RecordedEpisode, row: int) -> Float32:
-    """Return the action of a row; NaN if the dataset has none, or one of another width than the joints."""
+    """Return the action of a row; NaN if the dataset has no action, or its width differs from that of the joints."""
     if episode.action is None or episode.action.shape != episode.qpos.shape:
         return np.full_like(episode.qpos[row], np.nan)
     return np.asarray(episode.action[row], np.float32)

@@ -1,4 +1,4 @@
-"""Folder of a LeRobot dataset: names of its files, and how to read them."""
+"""Folder of a LeRobot dataset: the names of its files, and functions that read them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ Line = dict[str, Any]  # entry of a metadata list, for one episode or task
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object in `path`. Raises: RecordingError if there is none."""
+    """Return the JSON object in `path`. Raises: RecordingError if there is no valid object."""
     try:
         content = _parse(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -59,7 +59,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the objects of a JSON Lines file, [] if it is absent. Raises: RecordingError naming an invalid line."""
+    """Return the objects of a JSON Lines file, [] if there is no file. Raises: RecordingError, which names an invalid
+    line.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -81,7 +83,9 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _parse(text: str) -> Any:
-    """Parse JSON. Raises: ValueError for a duplicate key, which readers would resolve differently."""
+    """Return the parsed JSON. Raises: ValueError for a duplicate key, because readers differ in which value
+    they use.
+    """
     try:
         return json.loads(text, object_pairs_hook=_unique)
     except RecursionError:
@@ -97,7 +101,7 @@ def _unique(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return meta/info.json of a readable dataset. Raises: RecordingError if the folder has anything else."""
+    """Return meta/info.json of a readable dataset. Raises: RecordingError if the folder does not contain one."""
     info = read_json(root / INFO)
     version = info.get("codebase_version")
     if version not in READABLE_VERSIONS:
@@ -130,7 +134,7 @@ def _is_count(value: object, least: int) -> bool:
 
 
 def _declares(feature: object) -> bool:
-    """Return True for an object with a dtype and the lengths of its axes."""
+    """Return True if the feature is an object with a dtype and the lengths of its axes."""
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
         return False
     shape = feature.get("shape")
@@ -138,7 +142,7 @@ def _declares(feature: object) -> bool:
 
 
 def resolve(root: Path, template: str, **fields: Any) -> Path:
-    """Return the file for a path template of info.json. Raises: RecordingError if it is not below `root`."""
+    """Return the file for a path template of info.json. Raises: RecordingError if it would be outside `root`."""
     try:
         relative = template.format(**fields)
     except (KeyError, IndexError, ValueError, TypeError, AttributeError) as error:

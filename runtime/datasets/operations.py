@@ -38,7 +38,7 @@ def convert(
     reencode: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> AssemblyResult:
-    """Write `dataset` as the new dataset `target` of `version`, v2.1 or v3.0; `rename`: new names of features."""
+    """Write `dataset` as the new dataset `target` of `version`, v2.1 or v3.0; `rename` has new names of features."""
     with _locked_datasets([dataset]):
         source = SourceDataset.open(Path(dataset), ColumnRenaming(dict(rename or {})))
         return assemble(target, version, source.episode_refs(), reencode=reencode, tell=tell)
@@ -62,7 +62,7 @@ def merge(
         tell: Receives the progress.
 
     Raises:
-        RecordingError: The datasets do not belong together; names every difference.
+        RecordingError: The datasets do not belong together; the message names every difference.
     """
     if not datasets:
         raise RecordingError("no datasets to merge")
@@ -80,9 +80,9 @@ def split(
     reencode: bool = False,
     tell: ProgressCallback = ignore_progress,
 ) -> list[AssemblyResult]:
-    """Write the episodes with these indices as new datasets; an episode may be in several, or in none.
+    """Write for each of `targets` a new dataset with the named episodes; an episode may be in several, or in none.
 
-    All targets are written, or none.
+    Either all targets are written or none.
 
     Raises:
         RecordingError: A target exists or an episode does not; checked before anything is written.
@@ -120,9 +120,10 @@ def delete(
     known: str = "",
     tell: ProgressCallback = ignore_progress,
 ) -> AssemblyResult:
-    """Delete episodes of `dataset`; later episodes move up. At any moment it is the old or the new dataset.
+    """Delete episodes of `dataset`; the indices of later episodes decrease.
 
-    `known`: `fingerprint` of the dataset to which the indices refer; a changed dataset is then left as it is.
+    The folder is replaced in one step, so that it always contains either the old or the new dataset. `known` is the
+    `fingerprint` of the dataset to which the indices refer; if the dataset has changed since, nothing is deleted.
 
     Raises:
         RecordingError: An episode does not exist, none would remain, or the dataset has changed.
@@ -160,7 +161,7 @@ def fingerprint(dataset: Path) -> str:
 
 
 def repair(dataset: Path) -> list[str]:
-    """Undo what a crash left incomplete; return the problems that `check` still finds, which need other means."""
+    """Undo what a crash left incomplete; return the problems that `check` still finds, which `repair` cannot solve."""
     root = Path(dataset).resolve()
     remove_drafts(root)
     _require_dataset(root)
@@ -189,9 +190,9 @@ def _unique(indices: Sequence[int]) -> Sequence[int]:
 
 @contextmanager
 def _locked_datasets(datasets: Sequence[Path]) -> Iterator[None]:
-    """Keep publishers out of `datasets` within the block.
+    """Lock `datasets` against publishers within the context.
 
-    A dataset without a lock file has never been published to, and none is created.
+    A dataset without a lock file has never been published to, and no lock file is created for it.
     """
     with ExitStack() as stack:
         for path in sorted({Path(dataset).absolute() / LOCK for dataset in datasets}):

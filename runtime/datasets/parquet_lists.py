@@ -45,7 +45,7 @@ def read_statistics(root: Path) -> list[Line]:
 
 
 def read_tasks(root: Path) -> list[Line]:
-    """Return {"task_index", "task"} for each row of meta/tasks.parquet; the task is the index of a pandas frame."""
+    """Return {"task_index", "task"} for each row of meta/tasks.parquet, whose index as a pandas frame is the task."""
     path = root / layout.TASKS_V30
     if not path.is_file():
         return []
@@ -60,7 +60,10 @@ def read_tasks(root: Path) -> list[Line]:
 
 
 def episode_files(lines: Sequence[Line], statistics: Sequence[Line]) -> dict[str, bytes]:
-    """Return the files of meta/episodes by name; each of `lines` names its file, `statistics` are added to it."""
+    """Return the content of the files of meta/episodes by name.
+
+    Each of `lines` names its file and gets the statistics of its episode added.
+    """
     by_index = {line["episode_index"]: line["stats"] for line in statistics}
     files: dict[tuple[int, int], list[Line]] = {}
     for line in lines:
@@ -83,7 +86,7 @@ def is_storable(values: Sequence[Any]) -> bool:
 
 
 def tasks_file(tasks: Iterable[Line]) -> bytes:
-    """Return meta/tasks.parquet in the form in which pandas writes a frame with the task as index."""
+    """Return the content of meta/tasks.parquet, in the form in which pandas writes a frame with the task as index."""
     import json
 
     import pyarrow as pa
@@ -118,7 +121,7 @@ def tasks_file(tasks: Iterable[Line]) -> bytes:
 
 
 def _plain(table: pa.Table) -> pa.Table:
-    """Convert times in nanoseconds, for which Python has no type, to text."""
+    """Return the table with times in nanoseconds as text, because Python has no type for them."""
     import pyarrow as pa
 
     for place, field in enumerate(table.schema):

@@ -45,7 +45,7 @@ PIXELS = "yuv420p"  # pixel format of our recorder
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Location of a published episode."""
+    """Location of a published episode, and whether it is new in the dataset."""
 
     dataset: Path
     episode_index: int
@@ -63,9 +63,9 @@ def publish(
     version: str | None = None,
     sides: Mapping[str, Path] | None = None,
 ) -> Published:
-    """Publish the episode folder `episode` into the dataset folder `dataset`, which is created if absent.
+    """Publish the episode folder `episode` into the dataset folder `dataset`, which is created if it does not exist.
 
-    An episode that is there already (by its uuid) is written again at its index. The three action streams are
+    An episode that the dataset already has (by its uuid) is written again at its index. The three action streams are
     published as a sidecar.
 
     Args:
@@ -110,7 +110,7 @@ def publish(
 
 
 def never_published(manifest: Mapping[str, object]) -> str:
-    """Return why the run of that manifest may never be published, to follow its name; "" if it may."""
+    """Return why the run with this manifest may never be published, as a clause to follow its name; "" if it may be."""
     if manifest.get("kind") == IMPORTED:
         return "was imported: the dataset that it was imported with holds it, and can be converted, merged and split"
     if manifest.get("mode") != SIMULATED:
@@ -122,7 +122,7 @@ def never_published(manifest: Mapping[str, object]) -> str:
 
 
 def _discarded(journal: FinishedEpisode) -> str:
-    """Return a sentence on the discarding of an episode, with its author; "" if it is not discarded."""
+    """Return a sentence that says who discarded the episode; "" if it is not discarded."""
     label = latest_label(journal.folder.absolute().parent.parent, str(journal.manifest["uuid"]))
     if label is None or not label.discarded:
         return ""
@@ -191,7 +191,11 @@ def _publish(
 
 
 def _with_success(journal: FinishedEpisode, catalog: Catalog, success: bool | None) -> bool:
-    """Return True if the episode gets a success column: as in the dataset, or in a new one if it is known."""
+    """Return whether the episode's success is published: if the dataset has that column, or in a new one if it is
+    known.
+
+    Raises: RecordingError if the dataset has the column and the success is not known.
+    """
     if not catalog.info:
         return success is not None
     wanted = SUCCESS in catalog.features
@@ -216,7 +220,7 @@ def _features(journal: FinishedEpisode, with_success: bool) -> declared.Features
 
 
 def _place(journal: FinishedEpisode, catalog: Catalog) -> tuple[int, bool]:
-    """Return the index of the episode, and whether it is new.
+    """Return the index for the episode, and whether it is new in the dataset.
 
     Raises:
         RecordingError: Its length has changed, which would shift the rows of later episodes.
@@ -245,7 +249,9 @@ def _stage_video(journal: FinishedEpisode, camera: str, staged: Path) -> Statist
 def _eva(
     journal: FinishedEpisode, columns: Columns, success: bool | None, result: Result | None
 ) -> dict[str, Any]:
-    """Return our own line about the episode: facts that LeRobot's files have no field for, e.g. a partial success."""
+    """Return EVA Web's own line about the episode: facts that have no field in LeRobot's files, e.g. a partial
+    success.
+    """
     manifest = journal.manifest
     told = ("station", "kind", "mode", "strategy", "started_wall", "configuration_hash", "versions")
     return {
@@ -263,7 +269,10 @@ def _eva(
 
 
 def _provenance(columns: Mapping[str, NDArray[np.generic]], flag: str, true: str, false: str) -> str | None:
-    """Return the source of a pose column in all rows, or "mixed" if its flag column differs by row."""
+    """Return the source of the poses: `true` or `false` by the flag column, "mixed" if it differs by row.
+
+    None if there is no such flag column.
+    """
     if flag not in columns:
         return None
     flags = columns[flag]

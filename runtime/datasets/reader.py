@@ -108,7 +108,7 @@ class Dataset:
         raise RecordingError(f"{self.root} has no episode {index}, there are {len(self.episodes)}: {there}")
 
     def episode(self, index: int, mapping: ColumnMapping | None = None) -> RecordedEpisode:
-        """Read episode `index`, with its columns as `mapping` names them. Raises: RecordingError."""
+        """Read episode `index` with the columns that `mapping` names. Raises: RecordingError."""
         mapping = mapping or ColumnMapping()
         listed = self.entry(index)
         cameras = self._cameras(mapping)
@@ -135,7 +135,7 @@ class Dataset:
         return self._table(self.entry(index), set(layout.image_keys(self.features)))
 
     def _table(self, listed: EpisodeEntry, images: set[str]) -> pa.Table:
-        """Return the rows of an episode, without the image columns that are not in `images`."""
+        """Return the rows of an episode with the image columns in `images` and without other image columns."""
         left_out = set(layout.image_keys(self.features)) - images
         table = read_rows(listed.data, listed.index if listed.shared else None, left_out)
         if table.num_rows != listed.length or not table.num_rows:
@@ -158,7 +158,7 @@ class Dataset:
         return np.arange(columns.rows, dtype=np.float64) / self.fps
 
     def _cameras(self, mapping: ColumnMapping) -> dict[str, str]:
-        """Return the feature with the images of each camera."""
+        """Return by camera the feature that contains its images."""
         stored = [*layout.video_keys(self.features), *layout.image_keys(self.features)]
         prefix = video_key("")
         wanted = mapping.videos
@@ -200,7 +200,7 @@ class _Columns:
         return np.asarray(flat, dtype=np.float64)
 
     def images(self, name: str, root: Path) -> StoredImages:
-        """Return the images of column `name`."""
+        """Return the images in column `name`, whose files, if any, are below `root`."""
         import pyarrow as pa
 
         if not self.has(name):
@@ -262,7 +262,7 @@ def open_dataset(root: Path | str) -> Dataset:
 
 
 def _numbered(root: Path, lines: Iterable[Mapping[str, Any]]) -> dict[int, str]:
-    """Return tasks by index. Raises: RecordingError if an index has two tasks."""
+    """Return the tasks by index. Raises: RecordingError if two tasks have the same index."""
     found: dict[int, str] = {}
     for line in lines:
         number, task = line["task_index"], line["task"]

@@ -37,18 +37,22 @@ def codec_of(video: Path) -> str:
 
 
 def copied_stream(container: av.container.OutputContainer, stream: Any) -> Any:
-    """Add a stream to `container` for the encoded images of `stream`; works without an encoder, as for AV1."""
+    """Add a stream to `container` for the encoded images of `stream`, and return it.
+
+    This needs no encoder, so that it also works for AV1.
+    """
     return container.add_stream_from_template(stream, opaque=stream.codec.canonical_name != "h264")
 
 
 def remux(source: Path, target: Path, frames: int, fps: float) -> VideoFacts:
-    """Copy the first `frames` encoded images of `source` to `target`, frame k at k / fps, index at the front.
+    """Copy the first `frames` encoded images of `source` to `target`: frame k at k / fps, with the file's index in
+    front.
 
     Nothing is encoded anew.
 
     Raises:
         RecordingError: The source has fewer frames, does not start with a key frame, or has B-frames (its decoding
-            order would differ from the order of the rows).
+        order would differ from the order of the rows).
     """
     import av
 
@@ -120,7 +124,10 @@ def cut(source: Path, target: BinaryIO, begin: float, end: float) -> float:
 
 
 def _in_order(source: Path, recorded: av.container.InputContainer, frames: int) -> Iterator[Any]:
-    """Yield the first `frames` packets. Raises: RecordingError if decoding order is not presentation order."""
+    """Yield the first `frames` packets.
+
+    Raises: RecordingError if the first is no key frame, or decoding order is not presentation order.
+    """
     newest: int | None = None
     taken = 0
     for packet in recorded.demux(recorded.streams.video[0]):

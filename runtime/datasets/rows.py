@@ -1,4 +1,4 @@
-"""Parquet files of rows: reading one episode from a file that may hold many, and writing one."""
+"""Parquet files of rows: reading one episode from a file that may contain many, and writing a file of one episode."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ EPISODE = "episode_index"
 
 
 def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -> pa.Table:
-    """Return the rows of `episode`, or all (None), without the columns in `left_out`.
+    """Return the rows of `episode`, or all rows if it is None, without the columns in `left_out`.
 
-    Only row groups that may contain the episode are read. Raises: RecordingError naming the file.
+    Only row groups that may contain the episode are read. Raises: RecordingError, which names the file.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -49,7 +49,7 @@ def read_rows(path: Path, episode: int | None, left_out: Collection[str] = ()) -
 
 
 def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, Any]:
-    """Return column `name` as an array [N, W], flattening nested lists; NaN if a row is null.
+    """Return column `name` as an array [N, W] with nested lists flattened; NaN if a row is null.
 
     Args:
         table: Rows of an episode.
@@ -57,7 +57,7 @@ def column_array(table: pa.Table, name: str, width: int = 1) -> np.ndarray[Any, 
         width: W if the column is null in all rows.
 
     Raises:
-        RecordingError: Rows differ in length or are not numbers; names the column.
+        RecordingError: Rows differ in length or are not numbers; the message names the column.
     """
     import pyarrow as pa
 
@@ -86,7 +86,7 @@ def row_shape(table: pa.Table, name: str) -> tuple[int, ...]:
     """Return the lengths of the nested lists in each row of column `name`, () for single values.
 
     Raises:
-        RecordingError: Rows differ in length; names the column.
+        RecordingError: Rows differ in length; the message names the column.
     """
     return _flattened(table.column(name).combine_chunks().drop_null(), name)[1]
 
@@ -105,7 +105,7 @@ def _flattened(flat: pa.Array, name: str) -> tuple[pa.Array, tuple[int, ...]]:
 
 
 def is_list(kind: pa.DataType) -> bool:
-    """Return True for a list type of any kind."""
+    """Return True if the type is a list, of fixed or variable length."""
     import pyarrow as pa
 
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))

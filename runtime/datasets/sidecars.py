@@ -1,4 +1,4 @@
-"""Sidecars of a dataset, which loaders ignore: action streams, annotations and reviews by episode."""
+"""Sidecars of a dataset: files by episode with action streams, annotations and reviews, which loaders ignore."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ def sidecar_paths(root: Path, uuid: str) -> dict[str, Path]:
 
 
 def read_sidecars(given: Mapping[str, Path]) -> dict[str, bytes]:
-    """Read sidecars for publication by kind ("annotations", "reviews"); JSON Lines are checked."""
+    """Return the contents of sidecar files to publish by kind ("annotations", "reviews"); JSON Lines are checked."""
     return {kind: _content(kind, Path(path)) for kind, path in given.items()}
 
 
 def attach_sidecar(dataset: Path, uuid: str, kind: str, source: Path | None) -> Path:
-    """Store the file `source` as a sidecar of the published episode `uuid`, replacing an older one; None removes it.
+    """Store the file `source` as a sidecar of the published episode `uuid`; it replaces an older one.
+
+    If `source` is None, the sidecar is removed.
 
     Raises:
         RecordingError: The episode is not in the dataset, or the file is not JSON Lines.

@@ -11,7 +11,10 @@ TRAIN = "train"  # default split of every episode, as in LeRobot
 
 
 def episodes_of(name: str, value: Any) -> list[int]:
-    """Return the indices in a split: "0:40", "0:3,5:8,9" or a list of numbers. Raises: RecordingError if invalid."""
+    """Return the indices of a split's episodes; `value` is "0:40", "0:3,5:8,9" or a list of numbers.
+
+    Raises: RecordingError if it is invalid.
+    """
     try:
         if isinstance(value, str):
             return [index for part in value.split(",") if part.strip() for index in _range(part)]
@@ -23,12 +26,15 @@ def episodes_of(name: str, value: Any) -> list[int]:
 
 
 def written(splits: Mapping[str, Iterable[int]]) -> dict[str, str]:
-    """Return splits in the form of info.json: half-open ranges, separated by commas; empty splits are omitted."""
+    """Return splits as info.json has them: half-open ranges, separated by commas; empty splits are omitted."""
     return {name: text for name, indices in splits.items() if (text := _text(sorted(set(indices))))}
 
 
 def with_more(splits: Mapping[str, Any], first: int, end: int) -> dict[str, Any]:
-    """Return `splits` with the episodes `first` to `end` (excluded) added for training. Raises: RecordingError."""
+    """Return `splits` with the episodes from `first` to before `end` added for training.
+
+    Raises: RecordingError if the present split for training is invalid.
+    """
     if first >= end:
         return dict(splits)
     known = episodes_of(TRAIN, splits.get(TRAIN, ""))

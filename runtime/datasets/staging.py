@@ -1,4 +1,4 @@
-"""Atomic writes of an episode into a dataset: a crash at any moment leaves the old contents."""
+"""Atomic writes of an episode into a dataset: a crash at any time leaves the old contents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ _HERE, _RENAME_EXCHANGE = -100, 2  # AT_FDCWD and the flag of renameat2(2)
 
 @contextmanager
 def lock_dataset(root: Path) -> Iterator[None]:
-    """Hold the writers' lock of the dataset, waiting for another writer; create the folder if needed."""
+    """Hold the writers' lock of the dataset within the context, after waiting for another writer.
+
+    The folder is created if it does not exist.
+    """
     try:
         root.mkdir(parents=True, exist_ok=True)
         descriptor = _lock(root)
@@ -41,7 +44,10 @@ def lock_dataset(root: Path) -> Iterator[None]:
 
 
 def _lock(root: Path) -> int:
-    """Lock the folder that is at `root` now, which may be exchanged while waiting; return the descriptor."""
+    """Lock the folder `root` and return the lock file's descriptor.
+
+    Another process may exchange the folder while this one waits; then the new folder is locked.
+    """
     while True:
         descriptor = os.open(root / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -51,10 +57,10 @@ def _lock(root: Path) -> int:
 
 
 def recover(root: Path) -> None:
-    """Undo an interrupted publication; the caller holds the lock.
+    """Undo an interrupted publication; the caller must hold the lock.
 
     The plan of that publication names its files. If info.json does not count the episode, they are removed, with every
-    line about it. If it does, the files stay, in either version: publishing the episode again completes it.
+    line about it. If it does, the files remain, in either version: publishing the episode again completes it.
     """
     staging = root / FOLDER
     if not staging.exists():
@@ -84,7 +90,7 @@ def _take_back(root: Path, index: int, files: list[Path]) -> None:
 
 
 def require_empty(root: Path) -> None:
-    """Check that a folder without info.json holds no foreign files. Raises: RecordingError."""
+    """Raise RecordingError if a folder without info.json contains foreign files."""
     ours = {FOLDER, LOCK, "data", "videos", "meta", "eva"}
     foreign = sorted(entry.name for entry in root.iterdir() if entry.name not in ours)
     foreign += [
@@ -100,8 +106,8 @@ def require_empty(root: Path) -> None:
 class Draft:
     """Complete new dataset: written into a hidden folder next to `target`, then moved there by one rename.
 
-    `replacing`: it is exchanged with the existing folder in one step; otherwise the target must not exist or be empty.
-    Leaving the block without `commit` removes the draft; the draft of a killed process is removed by `repair`.
+    With `replacing` it is exchanged with the existing folder in one step; otherwise the target must not exist or be
+    empty. Leaving the context without `commit` removes the draft; the draft of a killed process is removed by `repair`.
     """
 
     def __init__(self, target: Path, replacing: bool) -> None:
@@ -135,7 +141,10 @@ class Draft:
             raise RecordingError(f"{self._target} is there already and not empty: give a folder that is not")
 
     def commit(self) -> None:
-        """Sync all files and move them to the target; the replaced dataset, then in `folder`, is removed."""
+        """Sync all files and move them to the target.
+
+        A dataset that is replaced is moved to `folder`, which is removed at the end of the context.
+        """
         try:
             for path in sorted(self.folder.rglob("*")):
                 if path.is_file():
@@ -153,7 +162,9 @@ class Draft:
 
 
 def remove_drafts(target: Path) -> list[Path]:
-    """Remove drafts of `target` left by killed processes; locked ones, still being written, stay."""
+    """Remove drafts of `target` that killed processes left; drafts that are still being written are locked and
+    remain.
+    """
     removed = []
     for folder in sorted(target.absolute().parent.glob(f"{glob.escape(_draft_prefix(target))}*")):
         try:
@@ -188,9 +199,9 @@ def _exchange(one: Path, other: Path) -> None:
 
 
 class Staging:
-    """Files prepared next to the dataset's and then renamed into place, the large ones first, info.json last.
+    """Files prepared next to the dataset's files and then renamed into place: data first, info.json last.
 
-    Leaving the block without `commit` undoes everything.
+    Leaving the context without `commit` undoes everything.
     """
 
     def __init__(self, root: Path, episode_index: int, data: list[Path]) -> None:
@@ -218,14 +229,14 @@ class Staging:
         return self._folder / str(final.relative_to(self._root)).replace("/", "|")
 
     def write(self, final: Path, content: bytes) -> None:
-        """Prepare `content` for `final`."""
+        """Prepare `content` for the path `final`."""
         try:
             self.path(final).write_bytes(content)
         except OSError as error:
             raise disk_error("publishing to", self._root, error) from error
 
     def commit(self, before: dict[str, bytes], after: dict[str, bytes]) -> None:
-        """Write the documents, sync all files, then rename in the order `before`, data, `after`."""
+        """Write the documents, sync all files, then rename them: those in `before`, the data, those in `after`."""
         try:
             for name, content in (before | after).items():
                 self.path(self._root / name).write_bytes(content)

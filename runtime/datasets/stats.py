@@ -43,7 +43,7 @@ def column_statistic(values: NDArray[Any]) -> Statistic | None:
 
 
 def finite(rows: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which rows of [N, ...] are finite in all values, bool [N]."""
+    """Return bool [N]: which rows of [N, ...] have only finite values."""
     good: NDArray[np.bool_] = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
     return good
 
@@ -104,9 +104,10 @@ def video_statistic(path: Path, frames: int) -> Statistic:
 
 
 def picture_statistic(pictures: StoredImages) -> Statistic | None:
-    """Do as `video_statistic` for images stored one by one; None if all are missing or no value is finite.
+    """Return the statistic that `video_statistic` returns, for images stored one by one.
 
-    Missing images are skipped. Depth of 16 bits is scaled by 65535, floats are used unchanged.
+    None if all images are missing or no value is finite. Missing images are skipped. Depth of 16 bits is divided by
+    65535, floats are used unchanged.
     """
     there = [number for number in range(len(pictures)) if not pictures.is_missing(number)]
     sums, deep = _Histogram(), _Deep()
@@ -132,14 +133,16 @@ class _Deep:
         return self._pictures > 0
 
     def add(self, depth: NDArray[np.floating[Any]]) -> None:
-        """Add an image [H, W] in shares of the full scale."""
+        """Add an image [H, W] whose values are shares of the full scale."""
         self._pictures += 1
         statistic = column_statistic(depth.reshape(-1))
         if statistic is not None:
             self._each.append(statistic)
 
     def statistic(self) -> Statistic | None:
-        """Return the single channel three times, as LeRobot expects; None if no value is finite."""
+        """Return the statistic with the single channel repeated three times, as LeRobot expects; None if no value is
+        finite.
+        """
         if not self._each:
             return None
         together = _merge_statistics(self._each)
@@ -150,7 +153,7 @@ class _Deep:
 
 
 class _Histogram:
-    """Counts of the values 0 to 255 per channel, from which all figures follow exactly."""
+    """Counts of the values 0 to 255 per channel, from which every statistic follows exactly."""
 
     def __init__(self) -> None:
         self._pictures = 0

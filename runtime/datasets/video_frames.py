@@ -1,4 +1,4 @@
-"""Images of one episode and camera by frame number, exact with any B-frames and groups of pictures."""
+"""Images of one episode and camera by frame number, which is exact with any B-frames and groups of pictures."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ class VideoFrames(ImageSequence):
     """Frames of a video, or of a segment of it.
 
     Frames are numbered in order of presentation by a scan of the packets, never by rounded times. Reading in order
-    decodes each frame once; any other order seeks to the key frame before the wanted frame and decodes from there.
-    The newest decoded frames are cached. Raises: RecordingError, naming the file.
+    decodes each frame once; any other order seeks to the key frame before the requested frame and decodes from there.
+    The newest decoded frames are cached. Raises: RecordingError, which names the file.
     """
 
     def __init__(self, path: Path, stretch: VideoSegment | None = None) -> None:
@@ -122,7 +122,7 @@ class VideoFrames(ImageSequence):
             raise RecordingError(f"{self._path} does not start with a key frame")
 
     def _packets(self) -> Iterator[Any]:
-        """Yield the packets to number; for a segment, those from the key frame before it to its end."""
+        """Yield the packets to number: all, or for a segment those from the key frame before it to its end."""
         end = None
         if self._stretch is not None:
             self._container.seek(int(self._stretch.start / self._stream.time_base), stream=self._stream)
@@ -158,7 +158,7 @@ class VideoFrames(ImageSequence):
         return list(self._times)
 
     def coded(self) -> Iterator[bytes]:
-        """Yield the frames' packets as stored, in coded order; the next image that is read requires a seek."""
+        """Yield the frames' packets as stored, in coded order; reading an image afterwards requires a seek."""
         wanted = set(self._times)
         self._upcoming = None
         try:
@@ -176,7 +176,7 @@ class VideoFrames(ImageSequence):
 
     @property
     def is_deep(self) -> bool:
-        """True for depth: one component of more than 8 bits."""
+        """True if the video is depth: one component of more than 8 bits."""
         given = self._stream.codec_context.format
         return given is not None and [part.bits > 8 for part in given.components] == [True]
 
@@ -227,7 +227,9 @@ class VideoFrames(ImageSequence):
             del self._kept[next(iter(self._kept))]
 
     def _reachable(self, index: int) -> bool:
-        """Return True if decoding can continue: the frame is ahead, without a key frame in between."""
+        """Return True if frame `index` is ahead with no key frame in between, so that decoding can continue without a
+        seek.
+        """
         if self._upcoming is None or index < self._upcoming:
             return False
         return index == self._upcoming or self._key_before(index) <= self._times[self._upcoming]
@@ -250,7 +252,10 @@ class VideoFrames(ImageSequence):
 
 
 def stored_row(found: object) -> Mapping[str, Any] | None:
-    """Return a row of an image column as "bytes" and "path"; some writers store only the bytes or the path."""
+    """Return a row of an image column as a map with "bytes" and "path"; None if it is empty.
+
+    Some writers store only the bytes or the path.
+    """
     if isinstance(found, Mapping):
         return found
     if isinstance(found, bytes):
@@ -277,7 +282,7 @@ def _depth(image: Image.Image) -> NDArray[np.float64] | None:
 class StoredImages(ImageSequence):
     """Images of an image column: encoded as PNG, JPEG or TIFF in the rows, or in files that the rows name.
 
-    Depth is shown in grey: the most distant point of an image is white, unknown (0) is black.
+    Depth becomes grey: the most distant point of an image is white, unknown (0) is black.
     """
 
     def __init__(self, name: str, rows: Sequence[object], root: Path) -> None:
@@ -302,7 +307,10 @@ class StoredImages(ImageSequence):
             return image.height, image.width
 
     def depth(self, index: int) -> NDArray[np.float64] | None:
-        """Return image `index` as float64 [H, W] if it is depth (shares of 65535, or floats), else None."""
+        """Return image `index` as float64 [H, W] if it is a depth image, else None.
+
+        Depth of 16 bits is divided by 65535, floats are unchanged.
+        """
         with self._opened(index) as image:
             return _depth(image)
 
@@ -312,7 +320,7 @@ class StoredImages(ImageSequence):
         return row is None or (row.get("bytes") is None and not row.get("path"))
 
     def row(self, index: int) -> dict[str, Any] | None:
-        """Return the stored row of image `index`, with the content of its file; None if nothing is stored."""
+        """Return the stored row of image `index`, with its file's content as "bytes"; None if nothing is stored."""
         if self.is_missing(index):
             return None
         path = (stored_row(self._rows[index]) or {}).get("path")
@@ -345,4 +353,4 @@ class StoredImages(ImageSequence):
         return path.read_bytes()
 
     def close(self) -> None:
-        """Do nothing: no file stays open."""
+        """Do nothing, because no file is open."""

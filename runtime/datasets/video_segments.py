@@ -24,17 +24,17 @@ ENCODING = {"crf": "18", "preset": "veryfast", "g": "2", "bf": "0"}  # x264 opti
 
 
 class NotCopyableError(RecordingError):
-    """The encoded images of the episode cannot be separated from those of other episodes."""
+    """Error that the encoded images of an episode cannot be separated from those of other episodes."""
 
 
 def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
-    """Copy the `frames` encoded images of `span` to `target`, frame k at k / fps, index at the front.
+    """Copy the `frames` encoded images of `span` to `target`: frame k at k / fps, with the file's index in front.
 
-    A file that has this form already is copied unchanged.
+    A file that already has this form is copied unchanged.
 
     Raises:
-        NotCopyableError: The first image is no key frame, or images of other episodes lie between in coded order.
-        RecordingError: Images are missing, or too far from their rows in time.
+        NotCopyableError: The first image is no key frame, or images of other episodes are between them in coded order.
+        RecordingError: Images are missing, or their times are too far from those of their rows.
     """
     stretch = None if span.start is None else VideoSegment(span.start, frames, fps)
     with VideoFrames(span.path, stretch) as scan:
@@ -54,7 +54,7 @@ def copy_segment(span: Span, target: Path, frames: int, fps: float) -> None:
 
 
 def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
-    """Do as `copy_segment`, but decode the images and encode them as H.264, which loses a little quality.
+    """Write the file that `copy_segment` writes, but encode its images anew as H.264, which loses a little quality.
 
     Raises:
         RecordingError: The images cannot be encoded, or are depth of more than 8 bits.
@@ -86,13 +86,13 @@ def encode_segment(span: Span, target: Path, frames: int, fps: float) -> None:
 
 
 def extra_stream_kinds(path: Path) -> set[str]:
-    """Return the types of the streams in a video file besides its images."""
+    """Return the types of a video file's streams other than its images."""
     with open_video(path) as container:
         return {stream.type for stream in container.streams} - {"video"}
 
 
 def _is_ready(path: Path, frames: int, fps: float) -> bool:
-    """Return True if the whole file has the wanted form: these frames at these times, its index at the front."""
+    """Return True if the whole file already has the form that `copy_segment` writes."""
     with VideoFrames(path) as whole:
         times = whole.times
     if len(times) != frames or np.abs(np.array(times) - np.arange(frames) / fps).max() > TOLERANCE:
@@ -102,7 +102,7 @@ def _is_ready(path: Path, frames: int, fps: float) -> bool:
 
 
 def _index_first(file: Any) -> bool:
-    """Return True if the box `moov` comes before `mdat`."""
+    """Return True if the file's index (box `moov`) comes before its data (`mdat`)."""
     while len(head := file.read(8)) == 8:
         size, kind = int.from_bytes(head[:4], "big"), head[4:]
         if kind in (b"moov", b"mdat"):
@@ -140,7 +140,7 @@ def _copy(source: Path, target: Path, ticks: list[int], fps: float) -> None:
 
 
 def _coded(source: Path, recorded: av.container.InputContainer, rank: dict[int, int]) -> Iterator[Any]:
-    """Yield the packets of the images in `rank` (number by time stamp), in coded order."""
+    """Yield in coded order the packets of the images in `rank`, which maps time stamps to numbers of images."""
     first = min(rank, key=rank.__getitem__)
     stream = recorded.streams.video[0]
     recorded.seek(first, stream=stream)

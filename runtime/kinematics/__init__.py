@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics, one file per backend, which declares `Config` and `build`."""
+"""Forward and inverse kinematics, one module per backend, which declares `Config` and `build`."""
 
 # Module of each kind; imported only if a deployment names the kind.
 KINDS = {

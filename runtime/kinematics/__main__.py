@@ -1,4 +1,4 @@
-"""Compile the kinematics of robots in advance, so that no start of a station and no command waits for it."""
+"""Compilation of the kinematics of robots in advance, so that no start of a station and no command waits for it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runtime.kinematics import compiled
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compile for the named robots, else for all; return 1 if that fails for one of them."""
+    """Compile for the named robots, or for all if none are named; return 1 if that fails for one of them."""
     parser = argparse.ArgumentParser(prog="python -m runtime.kinematics", description=__doc__)
     parser.add_argument("robots", metavar="ROBOT", nargs="*", help="a robot's name or a folder")
     wanted = parser.parse_args(arguments).robots or robots.robot_names()

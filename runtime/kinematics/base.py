@@ -21,11 +21,11 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class KinematicsError(RuntimeFault):
-    """Invalid shape of joints, poses or seed, or numbers that are no pose."""
+    """Error about joints, poses or a seed of the wrong shape, or about numbers that are no pose."""
 
 
 class IkFlag(IntFlag):
-    """Properties of a solved frame; bits of IkResult.flags."""
+    """Properties of a solved frame, as bits of IkResult.flags."""
 
     OVER_TOLERANCE = 1
     AT_LIMIT = 2  # a joint is at its limit
@@ -57,10 +57,10 @@ class KinematicsSettings(Settings):
 
 @dataclass(frozen=True, slots=True)
 class IkResult:
-    """Joints for a sequence of target poses.
+    """Solved joints for a sequence of target poses.
 
-    `q` float64 [T, D] are full robot vectors; `position_error` [T, arms] in m and `rotation_error` [T, arms] in rad
-    are those of `q`; `flags` uint8 [T, arms] are bits of IkFlag.
+    `q` float64 [T, D] are full robot vectors; `position_error` [T, arms] in m and `rotation_error` [T, arms] in rad are
+    the errors of `q`; `flags` uint8 [T, arms] are bits of IkFlag.
     """
 
     q: Float64
@@ -80,14 +80,16 @@ class Forward(ABC):
 
     @abstractmethod
     def forward(self, q: Float64) -> Float64:
-        """Return poses [..., arms, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) of joint vectors [..., D]."""
+        """Return poses [..., arms, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) for joint vectors [..., D]."""
 
 
 class Kinematics(Forward):
     """Forward and inverse kinematics of a robot."""
 
     def prepare(self) -> bool:
-        """Start to load what `solve` needs; return True if `solve` would not have to wait for it."""
+        """Start to load everything that `solve` needs; return True if it is loaded, so that `solve` would not have to
+        wait.
+        """
         return True
 
     @abstractmethod
@@ -101,17 +103,17 @@ class Kinematics(Forward):
     ) -> IkResult:
         """Solve for poses [T, arms, 7]: each frame starts from its predecessor, the first from `seed` [D].
 
-        Dimensions of `seed` outside the arms' chains (grippers, head) are copied, and carriers (a torso) are assumed
-        to be as in `seed`. No joint leaves its limits. Poses that are not reached are flagged. Redundant joints are
+        Dimensions of `seed` outside the arms' chains (grippers, head) are copied, and carriers (a torso) are assumed to
+        be as in `seed`. No joint leaves its limits. Poses that are not reached are flagged. Redundant joints are
         resolved by the backend.
 
         Args:
-            targets: poses in each arm's declared frame.
-            seed: joints [D] from which the first frame is solved.
-            dt: time between frames [s]; if given, no joint exceeds its velocity limit between frames.
-            anchor: commanded position [D] in the step before row `anchor_row`; the velocity limit binds that row to
-                it. Without it, the first row is bound by joint limits only.
-            anchor_row: first row that will be executed; rows before it are stale, and bound by joint limits only.
+            targets: Poses in each arm's declared frame.
+            seed: Joints [D] from which the first frame is solved.
+            dt: Time between frames [s]; if given, no joint exceeds its velocity limit between frames.
+            anchor: Commanded position [D] in the step before row `anchor_row`; between it and that row the velocity
+            limit applies. If it is None, the first row is bound by joint limits only.
+            anchor_row: First row that will be executed; rows before it are stale, and bound by joint limits only.
         """
 
 
@@ -123,10 +125,10 @@ class ChainForward(Forward):
         self._dim = robot.dim
 
     def forward(self, q: Float64) -> Float64:
-        """Return poses [..., arms, 7] of joint vectors [..., D].
+        """Return poses [..., arms, 7] for joint vectors [..., D].
 
         Raises:
-            KinematicsError: another width.
+            KinematicsError: The joint vectors have another width.
         """
         q = np.asarray(q, dtype=np.float64)
         if q.shape[-1:] != (self._dim,):

@@ -24,7 +24,7 @@ def chain_type(moving: int) -> np.dtype[np.void]:
     """Return the type of a chain of up to `moving` joints; shorter chains are padded with fixed joints.
 
     `fixed` are the transforms before each joint and after the last: a rotation row by row, then the origin [m]. Each
-    joint turns about the resulting z axis, or slides along it if `slides` is 1, by factor * q[drive] + offset; drive
+    joint turns about the resulting z axis, or slides along it if `slides` is 1, by factor * q[drive] + offset; `drive`
     is -1 for a fixed joint.
     """
     return np.dtype(
@@ -40,14 +40,14 @@ def chain_type(moving: int) -> np.dtype[np.void]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainSequence:
-    """Consecutive chains, each driven by its `dims` of a vector."""
+    """Consecutive chains; `dims` are for each chain the indices of its joints in a vector."""
 
     chains: Sequence[Chain]
     dims: Sequence[Sequence[int]]
 
 
 def chain_records(ways: Sequence[ChainSequence]) -> Records:
-    """Return records [A] of the sequences, all as long as the longest."""
+    """Return one record per sequence [A], padded to the length of the longest."""
     longest = max((sum(len(chain.moving) for chain in way.chains) for way in ways), default=0)
     records = np.zeros(len(ways), dtype=chain_type(max(1, longest)))
     records["fixed"] = _flat(np.eye(4))
@@ -74,7 +74,7 @@ def _fill(record: Record, way: ChainSequence) -> None:
 
 
 def _basis(axis: Float64) -> Float64:
-    """Return a rotation [4, 4] from z to the unit vector `axis`; the identity if that is z."""
+    """Return a rotation [4, 4] that turns z to the unit vector `axis`; the identity if `axis` is z."""
     across = np.array([0.0, 1.0, 0.0]) if abs(axis[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(across, axis)
     x /= np.linalg.norm(x)

@@ -93,7 +93,7 @@ class CompiledKinematics(Kinematics):
         )
 
     def warm_up(self) -> None:
-        """Compile kernels that are not cached and load the others, so that no command waits for them.
+        """Load all kernels, and compile those that are not cached, so that no command waits for it.
 
         A cached kernel that cannot be read (a full disk, a power failure) is compiled again.
         """
@@ -117,10 +117,10 @@ class CompiledKinematics(Kinematics):
         self.solve(self.forward(seed)[None], seed)
 
     def forward(self, q: Float64) -> Float64:
-        """Return poses [..., arms, 7] of joint vectors [..., D].
+        """Return poses [..., arms, 7] for joint vectors [..., D].
 
         Raises:
-            KinematicsError: another width.
+            KinematicsError: The joint vectors have another width.
         """
         q = np.array(q, dtype=np.float64, order="C")
         if q.shape[-1:] != (self._dim,):
@@ -139,13 +139,13 @@ class CompiledKinematics(Kinematics):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """Solve for poses [T, arms, 7], see Kinematics.solve; errors are measured on the returned joints.
+        """Solve for poses [T, arms, 7] as `Kinematics.solve` describes; errors are measured on the returned joints.
 
         Quaternions may have any length above zero.
 
         Raises:
-            KinematicsError: wrong shapes, numbers that are not finite, a quaternion of length zero, a `dt` of zero or
-                less, or a negative `anchor_row`.
+            KinematicsError: Wrong shapes, numbers that are not finite, a quaternion of length zero, a `dt` of zero or
+            less, or a negative `anchor_row`.
         """
         targets, seed = self._targets(targets), self._vector("a seed", seed)
         if dt is not None and not 0 < dt < np.inf:
@@ -164,9 +164,10 @@ class CompiledKinematics(Kinematics):
     def _replan_missed(
         self, found: IkResult, targets: Float64, seed: Float64, dt: float, held: Float64, row: int
     ) -> None:
-        """Replan in `found` the arms that reach the first pose but miss a later one or end near limits.
+        """Replan in `found` the arms that reach the first pose, but miss a later one or end near limits.
 
-        The next chunk is unknown, and may continue towards a limit near which this chunk ends.
+        Ending near a limit matters because the next chunk is unknown, and may continue towards the limit. `row` is the
+        anchor's row, -1 without an anchor, and `held` its joints [D].
         """
         begin = row if row >= 0 else 1
         if begin >= len(targets):
@@ -206,7 +207,10 @@ class CompiledKinematics(Kinematics):
         guide: Float64 | None = None,
         home_rate: float | None = None,
     ) -> IkResult:
-        """Call the kernel for some of the arms; arrays must be contiguous, anchor_row -1: no anchor."""
+        """Call the kernel for some of the arms.
+
+        Arrays must be contiguous; `anchor_row` is -1 if there is no anchor.
+        """
         costs = self._costs if home_rate is None else self._costs._replace(home_rate=home_rate)
         frames = (len(targets), len(arms))
         q, away, astray = np.empty((len(targets), self._dim)), np.empty(frames), np.empty(frames)
@@ -254,7 +258,7 @@ def _full_chain(group: Group, chain: Chain) -> ChainSequence:
 
 
 def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: float) -> Records:
-    """Return the arms as records; shorter arms are padded with fixed joints."""
+    """Return the arms as records; the chains of shorter arms are padded with fixed joints."""
     from runtime.kinematics.kernels.chunk_solver import arm_type
 
     chains = chain_records([ChainSequence([chain], [range(chain.size)]) for _, chain in own])
@@ -278,7 +282,7 @@ def _arms_of(robot: Robot, own: Sequence[tuple[Group, Chain]], velocity_scale: f
 def _limit_margin(arm: Record, q: Float64) -> float:
     """Return the distance of joints [D] to the nearest limit, relative to _ROOM; inf for an arm without redundancy.
 
-    Limits to which home itself is nearer than _ROOM do not count: no posture is better there.
+    Limits to which home itself is nearer than _ROOM do not count, because no posture is better there.
     """
     count = arm["joints"]
     if count <= POSED:
@@ -296,7 +300,9 @@ def _carrier_chain(group: Group) -> ChainSequence:
 
 
 def _lengths(arms: Records) -> tuple[int, int, int]:
-    """Return the number of joints of the arms' own chains, of their carriers, and of the driving numbers."""
+    """Return the lengths in the arms' records: joints of their own chains, joints of their carriers, and driving
+    numbers.
+    """
     return (
         arms["own"]["drive"].shape[1],
         arms["carrier"]["drive"].shape[1],

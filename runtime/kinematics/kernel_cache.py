@@ -1,4 +1,6 @@
-"""Cache of compiled kernels on disk, and a record of the robots for which it is complete; loads no compiler."""
+"""Cache of compiled kernels on disk, and records of the robots for which it is complete; this module loads no
+compiler.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,10 @@ _KERNELS = Path(__file__).resolve().parent / "kernels"
 
 @functools.cache  # cache: one process compiles into one folder
 def folder() -> Path | None:
-    """Return the first writable folder: below $NUMBA_CACHE_DIR, or next to the sources, or in the user's cache."""
+    """Return the first writable folder for the cache, None if there is none.
+
+    It is below $NUMBA_CACHE_DIR, or next to the sources, or in the user's cache.
+    """
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
     roots = [Path(chosen)] if chosen else [_KERNELS / "__pycache__", home / "eva-web"]
@@ -39,7 +44,7 @@ def folder() -> Path | None:
 
 
 def is_compiled(robot: Robot) -> bool:
-    """Return True if the robot's kernels are on disk: they load within a second, without compilation."""
+    """Return True if the robot's kernels are on disk, so that they load within a second, without compilation."""
     kept = folder()
     if kept is None:
         return False
@@ -69,7 +74,7 @@ def forget() -> bool:
 
 
 def _kernels(kept: Path) -> dict[str, int]:
-    """Return the sizes of the files with machine code that have an index file of numba."""
+    """Return the sizes by name of the files with machine code that also have an index file of numba."""
     return {
         file.relative_to(kept).as_posix(): file.stat().st_size
         for file in sorted(kept.rglob("*.nbc"))
@@ -78,12 +83,18 @@ def _kernels(kept: Path) -> dict[str, int]:
 
 
 def _function(file: Path) -> str:
-    """Return the function's part of a file name of numba: MODULE.FUNCTION-LINE.PYTHON.NUMBER.nbc."""
+    """Return the part of a numba file's name that identifies a function.
+
+    The name is MODULE.FUNCTION-LINE.PYTHON.NUMBER.nbc; the part is what precedes NUMBER.
+    """
     return file.name.rpartition(".nbc")[0].rpartition(".")[0]
 
 
 def _digest() -> str:
-    """Return a digest of all kernels: numba compares only a function's own file, and would use outdated callees."""
+    """Return a digest of the sources of all kernels.
+
+    It is needed because numba compares only a function's own file, and would use outdated functions that it calls.
+    """
     found = hashlib.sha256()
     for file in sorted(_KERNELS.glob("*.py")):
         found.update(file.read_bytes())
@@ -91,7 +102,7 @@ def _digest() -> str:
 
 
 def _name(robot: Robot) -> str:
-    """Return the name of the record for such a robot with this compiler on this processor."""
+    """Return the file name of the robot's record, which depends on its model, the compiler and the processor."""
     found = hashlib.sha256(robot.urdf.read_bytes())
     for part in (robot.joint_names, _numba(), _processor()):
         found.update(repr(part).encode())

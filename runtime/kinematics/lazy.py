@@ -14,9 +14,10 @@ Make = Callable[[], Kinematics]
 
 
 class LazyKinematics(Kinematics):
-    """Kinematics with a backend that `make` builds once, run in the background by `aside`; `forward` works at once.
+    """Kinematics with a backend that is built in the background on first use; `forward` works at once.
 
-    A station with a policy in joint space starts without a compiler and never loads one.
+    `make` builds the backend, once; `aside` runs it in the background. A station with a policy in joint space starts
+    without a compiler and never loads one.
     """
 
     def __init__(
@@ -26,27 +27,29 @@ class LazyKinematics(Kinematics):
         aside: Callable[[Make], Future[Kinematics]],
         compiled: Callable[[], bool] = lambda: True,
     ) -> None:
-        """`compiled` returns whether `make` would have nothing to compile."""
+        """Store the functions; `compiled` returns True if `make` would have nothing to compile."""
         self._forward = forward  # used until the backend is loaded
         self._make, self._aside, self._compiled = make, aside, compiled
         self._made: Future[Kinematics] | None = None
         self._once = Lock()
 
     def prepare(self) -> bool:
-        """Start to load the backend, once; return True if `solve` would not have to wait for it."""
+        """Start to load the backend, if that was not done yet; return True if `solve` would not have to wait for it."""
         return self._start_loading().done()
 
     def compile(self) -> Future[Kinematics] | None:
-        """Start to compile what a run may need; None, without loading anything, if all is compiled."""
+        """Start to compile everything that a run may need; return None, without loading anything, if all is
+        compiled.
+        """
         if self._made is None and self._compiled():
             return None
         return self._start_loading()
 
     def forward(self, q: Float64) -> Float64:
-        """Return poses [..., arms, 7] of joint vectors [..., D], without waiting for the backend.
+        """Return poses [..., arms, 7] for joint vectors [..., D], without waiting for the backend.
 
         Raises:
-            KinematicsError: another width.
+            KinematicsError: The joint vectors have another width.
         """
         made = self._made
         if made is None or not made.done() or made.exception() is not None:
@@ -64,7 +67,7 @@ class LazyKinematics(Kinematics):
         """Solve with the backend, after waiting for it.
 
         Raises:
-            SetupError: the backend cannot be built.
+            SetupError: The backend cannot be built.
         """
         return self._start_loading().result().solve(targets, seed, dt, anchor, anchor_row)
 

@@ -1,4 +1,4 @@
-"""Poses of all links of a robot in the format of the 3D scene, in microseconds."""
+"""Poses of all links of a robot in the format of the 3D scene, computed within microseconds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class LinkPoses:
-    """Calculator of link poses of a body, in its order; compiled or loaded from disk on construction.
+    """Calculator of the poses of a body's links, in its order; the kernel is compiled or loaded on construction.
 
     Raises:
         KinematicsError: numba is not installed.
@@ -36,7 +36,7 @@ class LinkPoses:
         """Return the transforms scene <- link for joints [..., D]: float32 [..., P, 16], column by column.
 
         Raises:
-            KinematicsError: another width.
+            KinematicsError: The joint vectors have another width.
         """
         joints = np.array(q, dtype=np.float64, order="C")
         if joints.shape[-1:] != (self._dim,):

@@ -1,4 +1,4 @@
-"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728): the same problem solved in JAX, for its users.
+"""Kinematics by PyRoki (Kim et al. 2025, arXiv:2505.03728), which solves the same problem in JAX, for its users.
 
 PyRoki is on no package index: install it and jaxls from their repositories. They are imported only if a deployment
 selects this kind.
@@ -52,7 +52,7 @@ def is_compiled(robot: Robot) -> bool:
 class PyrokiKinematics(Kinematics):
     """Inverse kinematics in float32 by Levenberg-Marquardt, frame by frame in one compiled scan per arm.
 
-    Joint limits and velocities are a cost term, and the result is clipped: PyRoki has no hard bounds. Forward
+    Joint limits and velocities are a cost term, and the result is clipped, because PyRoki has no hard bounds. Forward
     kinematics and the errors of a result are those of the default backend, in float64.
     """
 
@@ -66,10 +66,10 @@ class PyrokiKinematics(Kinematics):
         self._arms = [_Arm(libraries, robot, arm, self._config) for arm in robot.arms]
 
     def forward(self, q: Float64) -> Float64:
-        """Return poses [..., arms, 7] of joint vectors [..., D].
+        """Return poses [..., arms, 7] for joint vectors [..., D].
 
         Raises:
-            KinematicsError: another width.
+            KinematicsError: The joint vectors have another width.
         """
         return self._default.forward(q)
 
@@ -81,10 +81,10 @@ class PyrokiKinematics(Kinematics):
         anchor: Float64 | None = None,
         anchor_row: int = 0,
     ) -> IkResult:
-        """Solve for poses [T, arms, 7], see Kinematics.solve; errors are measured on the returned joints.
+        """Solve for poses [T, arms, 7] as `Kinematics.solve` describes; errors are measured on the returned joints.
 
         Raises:
-            KinematicsError: as in the default backend.
+            KinematicsError: In the same cases as the default backend.
         """
         # The default backend checks all arguments, with one row; its solution is not used.
         self._default.solve(targets[:1], seed, dt, anchor, anchor_row)
@@ -99,7 +99,7 @@ class PyrokiKinematics(Kinematics):
 
 
 class _ArmTask(NamedTuple):
-    """One arm's part of a chunk: poses [T, 7] in its frame, and the bounds of its rows."""
+    """Part of a chunk for one arm: its poses [T, 7] in the arm's frame, with the other arguments of `solve`."""
 
     targets: Float64
     seed: Float64
@@ -146,7 +146,9 @@ class _Arm:
         return self._cut(q, asked, steps[:rows], held), low, high
 
     def _bounds(self, asked: _ArmTask, rows: int) -> tuple[Float64, Float64]:
-        """Return the joints before the anchor's row [n], and each row's largest step from its predecessor [rows, n]."""
+        """Return the joints [n] before the anchor's row, and the largest step of each row from its predecessor [rows,
+        n].
+        """
         steps = np.full((rows, len(self.dims)), np.inf)
         held = (asked.seed if asked.anchor is None else np.asarray(asked.anchor, np.float64))[self.dims]
         if asked.dt is not None:
@@ -155,7 +157,10 @@ class _Arm:
         return held, steps
 
     def _cut(self, q: Float64, asked: _ArmTask, steps: Float64, held: Float64) -> Float64:
-        """Return the rows [T, n] clipped to limits and velocities in float64."""
+        """Return the rows [T, n] clipped in float64 to joint limits and to their `steps` from the row before.
+
+        The anchor's row is clipped to its step from `held`.
+        """
         cut = np.clip(q, self._lower, self._upper)
         for row in range(len(cut)):
             anchored = asked.anchor is not None and row == asked.anchor_row
@@ -191,10 +196,10 @@ def _libraries() -> _Libraries:
 def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
     """Return PyRoki's robot for the group's chain: its moving joints and the fixed parts between them.
 
-    Arms with equally many joints differ only in numbers, so one compiled function serves them all.
+    Arms with equally many joints differ only in numbers, so that one compiled function serves them all.
 
     Raises:
-        SetupError: the chain has a mimic joint.
+        SetupError: The chain has a mimic joint.
     """
     assert group.chain is not None  # it is an arm
     describe = libraries.yourdfpy.urdf
@@ -233,7 +238,10 @@ def _robot_of(libraries: _Libraries, robot: Robot, group: Group) -> Any:
 
 @functools.cache  # cache: what is compiled is bound to it
 def _variable_of(libraries: _Libraries, size: int) -> Any:
-    """Return the variable type for `size` joints: compiled functions depend on it, and PyRoki makes one per robot."""
+    """Return the cached variable type for `size` joints.
+
+    PyRoki makes one per robot, but compiled functions depend on it and shall be shared.
+    """
     zeros = libraries.jax.numpy.zeros(size)
     return new_class(
         "Joints", (libraries.jaxls.Var[libraries.jax.Array],), {"default_factory": lambda: zeros}
@@ -242,7 +250,7 @@ def _variable_of(libraries: _Libraries, size: int) -> Any:
 
 @functools.cache  # cache: to compile it takes longer than a thousand chunks
 def _scan_of(libraries: _Libraries, config: Config) -> Any:
-    """Return the function from an arm, poses and bounds of a chunk to its joints and their bounds.
+    """Return the function that computes joints and their bounds for an arm, and the poses and bounds of a chunk.
 
     It is compiled with the first arm of each number of joints, which takes longer than a thousand chunks.
     """

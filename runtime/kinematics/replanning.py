@@ -27,7 +27,7 @@ LimitMargin = Callable[[Float64], float]  # joints [D] -> margin to the nearest 
 
 
 def sample_postures(home: Float64, lower: Float64, upper: Float64, count: int) -> Float64:
-    """Return joints [1 + count, n] from which ends are searched: home, and random ones within the limits.
+    """Return joints [1 + count, n] from which end postures are searched: home, and random ones within the limits.
 
     The sample is always the same, so that equal problems have equal solutions.
     """
@@ -51,13 +51,13 @@ def replan(
     room: LimitMargin,
     least: float = -np.inf,
 ) -> IkResult | None:
-    """Return a plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D]; None if none is found.
+    """Return a plan for poses [T, 1, 7] of the arm at `dims`, from `start` [D]; None if no plan is found.
 
-    The plan reaches all poses, and its last joints [D] have more than `least` margin.
+    The plan reaches all poses, and its last joints [D] have a margin (`room`) above `least`.
 
-    Frames solved in sequence may follow a branch, or a posture, that ends before the poses do. So the last pose is
-    solved from `starts` [S, n], each solution is followed back to the first pose, and the result guides a plan
-    forwards, which approaches its guide with half of the joint velocities. The end nearest to `start` is tried first.
+    Frames solved in sequence may follow a branch, or a posture, that cannot reach all poses. So the last pose is solved
+    from `starts` [S, n], each solution is followed back to the first pose, and the result guides a plan forwards, which
+    approaches its guide with half of the joint velocities. The end nearest to `start` is tried first.
     """
     ends = (end for end in _ends(sweep, poses[-1:], start, dims, starts) if room(end) > least)
     for end in islice(ends, _FOLLOWED):
@@ -71,7 +71,7 @@ def replan(
 def _ends(
     sweep: SolveRows, last: Float64, start: Float64, dims: NDArray[np.intp], starts: Float64
 ) -> Iterator[Float64]:
-    """Yield distinct joints [D] for the last pose [1, 1, 7], the nearest to `start` first."""
+    """Yield distinct joints [D] that reach the last pose [1, 1, 7], the nearest to `start` first."""
     found: list[Float64] = []
     for tried, posture in enumerate(starts):
         if tried == _HOPELESS and not found:

@@ -1,1 +1,1 @@
-"""Execution over time: timeline, resampling and trajectories, as mathematics on arrays."""
+"""Execution of actions over time: timeline, resampling and trajectories, as mathematics on arrays."""

@@ -13,7 +13,7 @@ from runtime.core.types import Float64
 
 
 def resampled_length(count: int, rate: float, wanted_rate: float) -> int:
-    """Return the number of rows at `wanted_rate` [Hz] that `count` rows at `rate` [Hz] become, at least 1."""
+    """Return the number of rows, at least 1, to which `resample` converts `count` rows at these rates [Hz]."""
     return math.floor((count - 1) * wanted_rate / rate + 1e-9) + 1
 
 

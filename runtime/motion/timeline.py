@@ -1,4 +1,6 @@
-"""Timeline of the actions to be executed, by absolute control step, with the chunks that made each of them."""
+"""Timeline of the actions to be executed, by absolute control step, with the chunks that contributed to each of
+them.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ _PLAIN = DimensionKinds()
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """The action planned for one step, float64 [D], and the chunks that it was made from."""
+    """Action planned for one step, float64 [D], with the chunks that contributed to it."""
 
     action: Float64
     contributions: Contributions
@@ -35,7 +37,7 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class PlacedChunk:
-    """A chunk on the timeline: float64 [N, D]; row 0 is for step `first`."""
+    """Chunk on the timeline: float64 [N, D]; row 0 is for step `first`."""
 
     chunk_id: int
     first: int
@@ -43,15 +45,15 @@ class PlacedChunk:
 
     @property
     def end(self) -> int:
-        """The first step after the last row."""
+        """First step after the last row."""
         return self.first + len(self.rows)
 
 
 @dataclass(frozen=True, slots=True)
 class Fade:
-    """Outgoing actions, from step `first` on, that the plan takes over from.
+    """Outgoing actions from which the plan takes over, from step `first` on.
 
-    `rows` are float64 [L, D], `contributions` those of each row, `weights` [L] the share of each row in the blend.
+    `rows` are float64 [L, D], `contributions` those of each row, `weights` [L] the weight of each row in the blend.
     """
 
     first: int
@@ -75,9 +77,9 @@ class Fade:
 class Timeline:
     """Contiguous planned actions from step `first` on; empty if nothing is planned.
 
-    The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as one is
-    active: a chunk merged meanwhile changes the plan, and the fade continues over the new plan. `laid` are the placed
-    chunks that an averaging strategy still needs. A merge discards all steps before it.
+    The executed actions (`at`, `executed_rows`) are the strategy's `plan`, blended with `fade` as long as a fade is
+    active: a chunk merged in that time changes the plan, and the fade continues over the new plan. `laid` are the
+    placed chunks that an averaging strategy still needs. A merge discards all steps before it.
     """
 
     def __init__(self, dim: int) -> None:
@@ -105,14 +107,17 @@ class Timeline:
         return max(0, self.first + len(self.rows) - max(step, self.first))
 
     def plan(self, step: int) -> tuple[Float64, list[Contributions]]:
-        """Return the plan without the fade from `step` on: rows [N, D] and contributions; empty if it starts later."""
+        """Return rows [N, D] and contributions of the plan from `step` on, without the fade.
+
+        Both are empty if the plan starts after `step`.
+        """
         index = step - self.first
         if index < 0:
             return self.rows[:0], []
         return self.rows[index:], self.makers[index:]
 
     def executed_rows(self, step: int) -> tuple[Float64, list[Contributions]]:
-        """Return the actions to execute from `step` on, fade included: rows [N, D] and their contributions."""
+        """Return rows [N, D] and contributions of the actions to execute from `step` on, including the fade."""
         rows, makers = self.plan(step)
         if self.fade is None:
             return rows, makers
@@ -134,18 +139,18 @@ class Timeline:
             self.fade = None
 
     def begin_fade(self, fade: Fade) -> None:
-        """Clear the plan and start `fade`: the next plan takes over from it and from nothing else."""
+        """Clear the plan and start `fade`, from which alone the next plan takes over."""
         self.clear()
         self.fade = fade
 
 
 def single_contribution(chunk_id: int, count: int) -> list[Contributions]:
-    """Return the contributions of `count` rows that come from one chunk alone."""
+    """Return the contributions of `count` rows, all of which come from the chunk `chunk_id` alone."""
     return [((chunk_id, 1.0),)] * count
 
 
 def mix_contributions(old: Contributions, new: Contributions, weight: float) -> Contributions:
-    """Return the contributions of a step blended from `weight` of `old` and 1 - `weight` of `new`."""
+    """Return the contributions of a step that is blended from `old` with `weight` and `new` with 1 - `weight`."""
     shares: dict[int, float] = {}
     for makers, part in ((old, weight), (new, 1.0 - weight)):
         for maker, share in makers if part > 0.0 else ():
@@ -177,11 +182,11 @@ def unwrap_onto(rows: Float64, before: Float64 | None, wrapping: Sequence[int]) 
 def fade_weights(count: int, shape: str = "linear") -> Float64:
     """Return the weights [count] of the outgoing plan: 1 at the first row, 0 at the last; 0 for a single row.
 
-    Shapes: "linear"; "cosine" (no kink at either end); "exponential": c (e^c - 1) / (e - 1) of the linear weight c,
-    the soft mask of real-time chunking (arXiv 2506.07339, eq. 5), which takes over sooner.
+    Shapes: "linear"; "cosine" (no kink at either end); "exponential": c (e^c - 1) / (e - 1) of the linear weight c, the
+    soft mask of real-time chunking (arXiv 2506.07339, eq. 5), which takes over sooner.
 
     Raises:
-        ValueError: `shape` is none of these.
+        ValueError: If `shape` is unknown.
     """
     if count < 2:
         return np.zeros(count)
@@ -201,8 +206,8 @@ def overlap_blend(
     """Blend the first rows of `new` with `old`; return the blended rows [N, D] and the weights [L] of `old`.
 
     `old` [M, D] and `new` [N, D] start at the same step. L = min(M, N, `window`) rows are blended with the weights of
-    `fade_weights`; None blends the whole overlap. Binary grippers take the new value at once. Computed as new + w
-    (old - new), so that equal inputs stay exactly equal.
+    `fade_weights`; if `window` is None, the whole overlap. Binary grippers have the new value at once. The result is
+    computed as new + w (old - new), so that equal inputs stay exactly equal.
     """
     weights = fade_weights(min(len(old), len(new), len(new) if window is None else window), shape)
     blended, count, switched = new.copy(), len(weights), list(dims.switched)

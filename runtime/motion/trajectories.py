@@ -10,19 +10,19 @@ from runtime.core.types import Float64
 
 
 class Motion(ABC):
-    """A position for each time since its start; at rest at the end."""
+    """Motion that ends at rest: a position for each time since its start."""
 
     duration: float  # [s]
 
     @abstractmethod
     def at(self, elapsed: float) -> Float64:
-        """Return the position [D] `elapsed` seconds after the start; the end position from `duration` on."""
+        """Return the position [D] `elapsed` seconds after the start; from `duration` on it is the end position."""
 
 
 class Brake(Motion):
-    """Constant deceleration of each joint to rest, never beyond `lower` and `upper`.
+    """Motion of joints that decelerate constantly to rest, never beyond `lower` and `upper`.
 
-    Dimensions in `speeds` are themselves speeds: each goes to 0 at its rate in `slowing` [D].
+    Dimensions in `speeds` are themselves speeds: each decreases to 0 at its rate in `slowing` [D].
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Brake(Motion):
         return position
 
     def velocity(self, elapsed: float) -> Float64:
-        """Return the velocity [D] at `elapsed` [s]; lower than the mean over the tick that ends there."""
+        """Return the velocity [D] at `elapsed` [s], which is less than the mean over a tick that ends then."""
         velocity = np.sign(self._velocity) * np.maximum(
             np.abs(self._velocity) - self._deceleration * elapsed, 0.0
         )
@@ -66,7 +66,7 @@ class Brake(Motion):
         return np.asarray(velocity)
 
     def sample_path(self, spacing: float, most: int) -> Float64:
-        """Return positions [N, D] along the braking path, the last one at rest.
+        """Return positions [N, D] along the braking path; the last one is at rest.
 
         No joint moves more than `spacing` between two of them, unless that would need more than `most` positions.
         """
@@ -76,7 +76,8 @@ class Brake(Motion):
 
 
 class Trajectory(Motion):
-    """Straight line in joint space from rest to rest, all joints synchronised, with a trapezoidal speed profile.
+    """Motion on a straight line in joint space from rest to rest, all joints synchronised, with a trapezoidal speed
+    profile.
 
     No joint exceeds its velocity [rad/s] or acceleration [rad/s2]; the slowest joint determines the duration.
     """

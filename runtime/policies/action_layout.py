@@ -69,7 +69,9 @@ class ActionLayoutSettings(ActionFormatSettings):
         return self.observation_space == "eef" or relative
 
     def layout(self, robot: Robot, cameras: dict[str, str]) -> RequestLayout:
-        """Return the layout of requests: "state" float32 [W], "images" (by the names in `cameras`, HWC), "prompt"."""
+        """Return the layout of requests: "state" float32 [W], "images" (HWC, with the names in `cameras`) and
+        "prompt".
+        """
         settings = RequestSettings(
             observation_space=self.observation_space,
             observation_pose=self.observation_pose,
@@ -82,13 +84,16 @@ class ActionLayoutSettings(ActionFormatSettings):
         return RequestLayout(settings, robot)
 
     def widths(self, robot: Robot) -> tuple[int, int]:
-        """Return the widths of the state and of a row. Raises ConfigurationError if a format does not fit the robot."""
+        """Return the numbers of values of the state and of a row of actions.
+
+        Raises ConfigurationError if a format does not fit the robot.
+        """
         state = pose_rows_for(self.observation_space, self.observation_pose, robot, "observation_pose")
         rows = pose_rows_for(self.action_space, self.action_pose, robot, "action_pose")
         return robot.dim if state is None else state.width, robot.dim if rows is None else rows.width
 
     def chunk(self, rows: Float32, timing: Mapping[str, float]) -> ActionChunk:
-        """Return a chunk of the rows [H, W] with their meaning."""
+        """Return the rows [H, W] as a chunk with the space, mode, rate, frame and pose format of these settings."""
         return ActionChunk(
             actions=rows,
             space=self.action_space,

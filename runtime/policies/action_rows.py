@@ -12,7 +12,7 @@ from runtime.core.types import Float32
 
 
 def parse_action_rows(name: str, given: object, width: int | None = None) -> Float32:
-    """Return float32 [T, W] from [W], [T, W] or [1, T, W].
+    """Return the action rows of a reply as float32 [T, W]; [W] and [1, T, W] are accepted, too.
 
     Args:
         name: Name of the array in messages.
@@ -21,7 +21,7 @@ def parse_action_rows(name: str, given: object, width: int | None = None) -> Flo
 
     Raises:
         ShapeError: Type, shape or width is wrong.
-        NotFiniteError: A number is not finite; the message tells where.
+        NotFiniteError: A number is not finite; the message states its position.
     """
     if not isinstance(given, np.ndarray):
         raise ShapeError(f"{name} is a {type(given).__name__}; expected a number array [T, {width or 'W'}]")
@@ -45,7 +45,7 @@ def parse_action_rows(name: str, given: object, width: int | None = None) -> Flo
 
 
 def _to_float32(rows: NDArray[Any]) -> Float32:
-    """Convert to float32; an overflow becomes infinite and is refused as such."""
+    """Convert to float32; a number beyond its range becomes infinite, which the check for finite numbers refuses."""
     with np.errstate(over="ignore"):
         return rows.astype(np.float32)
 

@@ -24,10 +24,10 @@ class PolicyInfo:
 
 
 class Policy(ABC):
-    """One connection to one policy; one request in flight, and every wait has a deadline.
+    """Connection to one policy, with one request at a time and a deadline for every wait.
 
-    `observation_eef` selects the poses that it receives, and to which relative chunks refer: those that the robot
-    measures, or those computed from its joints. Without measured poses the latter are always used.
+    `observation_eef` selects the poses that the policy receives and to which its relative chunks refer: "measured" by
+    the robot, or "fk", computed from its joints. Without measured poses the computed poses are always used.
     """
 
     observation_eef: Literal["measured", "fk"] = "measured"
@@ -54,19 +54,22 @@ class Policy(ABC):
         """
 
     def observe(self, observation: Observation) -> None:  # noqa: B027  # not abstract: most need only the requests
-        """Receive an observation every `observe_period_s` during a run, without waiting even for a pending request."""
+        """Receive an observation; called every `observe_period_s` during a run.
+
+        Must not block, even while a request is pending.
+        """
 
     @abstractmethod
     def reset(self) -> None:
-        """Start a new episode; a reply still in flight belongs to the old one."""
+        """Start a new episode; a pending reply is treated as part of the previous one."""
 
     def resume(self) -> None:  # noqa: B027  # not abstract: most depend on the observation alone
-        """Continue the episode after a hold without requests; called before the next `infer`."""
+        """Continue the episode after a hold during which there were no requests; called before the next `infer`."""
 
     def end_episode(self) -> None:  # noqa: B027  # not abstract: most servers keep no state
         """End the rollout on the server if it keeps state.
 
-        `reset` is called before the next one. Raises PolicyError.
+        `reset` is called before the next rollout. Raises PolicyError.
         """
 
     @abstractmethod

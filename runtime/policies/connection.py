@@ -1,4 +1,4 @@
-"""TCP connections with one deadline for all steps, which another thread can abort."""
+"""TCP connections with one deadline for name resolution and connecting; another thread can abort them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ _SPELL_MS = 20  # period of the check for an abort while connecting [ms]
 def open_connection(
     url: str, host: str, port: int, deadline: float, seconds: float, require_wanted: Callable[[], None]
 ) -> socket.socket:
-    """Connect as `connect_any`, with errors that name `url` and the time `seconds` [s] until the deadline.
+    """Return a connection as `connect_any` does, with errors that name `url`.
+
+    `seconds` [s] is the time allowed for connecting, as errors state it.
 
     Raises:
         PortClosedError: The machine responds, but nothing listens on the port.
@@ -60,7 +62,7 @@ def connect_any(host: str, port: int, deadline: float, require_wanted: Callable[
         require_wanted: Function that raises if the caller was aborted; called every few milliseconds.
 
     Raises:
-        OSError: That of the last address; TimeoutError after the deadline.
+        OSError: The error of the last address; TimeoutError after the deadline.
     """
     refusal: OSError = OSError(f"{host} has no address")
     for family, kind, protocol, _, address in _addresses(host, port, deadline - time.monotonic()):
@@ -95,7 +97,10 @@ def _try_address(
 
 
 def _addresses(host: str, port: int, seconds: float) -> list[Address]:
-    """Return the addresses of the host, resolved in a thread because the resolver has no deadline."""
+    """Return the addresses of the host.
+
+    They are resolved in a thread, because the system's resolver has no deadline.
+    """
     found: queue.SimpleQueue[list[Address] | OSError] = queue.SimpleQueue()
 
     def resolve() -> None:

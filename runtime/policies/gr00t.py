@@ -1,8 +1,9 @@
 """Policies on GR00T servers N1.5, N1.6 and N1.7: one request, one response over a ZMQ REQ socket.
 
-First the server is asked for its modality configuration, i.e. the inputs and outputs of its model. Requests follow
-from that and from maps in the deployment; arrays are sent in the form that the server reads. Its `kill` endpoint is
-never used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality configuration, StarVLA.
+First the server is asked for its modality configuration, i.e. the inputs and outputs of its model. The form of requests
+follows from it and from maps in the deployment; arrays are sent in the form that the server reads. The server's `kill`
+endpoint is never used. Source: Isaac-GR00T's PolicyServer and PolicyClient; for servers without a modality
+configuration, StarVLA.
 """
 
 from __future__ import annotations
@@ -79,13 +80,14 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Gr
 
 
 class UnknownEndpoint(WrongProtocolError):
-    """Error about an endpoint that the server does not know."""
+    """Error that the server does not know the requested endpoint."""
 
 
 class Gr00tPolicy(Policy):
-    """Policy on one REQ socket; after a timeout or a lost reply it is dropped, and the next `infer` opens another.
+    """Policy on one REQ socket, which is replaced at the next `infer` after a timeout or a lost reply.
 
-    Deadlines are real seconds, whatever the clock. The long first deadline applies once after `connect`.
+    Deadlines are real seconds, whatever the clock. The longer first deadline applies to the first request after
+    `connect`.
     """
 
     def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
@@ -114,7 +116,7 @@ class Gr00tPolicy(Policy):
             return self._open()
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return the chunk; `timing` contains our `round_trip_ms`.
+        """Return the chunk for an observation; `timing` contains our `round_trip_ms`.
 
         Raises PolicyLostError if the server is absent or does not respond: the next call opens another connection.
         """
@@ -133,7 +135,7 @@ class Gr00tPolicy(Policy):
         return self._config.chunk(rows, {"round_trip_ms": round_trip})
 
     def reset(self) -> None:
-        """Forget earlier observations, here and on the server; N1.5 has no such endpoint."""
+        """Drop earlier observations here and let the server drop its own; N1.5 has no endpoint for that."""
         with self._lock:
             self._request.reset()
             if not self._asked or self._config.dialect == "n1.5":
@@ -144,9 +146,9 @@ class Gr00tPolicy(Policy):
                 self._call("reset", self._config.connect_deadline, {"options": None})
 
     def close(self) -> None:
-        """Return at once; a call that waits in another thread raises PolicyError.
+        """Abort the connection and return at once; a call that waits in another thread raises PolicyError.
 
-        The user of the connection drops it, now or at the next `connect`.
+        That thread, or the next `connect`, drops the connection.
         """
         with self._turning:
             self._closed = True
@@ -184,7 +186,10 @@ class Gr00tPolicy(Policy):
         )
 
     def _act(self, data: Mapping[str, Any], seconds: float) -> Any:
-        """Return the response to get_action; after a guess of the array form, the other form is tried once."""
+        """Return the response to get_action.
+
+        If the form of arrays was only guessed and the server fails, the other form is tried once.
+        """
         until = time.monotonic() + seconds
         guessed, self._guessed = self._guessed, False
         try:
@@ -200,9 +205,9 @@ class Gr00tPolicy(Policy):
                 raise error from None
 
     def _call(self, endpoint: str, seconds: float, data: Mapping[str, Any] | None = None) -> Any:
-        """Return the result of an endpoint.
+        """Return the response of an endpoint.
 
-        Raises PolicyError for the server's own error, after which it continues to serve.
+        Raises PolicyError if the server reports an error, after which it still runs.
         """
         message: dict[str, Any] = {"endpoint": endpoint}
         message |= {} if data is None else {"data": data}

@@ -17,9 +17,9 @@ Convention = Literal["droid", "robot"]
 
 
 class GripperConvention:
-    """Conversion of the values of all grippers of a robot, [..., G]; with the convention "robot" they are unchanged.
+    """Conversion of a robot's gripper values; with the convention "robot" they are unchanged.
 
-    `poses` is the row format of the responses if these are poses, None for joints.
+    `poses` is the row format of the responses if they contain poses, None for joints.
     """
 
     def __init__(self, convention: Convention, robot: Robot, poses: PoseRows | None = None) -> None:
@@ -33,13 +33,13 @@ class GripperConvention:
         self._gripped = [(EEF_WIDTH * arm + EEF_WIDTH - 1, dim) for arm, dim in arms if dim is not None]
 
     def to_policy(self, numbers: Float64) -> Float64:
-        """Convert to the policy's values, clipped to the ends of the travel."""
+        """Convert gripper values [..., G] to the policy's, clipped to 0 and 1."""
         if not self._converts:
             return numbers
         return np.clip((numbers - self._open) / self._travel, 0.0, 1.0)
 
     def convert_observation(self, observation: Observation) -> Observation:
-        """Return the observation with the grippers of its joints and poses in the policy's values."""
+        """Return the observation with the policy's values for the grippers in its joints and poses."""
         if not self._converts:
             return observation
         qpos = observation.qpos.copy()
@@ -52,7 +52,7 @@ class GripperConvention:
         return replace(observation, qpos=qpos, eef=eef)
 
     def to_robot(self, rows: Float32) -> Float32:
-        """Convert rows of a response [T, W] to the robot's values, clipped to 0 and 1."""
+        """Convert the grippers in the rows of a response [T, W] to the robot's values, within the grippers' travel."""
         if not self._converts:
             return rows
         made = rows.copy()
@@ -62,7 +62,7 @@ class GripperConvention:
         return made
 
     def served(self, rows: Float32) -> Float32:
-        """Convert rows with the robot's values [T, W] back to the server's."""
+        """Convert the grippers in rows [T, W] from the robot's values back to the server's."""
         if not self._converts:
             return rows
         made = rows.copy()
@@ -72,7 +72,7 @@ class GripperConvention:
 
 
 def _columns(robot: Robot, poses: PoseRows | None) -> list[tuple[int, int]]:
-    """Return the gripper columns of a row, each with the index of the robot's gripper."""
+    """Return for each gripper column of a row its index and the index of the robot's gripper."""
     dims = list(robot.gripper_dims)
     if poses is None:
         return [(dim, gripper) for gripper, dim in enumerate(dims)]

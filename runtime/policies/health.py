@@ -20,9 +20,9 @@ _LONGEST = 4096  # longest first line [bytes]
 def require_healthy(
     url: str, path: str, headers: Mapping[str, str], seconds: float, dial: Dial | None = None
 ) -> None:
-    """GET `path` from the host and port of the websocket `url`, with TLS for wss; return on status 200.
+    """GET `path` from the host and port of the websocket `url` (with TLS for wss); return only if the status is 200.
 
-    `dial` returns the host and port to connect to, if they differ.
+    `dial` returns the host and port to connect to, if they differ from those of the url.
 
     Raises:
         PolicyLostError: There is no response within `seconds`, or the server reports that it is not ready (HTTP 5xx).
@@ -59,7 +59,10 @@ def require_healthy(
 def _get_status(
     url: str, path: str, headers: Mapping[str, str], deadline: float, seconds: float, dial: Dial | None
 ) -> tuple[int, str]:
-    """Return status and reason. Raises TimeoutError at the deadline (monotonic clock), even if bytes trickle in."""
+    """Return the HTTP status and its reason phrase.
+
+    Raises TimeoutError at the deadline (monotonic clock), even if single bytes keep arriving.
+    """
     place = urlsplit(url)
     secure = place.scheme == "wss"
     host, port = place.hostname or "", place.port or (443 if secure else 80)

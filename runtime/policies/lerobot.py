@@ -1,9 +1,10 @@
 """LeRobot's asynchronous inference over gRPC, without the packages lerobot and torch.
 
-Its messages are pickles in both directions: any peer that reaches the server's port can run code there. So this is
-for servers on this machine or behind a tunnel, and must be allowed per checkpoint. Responses are read by our own
-interpreter of pickles, which executes nothing. The server sends an empty response both without an observation and
-after a failed inference, and does not distinguish the two. Source: lerobot.async_inference of LeRobot 0.4.
+Its messages are pickles in both directions, and the server executes them: any peer that reaches its port can run code
+there. This policy is therefore for servers on this machine or behind a tunnel, and must be allowed per checkpoint.
+Responses are read by our own interpreter of pickles, which executes nothing. An empty response means either that the
+server had no observation or that inference failed; it does not say which. Source: lerobot.async_inference of LeRobot
+0.4.
 """
 
 from __future__ import annotations
@@ -90,10 +91,10 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Le
 
 
 class LerobotPolicy(Policy):
-    """Policy on one channel; after a timeout or a lost response it is dropped, and the next `infer` opens another.
+    """Policy on one channel, which is replaced at the next `infer` after a timeout or a lost response.
 
     Every observation has `must_go` set: the server would skip one with nearly unchanged joints. Deadlines are real
-    seconds, whatever the clock. The long first deadline applies once after `connect`.
+    seconds, whatever the clock. The longer first deadline applies to the first request after `connect`.
     """
 
     def __init__(self, config: Config, robot: Robot, control_rate: float) -> None:
@@ -128,12 +129,11 @@ class LerobotPolicy(Policy):
         )
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return the chunk; `timing` contains our `round_trip_ms`.
+        """Return the chunk for an observation; `timing` contains our `round_trip_ms`.
 
         Raises:
             PolicyLostError: The server is absent or does not respond. The next call opens another connection, and lets
-                the
-                server load the checkpoint again if it has lost it.
+            the server load the checkpoint again if it has lost it.
             PolicyError: All responses were empty.
         """
         if conditioning is not None:
@@ -160,14 +160,14 @@ class LerobotPolicy(Policy):
         return self._config.chunk(rows, {"round_trip_ms": round_trip})
 
     def reset(self) -> None:
-        """Make the server forget its observation; nothing is sent if there was no request."""
+        """Make the server drop its observation; if there was no request since the last reset, nothing is sent."""
         with self._lock:
             if self._asked and self._link.is_open:  # a new connection starts without an observation anyway
                 self._link.call(messages.READY, messages.EMPTY, self._config.connect_deadline)
             self._asked = False
 
     def close(self) -> None:
-        """Cut the connection and return at once; a call that waits in another thread raises PolicyError."""
+        """Abort the connection and return at once; a call that waits in another thread raises PolicyError."""
         with self._turning:
             self._ended.set()
             self._link.abort()
@@ -198,9 +198,10 @@ class LerobotPolicy(Policy):
             ) from error
 
     def _answer(self, shown: bytes, seconds: float) -> bytes:
-        """Return the pickled actions for an observation, which is sent again after an empty response.
+        """Return the pickled actions for the pickled observation `shown`, which is sent again after an empty response.
 
-        A response is also empty if one of our aborted calls took the observation from the server's queue.
+        A response is empty after a failed inference, and also if a call that we aborted earlier took the observation
+        from the server's queue.
         """
         deadline, pause, asked = time.monotonic() + seconds, _PAUSES[0], 0
         while True:

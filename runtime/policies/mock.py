@@ -37,7 +37,7 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Mo
 
 
 class MockPolicy(Policy):
-    """Policy that moves each joint out and back as (1 - cos) / 2, starting at rest exactly at the robot's joints.
+    """Policy that moves each joint out and back as (1 - cos) / 2, starting at rest at the robot's joints.
 
     The motion depends on the control step alone: row i of the chunk for step s is for step s + i since the first
     observation after a reset. Grippers move half their travel; binary grippers stay.
@@ -53,7 +53,7 @@ class MockPolicy(Policy):
         self._first_step = 0
 
     def connect(self) -> PolicyInfo:
-        """Return its description; there is nothing to connect."""
+        """Return the policy's description; there is no server to connect to."""
         return PolicyInfo("mock", action_space="joint", horizon=self._config.horizon)
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
@@ -71,14 +71,14 @@ class MockPolicy(Policy):
         return ActionChunk(rows.astype(np.float32))
 
     def reset(self) -> None:
-        """Make the next observation the first again."""
+        """Start the motion anew from the joints of the next observation."""
         self._start = None
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no connection."""
 
     def _begin(self, observation: Observation) -> None:
-        """Choose the side with more room for each joint, within its limits."""
+        """Choose for each joint the direction with more room to its limit, and start from the observed joints."""
         robot = self._robot
         self._start = np.clip(observation.qpos.astype(np.float64), robot.lower, robot.upper)
         self._first_step = observation.step

@@ -37,7 +37,7 @@ class NoPolicy(Policy):
         raise PolicyError(_NONE)
 
     def reset(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no state."""
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no connection."""

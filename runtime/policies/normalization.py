@@ -39,7 +39,7 @@ class Statistics(Settings):
         return self
 
     def require_width(self, width: int) -> None:
-        """Raise ConfigurationError if rows have another width."""
+        """Raise ConfigurationError if these statistics are not for rows of `width` values."""
         if len(self.low) != width:
             raise ConfigurationError(
                 f"policy.statistics has {len(self.low)} numbers; the rows of this robot have {width}"

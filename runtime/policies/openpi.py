@@ -1,7 +1,7 @@
-"""Policies on openpi websocket servers: metadata on connect, then one map per observation, one map of actions.
+"""Policies on openpi websocket servers: metadata on connect, then one map of actions for each map of an observation.
 
-Source: openpi's websocket_policy_server and openpi-client. The layout of requests is declared in the configuration,
-so that those of ALOHA, DROID and LIBERO are settings and not code.
+Source: openpi's websocket_policy_server and openpi-client. The layout of requests is declared in the configuration, so
+that the layouts of ALOHA, DROID and LIBERO are settings and not code.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class OpenpiPolicy(WebsocketPolicy):
         self._own_relative = None if config.rtc_model_rows is None else config.rtc_model_rows == "relative"
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return the chunk; `timing` contains the server's durations [ms] and our `round_trip_ms`.
+        """Return the chunk; `timing` contains the durations [ms] that the server states and our `round_trip_ms`.
 
         Raises:
             PolicyLostError: The server is absent or does not respond. The next call opens another connection.
@@ -130,7 +130,7 @@ class OpenpiPolicy(WebsocketPolicy):
         return self._chunk(result, round_trip)
 
     def reset(self) -> None:
-        """Do nothing: the protocol has no reset, and no response depends on an earlier one."""
+        """Do nothing, because the protocol has no reset, and no response depends on an earlier request."""
 
     def request(self, observation: Observation) -> dict[str, object]:
         """Return the request map for an observation in the declared layout, without the dialect's additions."""
@@ -159,9 +159,9 @@ class OpenpiPolicy(WebsocketPolicy):
             raise
 
     def _mismatch_reason(self, request: bytes, answer: bytes, took: float) -> str:
-        """Return the reason to suspect a response; also one that is faster than the server's stated inference time.
+        """Return the reason to suspect that this response belongs to an earlier request, "" if there is none.
 
-        Such a response was under way before its request.
+        Besides the usual reasons: it arrived sooner than the inference time that it states.
         """
         with contextlib.suppress(CodecError):  # reported by `infer`
             reply = msgpack_arrays.unpack(answer, ANSWER_LIMIT)
@@ -195,7 +195,10 @@ class OpenpiPolicy(WebsocketPolicy):
         return None if origin is None else parse_action_rows("origin_actions", origin)
 
     def _as_served(self, conditioning: Conditioning | None) -> Conditioning | None:
-        """Convert conditioning rows to the server's values; absolute rows were stored as the server sent them."""
+        """Return the conditioning with its rows converted to the server's values.
+
+        Rows in absolute mode are unchanged, because they were stored as the server sent them.
+        """
         if conditioning is None or self._absolute or not self._converts:
             return conditioning
         rows = self._grip.served(conditioning.previous)
@@ -205,7 +208,9 @@ class OpenpiPolicy(WebsocketPolicy):
 
 
 def _check_protocol(metadata: Mapping[str, Any]) -> None:
-    """Raise WrongProtocolError for servers that greet like openpi's but accept other requests."""
+    """Raise WrongProtocolError if the metadata belong to a server that sends metadata first, too, but accepts other
+    requests.
+    """
     kind = next((kind for mark, kind in _MARKS.items() if mark in metadata), None)
     if kind is not None:
         found = ", ".join(map(str, metadata))

@@ -17,7 +17,8 @@ def resize_image(
 ) -> UInt8:
     """Resize a picture [H, W, 3] to RGB uint8 [height, width, 3], with Pillow because policies are trained with it.
 
-    "pad" preserves the aspect ratio and centres the picture on black; sides are rounded down as in openpi.
+    "stretch" scales both sides independently. "pad" preserves the aspect ratio and centres the picture on black; sides
+    are rounded down as in openpi.
     """
     rows, columns = picture.shape[:2]
     if (rows, columns) == (height, width):

@@ -1,4 +1,4 @@
-"""Recorded episode as a policy: it returns the recorded actions exactly as they are stored."""
+"""Policy that replays a recorded episode: it returns the recorded actions exactly as they are stored."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Config(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Recorded:
-    """Actions of an episode, and their robot if it is known."""
+    """Actions of an episode, and the robot that it was recorded with, if known."""
 
     actions: Float32  # [N, W]
     fps: float
@@ -62,8 +62,8 @@ class ReplayPolicy(Policy):
     """Policy that replays an episode: row 0 is for the first observation after a reset, later rows for later steps.
 
     After a hold, a replay in joint space continues with the row of the last chunk that is nearest to the robot's
-    joints; one in poses continues with the first row of the last chunk. A chunk beyond the end repeats the last row:
-    the robot holds there, instead of running out of rows in motion and braking beyond it.
+    joints; a replay in poses continues with the first row of the last chunk. A chunk beyond the end repeats the last
+    row, so that the robot holds there; without rows it would brake, and stop beyond that row.
     """
 
     def __init__(self, config: Config, robot: Robot, clock: Clock, control_rate: float) -> None:
@@ -148,7 +148,7 @@ class ReplayPolicy(Policy):
         return _Recorded(actions, journal.fps, journal.task, journal.robot, names, state)
 
     def _require_same_robot(self, recorded: _Recorded) -> None:
-        """Raise PolicyError for actions of another known robot, or in another joint order."""
+        """Raise PolicyError if the actions are known to be of another robot, or in another order of joints."""
         own = self._robot
         if recorded.robot in robots.robot_names() and recorded.robot != own.name:
             raise PolicyError(
@@ -163,7 +163,7 @@ class ReplayPolicy(Policy):
             )
 
     def _mapping(self) -> ColumnMapping:
-        """Return a mapping that reads the action column as the state, so that no other column is needed."""
+        """Return a mapping of columns that reads the action column as the state, so that no other column is needed."""
         name = "action" if self._config.space == "joint" else "action_eef"
         column = getattr(self._config.mapping, name)
         if column is None:
@@ -211,7 +211,7 @@ class ReplayPolicy(Policy):
         )
 
     def _place(self, observation: Observation) -> int:
-        """Return the row at which the robot was held."""
+        """Return the index of the row with which the replay continues after a hold."""
         if self._actions is None or self._config.space != "joint":
             return self._row
         given = self._actions[self._row : self._row + self._config.horizon]

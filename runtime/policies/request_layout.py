@@ -93,7 +93,10 @@ class RequestLayout:
         return np.ascontiguousarray(state, dtype=np.float32)
 
     def _encode_poses(self, poses: PoseRows, observation: Observation) -> Float32:
-        """Return the observation's poses in the policy's format; for a single row, angles are in their usual range."""
+        """Return the observation's poses in the policy's format.
+
+        The observation is encoded as a single row, so that its angles are in their usual range.
+        """
         if observation.eef is None:
             raise PolicyError('policy.observation_space is "eef" but the observation has no poses')
         if observation.eef.size != self._poses_given:
@@ -116,7 +119,10 @@ class RequestLayout:
 
 
 def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> PoseRows | None:
-    """Return the row format of a space of poses, None for joints. Raises ConfigurationError if it does not fit."""
+    """Return the row format of `pose` in the space "eef", None for joints; `key` is the setting that errors name.
+
+    Raises ConfigurationError if the format does not fit.
+    """
     if space == "eef":
         return PoseRows(pose, robot, f"policy.{key}")
     reject_pose_format(pose, f"policy.{key}")
@@ -124,7 +130,11 @@ def pose_rows_for(space: Space, pose: PoseFormat, robot: Robot, key: str) -> Pos
 
 
 def _cameras(settings: RequestSettings, robot: Robot) -> dict[str, str] | None:
-    """Return the named cameras; None for all in the observation, because a deployment may lack some."""
+    """Return the declared cameras; None, for all cameras of an observation, if none are declared.
+
+    All cannot be listed in advance, because a deployment may lack some cameras of the robot. Raises ConfigurationError
+    for an unknown camera.
+    """
     if settings.cameras is None:
         return None
     known = [camera.key for camera in robot.cameras]

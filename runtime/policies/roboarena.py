@@ -1,4 +1,4 @@
-"""Policies with the RoboArena protocol, also of DreamZero, IsaacLab-Arena and vLLM-Omni, over openpi's arrays.
+"""Policies with the RoboArena protocol, which DreamZero, IsaacLab-Arena and vLLM-Omni use, too, over openpi's arrays.
 
 The server's first frame states its requirements. Every request names an endpoint, infer or reset. A text frame is an
 acknowledgement only in response to a reset, and only if it is exactly "reset successful"; any other is an error.
@@ -46,9 +46,10 @@ def build(config: Config, robot: Robot, clock: Clock, control_rate: float) -> Ro
 
 
 class RoboarenaPolicy(WebsocketPolicy):
-    """Policy with one session per run: its end, or a `reset`, ends it on the server; the next request begins another.
+    """Policy with one session per run.
 
-    A connection that the server closed between two requests, as vLLM-Omni does after half a minute, is opened again.
+    The end of the run, or `reset`, ends the session on the server; the next request begins another. A connection that
+    the server closed between two requests, as vLLM-Omni does after half a minute, is opened again.
     """
 
     PROTOCOL = "RoboArena"
@@ -69,7 +70,8 @@ class RoboarenaPolicy(WebsocketPolicy):
         )
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return the chunk; `timing` contains our `round_trip_ms`, because the protocol has no durations of the server.
+        """Return the chunk; `timing` contains only our `round_trip_ms`, because the protocol has no durations of the
+        server.
 
         Raises PolicyLostError if the server is absent or does not respond: the next call opens another connection.
         """
@@ -88,11 +90,12 @@ class RoboarenaPolicy(WebsocketPolicy):
         return self._meant.chunk(reply, {"round_trip_ms": round_trip})
 
     def observe(self, observation: Observation) -> None:
-        """Store its pictures for later requests."""
+        """Store the observation's pictures for later requests."""
         self._shown.observe(observation)
 
     def reset(self) -> None:
-        """End the session on the server and wait for the acknowledgement; nothing is sent if it had no request.
+        """End the session on the server and wait for the acknowledgement; a session without requests is not reported to
+        it.
 
         If that fails, the next `infer` tries again before its request, because the server may keep a history.
         """
@@ -103,7 +106,7 @@ class RoboarenaPolicy(WebsocketPolicy):
                 self._end_session()
 
     def end_episode(self) -> None:
-        """End the session as `reset`, but only over an open connection; otherwise the next `infer` does it."""
+        """End the session as `reset` does, but only over an open connection; otherwise the next `infer` ends it."""
         with self._lock:
             self._forget_session()
             if self._link.is_open and not self._link.closed_by_peer and not self._closed:
@@ -163,7 +166,7 @@ class RoboarenaPolicy(WebsocketPolicy):
 
 
 def _require_no_error(reply: Any) -> None:
-    """Raise the error in a reply, because vLLM-Omni reports errors as a map and stays connected."""
+    """Raise ServerReportedError if the reply is an error, which vLLM-Omni sends as a map without disconnecting."""
     if isinstance(reply, Mapping) and reply.get("type") == "error":
         said = reply.get("message") or reply.get("error") or "nothing more"
         raise ServerReportedError(f"the policy server reports an error: {said}")

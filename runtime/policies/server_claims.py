@@ -1,4 +1,4 @@
-"""Comparison of a policy server's metadata with the deployment: neither side overrides the other."""
+"""Comparison of a policy server's metadata with the deployment; if they differ, that is an error."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _COMPARED = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class DeclaredPolicy:
-    """Declaration of a policy by the deployment: its request, and the rows of its responses (`rate` in Hz)."""
+    """Statements of the deployment about a policy: its requests and the rows of its responses (`rate` in Hz)."""
 
     request: RequestSettings
     space: Space
@@ -55,14 +55,15 @@ class DeclaredPolicy:
 
 
 def check_server_claims(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
-    """Return the action space that the server names in its `where` (metadata or an answer), or None.
+    """Check the server's statements; return the action space that they name, or None.
 
-    Compared keys: action_mode and action_space, action_dim, action_rate, relative_frame, action_orientation (or
-    orientation), observation_orientation, action_pose and observation_pose (maps with the keys of a pose format), and
-    image_size (image_resolution, training_obs_image_size).
+    `where` names their origin in errors (metadata or an answer). Compared keys: action_mode and action_space,
+    action_dim, action_rate, relative_frame, action_orientation (or orientation), observation_orientation, action_pose
+    and observation_pose (maps with the keys of a pose format), and image_size (image_resolution,
+    training_obs_image_size).
 
     Raises:
-        ActionSpaceError: The two sides differ about the actions; the message names both.
+        ActionSpaceError: The server and the deployment differ about the actions; the message has both values.
         ContradictionError: They differ about something else.
     """
     if _COMPARED.isdisjoint(said):  # the case of most responses
@@ -75,7 +76,7 @@ def check_server_claims(said: Mapping[str, Any], declared: DeclaredPolicy, where
 
 
 def _pairs(said: Mapping[str, Any], declared: DeclaredPolicy) -> Iterator[tuple[str, Any, str, Any]]:
-    """Yield (server's key, its value, deployment's key, its value) for each key that the server states."""
+    """Yield (server's key, its value, deployment's key, its value) for each compared key that the server states."""
     if said.get("action_dim") is not None:
         what = "joints" if declared.space == "joint" else f"poses ({declared.pose})"
         yield "action_dim", said["action_dim"], f"action_space: {what} of this robot, numbers", declared.width
@@ -111,13 +112,13 @@ def _pose_pairs(said: Mapping[str, Any], side: str, pose: PoseFormat) -> Iterato
 
 
 def _orientation(said: object, here: str) -> object:
-    """Return our name for a server's name of an orientation; `here` if its name leaves that open."""
+    """Return our name for an orientation that the server names `said`; `here` if it is among the possible names."""
     meant = _ORIENTATIONS.get(str(said).lower(), (said,))
     return here if here in meant else meant[0]
 
 
 def _space(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Space | None:
-    """Return the space named by action_space, or by action_mode, which some servers use for the space."""
+    """Return the space that the server names by action_space, or by action_mode, which some servers use for it."""
     found: Space | None = None
     for key, words in (("action_space", [*_SPACES]), ("action_mode", [*_SPACES, *_MODES])):
         given = said.get(key)
@@ -139,7 +140,7 @@ def _space(said: Mapping[str, Any], declared: DeclaredPolicy, where: str) -> Spa
 
 
 def _size(given: Any) -> Any:
-    """Return height and width as a list of two, from one number (a square), two numbers, or three with the channels."""
+    """Return [height, width] from one number (a square), two numbers, or three numbers with the channels."""
     if isinstance(given, int | np.integer):
         return [int(given), int(given)]
     if isinstance(given, list | tuple | np.ndarray) and len(given) in (2, 3):

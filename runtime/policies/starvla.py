@@ -98,7 +98,7 @@ class StarvlaPolicy(WebsocketPolicy):
         self._silent.set()
 
     def connect(self) -> PolicyInfo:
-        """Connect, read the metadata, and ping, which only StarVLA's server answers."""
+        """Connect, read the metadata, send a ping, which only StarVLA's server answers, and start regular pings."""
         info = super().connect()
         if self._config.ping_every and self._silent.is_set():
             self._silent = threading.Event()
@@ -129,15 +129,15 @@ class StarvlaPolicy(WebsocketPolicy):
         return self._chunk(reply.get("data"), round_trip)
 
     def reset(self) -> None:
-        """Do nothing: the protocol has no reset, and no response depends on an earlier one."""
+        """Do nothing, because the protocol has no reset, and no response depends on an earlier request."""
 
     def close(self) -> None:
-        """Close as every policy, and stop the pings."""
+        """Close the connection as every policy does, and stop the pings."""
         self._silent.set()
         super().close()
 
     def payload(self, observation: Observation) -> dict[str, Any]:
-        """Return one example, with the key of the statistics."""
+        """Return the content of a request: one example, and the key of the model's statistics if there is one."""
         shown = self._layout.build(observation)
         example: dict[str, Any] = {"image": list(shown["images"].values()), "lang": observation.prompt}
         if self._config.state:
@@ -191,7 +191,10 @@ class StarvlaPolicy(WebsocketPolicy):
         self._spoken = time.monotonic()
 
     def _ping_while_idle(self, silent: threading.Event, every: float) -> None:
-        """Ping while there are no requests; a request in progress counts as traffic."""
+        """Ping until `silent` is set, if there was no request for half of `every` [s].
+
+        No ping is sent while a request is pending.
+        """
         while not silent.wait(every / 2):
             if not self._lock.acquire(blocking=False):
                 continue
@@ -205,7 +208,9 @@ class StarvlaPolicy(WebsocketPolicy):
                 self._lock.release()
 
     def _check_reply(self, reply: Mapping[str, Any], envelope: Mapping[str, Any]) -> None:
-        """Check that the reply belongs to this request and is no error; else the connection is closed."""
+        """Raise PolicyError if the reply reports an error, or belongs to another request; then the connection is also
+        closed.
+        """
         asked, found = envelope["request_id"], reply.get("request_id")
         if found != asked:
             self._link.close_gracefully()
@@ -241,7 +246,10 @@ class StarvlaPolicy(WebsocketPolicy):
 
 
 def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:
-    """Return our key, else the server's default. Raises ContradictionError if it lacks our key or has no default."""
+    """Return the key of the statistics to use: `own`, else the server's default or only key, None if it has none.
+
+    Raises ContradictionError if the server lacks `own`, or has several keys and no default.
+    """
     available = metadata.get("available_unnorm_keys")
     known = [str(key) for key in available] if isinstance(available, list) else []
     if own is not None:
@@ -261,7 +269,9 @@ def _unnorm_key(metadata: Mapping[str, Any], own: str | None) -> str | None:
 
 
 def _size(said: Any) -> list[int] | None:
-    """Return height and width from one number (a square), two, or three with the channels; None for none."""
+    """Return height and width from one number (a square), two numbers, or three with the channels; None if `said` is
+    None.
+    """
     if said is None:
         return None
     numbers = [said, said] if type(said) is int else said

@@ -1,4 +1,4 @@
-"""Watchdog that cuts operations after a deadline, with one thread per connection instead of one per request."""
+"""Watchdog that aborts operations after a deadline, with one thread per connection instead of one per request."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 
 class Watchdog:
-    """Timer that calls `cut` after a deadline. For one watched thread at a time.
+    """Timer that calls `cut` when a deadline passes, in order to abort a blocking operation. For one watched thread.
 
     Its thread starts with the first `deadline` and sleeps from deadline to deadline; operations that end in time do not
     wake it. `stop` ends it, from any thread and without waiting; a later `deadline` starts another.
@@ -27,7 +27,9 @@ class Watchdog:
 
     @contextlib.contextmanager
     def deadline(self, seconds: float) -> Iterator[Callable[[], bool]]:
-        """Cut the operation in this context after `seconds` [s]; the yielded function returns True if that happened."""
+        """Call `cut` if this context lasts longer than `seconds` [s]; the yielded function returns True if that
+        happened.
+        """
         self._begin(time.monotonic() + seconds)
         try:
             yield lambda: self._fired
@@ -36,7 +38,7 @@ class Watchdog:
                 self._deadline = math.inf
 
     def stop(self) -> None:
-        """End the thread; nothing is cut any more."""
+        """End the thread; `cut` is not called any more."""
         with self._changed:
             self._thread, self._deadline = None, math.inf
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""Common parts of websocket policies: deadlines, one request at a time, metadata first."""
+"""Common parts of websocket policies: deadlines, one request at a time, metadata in the first frame."""
 
 from __future__ import annotations
 
@@ -55,11 +55,12 @@ class ServerSettings(Settings):
 
 
 class WebsocketPolicy(Policy):
-    """Policy on one connection; after a timeout it is dropped, and the next `infer` opens another.
+    """Policy on one connection, which is dropped after a timeout; the next `infer` opens another.
 
-    Deadlines are real seconds, whatever the clock, because a remote server knows no other. The long first deadline
-    applies once after `connect`. Later no `infer` takes longer than the deadlines of connection and inference
-    together, so that a server that came back silent, or compiles again, is detected quickly.
+    Deadlines are real seconds, whatever the clock, because a remote server does not know a virtual one. The longer
+    first deadline applies to the first request after `connect`. Later no `infer` takes longer than the deadlines of
+    connection and inference together, so that a server that does not respond after a restart, or compiles again, is
+    detected quickly.
     """
 
     PROTOCOL = ""  # name in messages
@@ -77,7 +78,9 @@ class WebsocketPolicy(Policy):
 
     @abstractmethod
     def _check_metadata(self, metadata: dict[str, Any]) -> PolicyInfo:
-        """Check the server's metadata. Raises PolicyError if it is the wrong server; the connection is then dropped."""
+        """Check the server's metadata. Raises PolicyError, after which the connection is dropped, if it is the wrong
+        server.
+        """
 
     def connect(self) -> PolicyInfo:
         """Connect to the server and read its metadata; an open connection is replaced."""
@@ -91,9 +94,9 @@ class WebsocketPolicy(Policy):
             return self._open()
 
     def close(self) -> None:
-        """Leave the server and return at once; a call that waits in another thread raises PolicyError.
+        """Abort the connection and return at once; a call that waits in another thread raises PolicyError.
 
-        The user of that connection drops it, now or at the next `connect`.
+        That thread, or the next `connect`, drops the connection.
         """
         with self._turning:
             self._closed = True
@@ -132,10 +135,10 @@ class WebsocketPolicy(Policy):
             raise
 
     def _exchange(self, request: bytes) -> tuple[bytes, float]:
-        """Return the response and its round trip [ms].
+        """Return the response to `request` and its round trip [ms].
 
-        A suspicious response is requested once more over another connection, whose first response cannot belong to an
-        earlier request. If the server responds in the same way there, the suspicion is dropped from then on.
+        If a response may belong to an earlier request, the request is sent once more over another connection, whose
+        first response cannot. If the server responds in the same way there, the suspicion is dropped from then on.
         """
         seconds = self._server.inference_deadline if self._warm else self._server.first_inference_deadline
         self._warm = True

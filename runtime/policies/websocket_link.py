@@ -1,7 +1,7 @@
-"""Websocket to a policy server: a first frame on connect, then strictly one request and one response.
+"""Websocket to a policy server: a first frame on connect, then strictly one response to each request.
 
-Responses carry no id. A connection whose response is late is therefore dropped and never reused; so is one that has a
-message waiting before a request is sent.
+Responses carry no id. A connection whose response is late is therefore dropped and never reused, and so is a connection
+on which a message waits before a request is sent.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ _CLOSE_TIMEOUT = 0.5  # [s] for the closing handshake; a server busy with infere
 
 
 def wait_closed(seconds: float) -> None:
-    """Wait until all closing handshakes are done, at most `seconds` [s]. For a process that is about to end."""
+    """Wait until all closing handshakes are done, at most `seconds` [s]; call it before the process ends."""
     until = time.monotonic() + seconds
     for thread in threading.enumerate():
         if thread.name == CLOSING:
@@ -121,7 +121,7 @@ def wait_closed(seconds: float) -> None:
 class WebsocketLink:
     """Connection that can be opened again until it is aborted. For one thread, except `abort`.
 
-    `dial` returns the host and port to connect to, if they differ from the url's.
+    `dial` returns the host and port to connect to, if they differ from those of the url.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class WebsocketLink:
         """Connect anew and return the server's first frame, both within the connect deadline.
 
         Raises:
-            PolicyLostError: There is no server, not yet or no longer.
+            PolicyLostError: No server listens at the url at present.
             PolicyError: Another kind of server listens there.
         """
         self.drop()
@@ -173,7 +173,7 @@ class WebsocketLink:
     def exchange(self, request: bytes, seconds: float) -> bytes:
         """Return the response to `request`.
 
-        Raises PolicyTimeout after `seconds`, PolicyDisconnected, or the server's error.
+        Raises PolicyTimeout after `seconds` [s], PolicyDisconnected, or the error that the server sent as text.
         """
         connection = self._connection
         if connection is None:
@@ -185,9 +185,9 @@ class WebsocketLink:
             return self._receive(connection, deadline, _AN_ANSWER, seconds)
 
     def exchange_ack(self, request: bytes, seconds: float, text: str) -> bytes | None:
-        """Return None if the response is `text`, with which some servers acknowledge, else its bytes.
+        """Return the response to `request` as bytes; None if it is the acknowledgement `text`, which some servers send.
 
-        Any other text is raised as the server's error, as is every text in response to `exchange`.
+        Any other text raises an error of the server, as every text does in `exchange`.
         """
         connection = self._connection
         if connection is None:
@@ -202,7 +202,7 @@ class WebsocketLink:
     def abort(self) -> None:
         """Make calls that wait in another thread raise PolicyError, now and later.
 
-        Only the resolution of a host name continues until the connect deadline.
+        A host name that is being resolved delays that until the connect deadline.
         """
         self._aborted = True
         for connection in (self._shaking, self._connection):
@@ -215,7 +215,7 @@ class WebsocketLink:
             raise PolicyError(_CLOSED_BY_US(url=self._url))
 
     def close_gracefully(self) -> None:
-        """Close with a close frame, without which servers print a traceback, on a thread of its own."""
+        """Send a close frame, without which servers print a traceback, and close, both in a thread of its own."""
         self._watchdog.stop()
         connection, self._connection = self._connection, None
         held = self._stack.pop_all()
@@ -247,7 +247,7 @@ class WebsocketLink:
         link = self
 
         class Connection(ClientConnection):
-            """Connection that is known before its handshake, so that `abort` can end it, too."""
+            """Connection that is stored before its handshake, so that `abort` can end it during the handshake, too."""
 
             def __init__(self, *arguments: Any, **options: Any) -> None:
                 super().__init__(*arguments, **options)
@@ -298,9 +298,9 @@ class WebsocketLink:
         return WrongProtocolError(_NO_WEBSOCKET(url=self._url, error=error))
 
     def _refused(self, status: int) -> PolicyError:
-        """Return the error for an HTTP status.
+        """Return the error for the HTTP status with which a handshake was refused.
 
-        A gateway sends 502 to 504 while its server restarts; others are permanent.
+        Status 502 to 504 is temporary: a gateway sends it while its server restarts. Others are permanent.
         """
         if status in (401, 403):
             return RefusedError(_WANTS_KEY(url=self._url, status=status))
@@ -309,7 +309,7 @@ class WebsocketLink:
         return WrongProtocolError(_REFUSED(url=self._url, status=status))
 
     def _send(self, connection: ClientConnection, request: bytes, seconds: float) -> None:
-        """Send with a deadline: a server that stopped reading leaves our socket full."""
+        """Send the request within the deadline: if the server has stopped reading, sending blocks."""
         from websockets.exceptions import ConnectionClosed
 
         with self._watchdog.deadline(seconds) as was_cut:
@@ -321,7 +321,7 @@ class WebsocketLink:
                 raise self._gone(error) from error
 
     def _require_silence(self, connection: ClientConnection) -> None:
-        """Check that no message waits: it would be mistaken for the response to the next request."""
+        """Raise an error if a message waits: it would be mistaken for the response to the next request."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -372,13 +372,15 @@ class WebsocketLink:
 
 
 def _end(wire: socket.socket) -> None:
-    """Wake every thread that waits on this socket, which is unusable afterwards."""
+    """Shut the socket down, which wakes every thread that waits on it and makes it unusable."""
     with contextlib.suppress(OSError):
         wire.shutdown(socket.SHUT_RDWR)
 
 
 def error_headline(text: str) -> str:
-    """Return the last line of a traceback, which has the message, then the whole text; for JSON, its error fields."""
+    """Return a short text for a server's error: the last line of a traceback, then the whole text; for JSON, its error
+    fields.
+    """
     try:
         said = json.loads(text)
     except (ValueError, RecursionError):

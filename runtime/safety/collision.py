@@ -23,7 +23,7 @@ _NEARER = 1e-6  # [m] rounding tolerance
 class Collision:
     """Two links ("left_arm/link5"), or a link and "table", that touch or nearly touch.
 
-    `distance` is that between the capsules that model them [m], negative if they overlap.
+    `distance` is the distance between the capsules that model them [m], negative if they overlap.
     """
 
     first: str
@@ -39,7 +39,7 @@ class Collision:
 class Collisions:
     """Collision checker for joint vectors float64 [D]: links closer than `margin` [m] count as touching.
 
-    A pair that touches already may hold its distance or separate; only a further approach is forbidden. Grippers are
+    A pair that touches already may keep its distance or separate; only a further approach is forbidden. Grippers are
     not restricted: the purpose is to separate arms, and releasing an object must be possible everywhere.
     """
 
@@ -49,12 +49,12 @@ class Collisions:
         self._grippers = np.array(robot.gripper_dims, dtype=np.intp)
 
     def nearest(self, q: Float64) -> Collision | None:
-        """Return the closest pair within the margin, None if there is none."""
+        """Return the closest pair within the margin, None if no pair is."""
         apart = self._clearance.distances(q)
         return self._worst(apart, apart < self._least)
 
     def closer_pair(self, q: Float64, before: Float64) -> Collision | None:
-        """Return the closest pair that touches at `q` and has approached since `before`, None if there is none."""
+        """Return the closest pair that touches at `q` and is nearer than at `before`, None if there is none."""
         apart = self._clearance.distances(q)
         touching = apart < self._least
         if not touching.any():
@@ -64,9 +64,11 @@ class Collisions:
         )
 
     def first_on_path(self, way: Float64) -> tuple[Collision, int] | None:
-        """Return the first pair that approaches while touching, and its row in `way` [T, D]; None if there is none.
+        """Return the first pair that approaches while touching, and its row in `way` [T, D]; None if there is no such
+        pair.
 
-        The path is checked with the grippers of its first row and with those of its last: they may move at any time.
+        The path is checked with the grippers of its first row and with those of its last row, because grippers may move
+        at any time.
         """
         found = [hit for end in self._ends(way) if (hit := self._hit(self._gripping(way, end))) is not None]
         return min(found, key=lambda hit: hit[1], default=None)
@@ -87,7 +89,7 @@ class Collisions:
         return worst, at
 
     def _gripping(self, q: Float64, like: Float64) -> Float64:
-        """Return `q` with the gripper positions of `like`."""
+        """Return `q` with its gripper positions replaced by those of `like`."""
         if not len(self._grippers):
             return q
         gripping = q.copy()

@@ -45,7 +45,7 @@ _MARGIN = 1.05
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """State that an action is checked against: vectors float64 [D], times in seconds."""
+    """State against which an action is checked: vectors float64 [D], times in seconds."""
 
     previous: Float64  # last command sent
     velocity: Float64  # of the commands
@@ -59,11 +59,11 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class SafetyVerdict:
-    """Verdict: `action` float64 [D] may be sent, None if refused; `notes` are changes or the reason.
+    """Result of the checks: `action` float64 [D] may be sent, or is None if refused.
 
-    `largest_change_note` describes the dimension that was changed most, `change` is that change [rad; a gripper's
-    scaled by `Limits.radian_scale`]. `near_collision` is a pair of links that the action brings near each other, if
-    this is only warned of.
+    `notes` are the changes, or the reason of the refusal. `largest_change_note` describes the dimension that was
+    changed most, `change` is that change [rad; a gripper's scaled by `Limits.radian_scale`]. `near_collision` is a pair
+    of links that the action brings near each other, if the settings only warn of that.
     """
 
     action: Float64 | None
@@ -81,12 +81,12 @@ Path = Literal["policy", "motion"]
 
 
 class SafetyFilter:
-    """Filter of actions, in a fixed order of checks.
+    """Filter that checks actions in a fixed order.
 
     The order: finite, ages, workspace, collision, following error, jump, reachability, limits. Reachability makes the
     command satisfy velocity, acceleration and joint limits in one step: the velocity is bounded so that the joint can
-    still stop before its limit with the same acceleration, also if tick lengths vary (v dt + v^2 / 2a <= distance),
-    so that no limit contradicts another.
+    still stop before its limit with the same acceleration, also if tick lengths vary (v dt + v^2 / 2a <= distance), so
+    that no limit contradicts another.
     """
 
     def __init__(
@@ -116,9 +116,10 @@ class SafetyFilter:
         }
 
     def judge(self, action: Float64, state: RobotState, path: Path = "policy") -> SafetyVerdict:
-        """Check and limit `action` [D]; return the verdict. With `report_only` the action is unchanged, with the notes.
+        """Check and limit `action` [D]; return the verdict.
 
-        `path` selects the limits: "policy" for a policy's actions, "motion" for generated motions such as homing.
+        `path` selects the limits: "policy" for a policy's actions, "motion" for generated motions such as homing. With
+        `report_only` the action is not changed; the verdict has notes on what would have been refused or changed.
         """
         if not _usable(action, state):
             return SafetyVerdict(None, (_unusable(action, self._limits),))
@@ -169,13 +170,13 @@ class SafetyFilter:
         return ""
 
     def _place(self, action: Float64, state: RobotState, path: Path) -> str:
-        """Return why `action` is at a forbidden place (outside a box, in collision), "" if it is allowed."""
+        """Return why the position `action` is forbidden (outside a box, in collision), "" if it is allowed."""
         return self._leaves_box(action, state, path) or self._collides(action, state, path)
 
     def _leaves_box(self, action: Float64, state: RobotState, path: Path) -> str:
-        """Return which arms leave their box, "" if none.
+        """Return a message that names the arms outside their box, "" if there is none.
 
-        A policy's action must be inside; a motion may start outside, and is refused only if an arm leaves its box.
+        A policy's action must be inside; a motion may start outside, and only arms that would leave their box count.
         """
         arms = self._outside(action) if self._outside else ()
         if arms and self._outside and path == "motion":
@@ -190,7 +191,9 @@ class SafetyFilter:
         return "" if found is None else str(found)
 
     def _warned(self, verdict: SafetyVerdict, path: Path) -> SafetyVerdict:
-        """Return `verdict` with the pair that the action brings near each other, if that is only warned of."""
+        """Return `verdict`; if collisions are only warned of, with the pair of links that the action brings near each
+        other.
+        """
         if self._collisions is None or path == "motion" or self._settings.collision != "warn":
             return verdict
         assert verdict.action is not None
@@ -224,7 +227,9 @@ class SafetyFilter:
         return _JUMPS(joint=self._limits.names[worst], distance=jump[worst], allowed=self._settings.jump)
 
     def _arrival(self, action: Float64, reachable: Float64, state: RobotState, path: Path) -> str:
-        """Check the place of the command that will be sent, and the path on which it would brake from there."""
+        """Return why the command that will be sent, or the path on which it would brake, is forbidden; "" if both are
+        allowed.
+        """
         if self._outside is None and self._collisions is None:
             return ""
         velocity = (reachable - state.previous) / state.elapsed
@@ -249,7 +254,7 @@ class SafetyFilter:
     def reachable(self, action: Float64, state: RobotState, path: Path = "policy") -> Float64:
         """Return the action closest to `action` [D] within velocity, acceleration and joint limits.
 
-        Returns the same array if nothing has to change.
+        If nothing has to change, it is the same array.
         """
         dt, now = state.elapsed, state.velocity
         gain = self._rate[path] * dt
@@ -281,7 +286,7 @@ class SafetyFilter:
         return reachable
 
     def _catch_up_velocity(self, wanted: Float64, action: Float64, state: RobotState, path: Path) -> Float64:
-        """Return velocities that catch up with a target without overshooting it.
+        """Return `wanted` velocities, reduced where the command is behind its target so that it does not overshoot.
 
         After a jump of the target, the command must not arrive with all the speed gathered on the way: its speed
         relative to the target is limited to one that can still be braked within the remaining distance.
@@ -332,9 +337,9 @@ class SafetyFilter:
 
 
 def braking(position: Float64, velocity: Float64, limits: Limits, settings: SafetySettings) -> Brake:
-    """Return a stop from `position` at `velocity` [D], as hard as necessary to stay within the joint limits.
+    """Return a braking motion from `position` at `velocity` [D], as hard as necessary to stay within the joint limits.
 
-    Between `brake_acceleration` and `acceleration` of `settings`, scaled for grippers.
+    Its deceleration is between `brake_acceleration` and `acceleration` of `settings`, scaled for grippers.
     """
     ahead = np.where(velocity > 0, limits.upper - position, position - limits.lower)
     needed = velocity * velocity / (2.0 * np.maximum(ahead, 1e-9))

@@ -18,19 +18,19 @@ _TOLERANCE = 1e-6  # [rad, or a gripper's equivalent]
 
 
 class LimitedCommand(NamedTuple):
-    """Command that may be sent, float64 [D], and a note for each number that was changed."""
+    """Command that may be sent, float64 [D], with a note for each number that was changed."""
 
     action: Float64
     notes: tuple[str, ...] = ()
 
 
 class CommandLimiter:
-    """Limiter of each number to finite values, its limits, its velocity and its acceleration.
+    """Limiter of each number to finite values, to its limits, and to its velocity and acceleration limits.
 
-    Velocity and acceleration are counted from the last command. The safety filter and all generated motions stay
-    within tighter limits: this check catches their defects. If limits contradict each other, position has priority
-    over velocity, and velocity over acceleration. A joint that is outside its limits may stay there or come back.
-    Binary grippers have no velocity limit. A stop may remove any velocity at once.
+    Velocity and acceleration are computed from the last command. The safety filter and all generated motions stay
+    within tighter limits: this check catches their defects. If limits contradict each other, position has priority over
+    velocity, and velocity over acceleration. A joint that is outside its limits may stay there or come back. Binary
+    grippers have no velocity limit. A stop may remove any velocity at once.
     """
 
     def __init__(self, limits: Limits, settings: SafetySettings) -> None:
@@ -45,9 +45,9 @@ class CommandLimiter:
     def __call__(
         self, action: Float64, previous: Float64, velocity: Float64, elapsed: float, stop: bool
     ) -> LimitedCommand:
-        """Limit `action` [D], `elapsed` seconds after `previous`, which moved at `velocity`.
+        """Limit `action` [D]; `previous` was sent `elapsed` seconds before and moved at `velocity`.
 
-        `stop`: the command is that of the e-stop.
+        `stop` is True for the commands of the e-stop.
         """
         wanted = np.where(np.isfinite(action), action, previous)
         low, high = self._velocities(velocity, elapsed, stop)

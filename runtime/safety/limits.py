@@ -49,7 +49,7 @@ class Limits:
 
     @property
     def radian_scale(self) -> Float64:
-        """Equivalent of one radian in each dimension [D]; 1 for angles.
+        """Change of each dimension that counts as one radian [D]; 1 for angles.
 
         A gripper's accelerations are scaled so that its whole travel counts as GRIPPER_TRAVEL radians, whatever its
         unit: metres, 0..1, 0..100.

@@ -78,5 +78,5 @@ class SafetySettings(Settings):
 
     @property
     def sagged(self) -> float:
-        """Offset of an arm that its servo error alone may cause [rad]."""
+        """Largest distance between command and measurement that an arm's servo error alone may cause [rad]."""
         return _BESIDE if self.steady_error <= _BESIDE else self.steady_error + _NOISE

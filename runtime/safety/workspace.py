@@ -25,16 +25,16 @@ class Workspace:
         self._upper = np.array([boxes[name].upper for name in self.arms]).reshape(-1, 3)
 
     def __call__(self, q: Float64) -> tuple[str, ...]:
-        """Return the names of the arms that are outside for any of the joints q [..., D]."""
+        """Return the names of the arms that are outside their box for any of the joint vectors q [..., D]."""
         outside = self.is_outside(q)
         return tuple(name for index, name in enumerate(self.arms) if outside[..., index].any())
 
     def is_outside(self, q: Float64) -> NDArray[np.bool_]:
-        """Return which of `arms` are outside, bool [..., arms], for joints q [..., D]."""
+        """Return bool [..., arms] for joints q [..., D]: which of `arms` are outside their box."""
         return np.asarray(self.excess(q) > 0.0)
 
     def excess(self, q: Float64) -> Float64:
-        """Return the distance of each arm outside its box on the worst axis [m], [..., arms], 0 inside."""
+        """Return how far each arm is outside its box on the worst axis [m], [..., arms]; 0 inside."""
         if not self._groups:
             return np.zeros((*q.shape[:-1], 0))
         points = np.stack([arm.transform(q)[..., :3, 3] for arm in self._groups], axis=-2)

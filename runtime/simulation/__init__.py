@@ -1,1 +1,1 @@
-"""Simulated robots: execution nodes of every transport, the bench with its objects, and the renderer of cameras."""
+"""Simulated robots: an execution node for every transport, the bench with its objects, and the renderer of cameras."""

@@ -1,4 +1,4 @@
-"""Command filter of a careful execution node: one master, fresh finite targets within limits, a deadline.
+"""Command filter of a careful execution node: one master; targets that are fresh, finite and within limits; a deadline.
 
 Control words that switch the drives of a simulated robot (`runtime.simulation.drives`) are accepted from any client. A
 node with a bench also accepts the word "scene_reset", with `id`, `seed` and optionally `positions`.
@@ -34,7 +34,9 @@ _MESSAGE_LIMIT = 1024 * 1024  # [bytes]; a command has a few hundred
 
 @dataclass(frozen=True, slots=True)
 class AcceptedCommand:
-    """Accepted message; exactly one field is set: a target [D], a control word, a bench reset or a drive switch."""
+    """Accepted message; exactly one field is set: a target [D], a control word, a bench reset or a switch of the
+    drives.
+    """
 
     target: Float64 | None = None
     control: Control | None = None
@@ -47,7 +49,7 @@ class CommandGate:
 
     `refused` counts rejected messages by reason. A target is also refused if it was sent more than `deadline` [s] ago
     according to the master's own clock, provided that this clock advances. `ack` is the `seq` of the master's newest
-    message that took effect, None if the master does not number its messages. `bench` is whether the node has a bench
+    message that took effect, None if the master does not number its messages. `bench` is True if the node has a bench
     that can be reset.
     """
 
@@ -64,7 +66,7 @@ class CommandGate:
         self.refused: Counter[str] = Counter()
 
     def accept(self, payload: bytes, arrival: float) -> AcceptedCommand | None:
-        """Return the command in a message if it may take effect, else None.
+        """Return the command in a message, or None if it may not take effect.
 
         A rejected message is counted in `refused`. Messages with target "sim" have no effect and are not counted.
         `arrival` is the time of reception on the node's clock [s].
@@ -95,7 +97,7 @@ class CommandGate:
         return None
 
     def is_silent(self, now: float) -> bool:
-        """Return True if no target was accepted within the deadline, so that the robot has to hold."""
+        """Return True if no target was accepted within the deadline before `now`, so that the robot has to hold."""
         return now - self._accepted > self._deadline
 
     def _message(self, payload: bytes) -> dict[Any, Any] | None:
@@ -109,7 +111,10 @@ class CommandGate:
         return message
 
     def _rules(self, message: dict[Any, Any], arrival: float) -> bool:
-        """Return True if the sender is the master: the first sender, until it is silent for MASTER_SILENCE."""
+        """Return True if the sender is the master or becomes it.
+
+        The first sender is the master until it has been silent for MASTER_SILENCE.
+        """
         name = message.get("master")
         name = name if isinstance(name, str) else ANONYMOUS
         if self.master != name and self.master is not None and arrival - self._heard <= MASTER_SILENCE:
@@ -122,7 +127,10 @@ class CommandGate:
         return True
 
     def _switch(self, word: str, message: dict[Any, Any]) -> AcceptedCommand | None:
-        """Accept a drive switch from any client, because operators at the robot send it; the master does not change."""
+        """Return the switch of the drives that any client may send, None if the message is malformed.
+
+        Operators at the robot send it, so the master does not change.
+        """
         switch = drives.parse_switch(word, message)
         if switch is None:
             self.refused["malformed"] += 1
@@ -153,7 +161,10 @@ class CommandGate:
         )
 
     def _late(self, stamp: object, arrival: float) -> bool:
-        """Return True if the target was sent too long ago; False if it has no stamp, or the clock does not advance."""
+        """Return True if the target was sent longer ago than the deadline.
+
+        Return False if it has no stamp, or the sender's clock does not advance, because its age is then unknown.
+        """
         if type(stamp) not in (int, float) or not math.isfinite(cast(float, stamp)):
             return False
         before, self._stamp = self._stamp, cast(float, stamp)

@@ -1,7 +1,8 @@
 """Drives of a simulated robot, on or off, with faults; `python -m runtime.simulation.drives` switches them.
 
 Control words on the node's command socket: "drives_disable", "drives_enable" (which clears all faults), and
-"drives_fault" with a `fault`, a sentence. Operators at the robot send them, so the sender need not be the master.
+"drives_fault" with a `fault`, a sentence. Operators at the robot send them, so the sender need not be the gate's
+master.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ _PATIENCE_S = 5.0  # wait for a node, and for the message to be sent
 
 @dataclass(frozen=True, slots=True)
 class DriveSwitch:
-    """Request to switch the drives: on, which clears all faults; off; or off because of `fault`."""
+    """Request to switch the drives on, which clears all faults, or off, with a `fault` as reason if there is one."""
 
     on: bool
     fault: str = ""
 
 
 def parse_switch(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
-    """Return the switch that one of WORDS requests; None if its fault is missing, empty or too long."""
+    """Return the switch that `word`, one of WORDS, requests; None if its fault is missing, empty or too long."""
     if word != "drives_fault":
         return DriveSwitch(word == "drives_enable")
     fault = message.get("fault")
@@ -40,14 +41,14 @@ def parse_switch(word: str, message: Mapping[Any, Any]) -> DriveSwitch | None:
 
 
 class Drives:
-    """State of the drives: off while there is a fault; disabled drives do not move the robot."""
+    """State of the drives; they are off while there is a fault, and then do not move the robot."""
 
     def __init__(self, enabled: bool = True, faults: Sequence[str] = ()) -> None:
         self._faults = list(faults)
         self.enabled = enabled and not faults
 
     def apply(self, switch: DriveSwitch) -> None:
-        """Switch on, off, or off with one more fault; only the newest DRIVE_FAULTS_LIMIT faults are retained."""
+        """Switch the drives on, off, or off with one more fault; the newest DRIVE_FAULTS_LIMIT faults are retained."""
         self.enabled = switch.on
         faults = [] if switch.on else [*self._faults, *([switch.fault] if switch.fault else [])]
         self._faults = faults[-DRIVE_FAULTS_LIMIT:]
@@ -75,7 +76,7 @@ def send_word(endpoint: str, word: str, fault: str = "") -> bool:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Switch the drives of a node; exit code 0 if the word was sent, 1 if no node listens."""
+    """Switch the drives of a node; return 0 if the word was sent, 1 if no node listens."""
     line = argparse.ArgumentParser(
         prog="python -m runtime.simulation.drives", description="Switches the drives of a simulated robot."
     )

@@ -22,7 +22,9 @@ NAMES = ("none", "tabletop", "conveyor")
 
 
 class Environment(ABC):
-    """Environment of a simulated robot: advances the robot and everything that it touches, and renders the cameras."""
+    """Environment of a simulated robot: it advances the robot and everything that it touches, and renders the
+    cameras.
+    """
 
     @abstractmethod
     def move(self, plant: Plant, seconds: float) -> None:
@@ -38,7 +40,7 @@ class Environment(ABC):
 
     @abstractmethod
     def reset(self, wish: ResetRequest) -> None:
-        """Reset the bench.
+        """Reset the bench as requested.
 
         Raises:
             BenchError: If the requested layout is not possible.
@@ -54,7 +56,7 @@ class TestPatternEnvironment(Environment):
         self._scene = Scene(robot, options.height, options.width, options.seed)
 
     def move(self, plant: Plant, seconds: float) -> None:
-        """Advance the plant, which moves freely."""
+        """Advance the plant, which touches nothing."""
         plant.advance(seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
@@ -62,10 +64,10 @@ class TestPatternEnvironment(Environment):
         return self._scene.draw(frame, seconds, q)
 
     def truth(self) -> None:
-        """Return None: there is no bench."""
+        """Return None, because there is no bench."""
 
     def reset(self, wish: ResetRequest) -> None:
-        """Raise AssertionError: there is no bench, and the command gate refuses such requests."""
+        """Raise AssertionError: without a bench the command gate refuses such requests."""
         raise AssertionError(f"reset {wish.id} of a bench that is not there")
 
 
@@ -87,7 +89,10 @@ class BenchEnvironment(Environment):
         self._tabletop.advance(plant, seconds)
 
     def pictures(self, frame: int, seconds: float, q: Float64) -> dict[str, UInt8]:
-        """Return the rendered images; they are drawn only if something has moved, as drawing is most of the work."""
+        """Return the rendered images.
+
+        They are drawn only if something has moved, because drawing is most of the work.
+        """
         state = self._tabletop.state()
         moment = np.concatenate([q, state.plate, *(block.pose.ravel() for block in state.blocks)]).tobytes()
         if moment != self._drawn[0]:
@@ -101,7 +106,7 @@ class BenchEnvironment(Environment):
         return self._tabletop.truth()
 
     def reset(self, wish: ResetRequest) -> None:
-        """Reset the bench."""
+        """Reset the bench as requested."""
         self._tabletop.reset(wish)
 
 

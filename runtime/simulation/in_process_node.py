@@ -1,4 +1,4 @@
-"""Simulated node within this process, for lockstep: its real messages in both directions, without sockets."""
+"""Simulated node within the station's process, for lockstep: the same messages in both directions, without sockets."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _NAME = "lockstep"
 class InProcessNode(Source, Sink):
     """Source and sink of a transport around a `Node` whose sockets are not opened.
 
-    The node advances in `receive`: it executes the commands sent since the previous observation, then lets the elapsed
-    time pass. An observation therefore shows the effect of the commands of all earlier ticks. Messages pass through the
-    codec, the node's command gate and the transport's message check, as with sockets.
+    The node advances in `receive`: it executes the commands sent since the previous observation, then advances by the
+    time that has passed. An observation therefore shows the effect of the commands of all earlier ticks. Messages pass
+    through the codec, the node's command gate and the transport's message check, as with sockets.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class InProcessNode(Source, Sink):
         clock: Clock,
         seen: Callable[[Observation], None] = lambda observation: None,
     ) -> None:
-        """Wrap `node`; `seen` is also called with every observation, for example by a simulated leader."""
+        """Wrap `node`; `seen` is called with every observation, for example by a simulated leader."""
         self._node, self._clock, self._seen = node, clock, seen
         self._messages = NodeMessages(robot, "bgr", frozenset(), MESSAGE_LIMIT)
         self._commands: list[bytes] = []
@@ -45,7 +45,7 @@ class InProcessNode(Source, Sink):
         self._looked: float | None = None
 
     def connect(self) -> None:
-        """Do nothing: there is no connection."""
+        """Do nothing, because there is no connection."""
 
     def receive(self, timeout: float) -> Observation | None:
         """Return an observation of the node; None if no time has passed since the previous one. Never waits.

@@ -1,4 +1,4 @@
-"""Simulated leader: `python -m runtime.simulation.leader --robot NAME`; stands in for a person's arm that demonstrates.
+"""Simulated leader: `python -m runtime.simulation.leader --robot NAME`; it replaces the leader arm that a person moves.
 
 It subscribes to a simulated execution node and publishes over ZMQ the joints that the script of the tabletop task would
 reach a moment later, as a person does who watches the bench and moves a leader arm. Its messages are those that
@@ -40,9 +40,9 @@ _AHEAD_S = 0.1  # [s] lead: a leader is ahead of the robot that follows it
 
 
 class SimulatedLeader:
-    """Leader joints from a script: at `start` [D] until the first observation, then along the script's rows.
+    """Leader whose joints come from a script: `start` [D] until the first observation, then the script's rows.
 
-    `rate` is that of the script's rows [Hz].
+    `rate` is the rate of the script's rows [Hz].
     """
 
     def __init__(self, robot: Robot, script: Script, task: str, rate: float, start: Float64) -> None:
@@ -53,7 +53,7 @@ class SimulatedLeader:
         self._asked = float("-inf")
 
     def update(self, observation: Observation, now: float) -> None:
-        """Update the script's rows from an observation, at most every _ASKS_S seconds; `now` is the time [s]."""
+        """Let the script answer the observation at time `now` [s], if it did not within the last _ASKS_S seconds."""
         if now - self._asked < _ASKS_S:
             return
         q = np.asarray(observation.qpos, np.float64)
@@ -87,24 +87,25 @@ class AttachedLeader(Leader):
         return "the simulated leader"
 
     def connect(self) -> None:
-        """Do nothing: there is no connection."""
+        """Do nothing, because there is no connection."""
 
     def update(self, observation: Observation) -> None:
-        """Update the simulated leader from an observation, and report its joints."""
+        """Update the simulated leader from an observation, and publish its joints as its newest pose."""
         now = self._clock.now()
         self._simulated.update(observation, now)
         self._set_pose(self._simulated.joints_at(now), now)
 
     def close(self) -> None:
-        """Do nothing: there are no resources."""
+        """Do nothing, because there are no resources."""
 
 
 def demonstrator(
     robot: Robot, task: str, seed: int, behaviour: str = "pick_place", start: str = "home"
 ) -> SimulatedLeader:
-    """Return a simulated leader that performs `task` by the script of `behaviour` ("pick_place", else a gesture).
+    """Return a simulated leader that performs `task` by the script that `behaviour` names.
 
-    Before the first observation it is at the pose `start`.
+    That is "pick_place", or any other name for a gesture. Before the first observation the leader is at the pose
+    `start`.
 
     Raises:
         SetupError: If the robot has no such pose, or no arm of it can pick objects up.

@@ -3,8 +3,8 @@
 Each tick executes the newest command, moves the plant and publishes one observation. Beyond the plain protocol an
 observation contains the frame number (`seq`), colour order (`encoding`), current master (`master`), number of the
 master's last message that took effect (`ack`), refused messages by reason (`refused`), whether the robot is `holding`
-for lack of commands, and the state of its `drives`. With `--bench tabletop` or `conveyor` there are objects; the word
-"scene_reset" resets them, and the field `truth` is their ground truth.
+because it receives no commands, and the state of its `drives`. With `--bench tabletop` or `conveyor` there are objects;
+the word "scene_reset" resets them, and the field `truth` is their ground truth.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _NO_LEADER = "the simulated node has no leader arm"
 
 
 class Ticking(Protocol):
-    """Object that `run` advances."""
+    """Interface of objects that `run` advances."""
 
     def tick(self, seconds: float) -> None:
         """Advance by `seconds`."""
@@ -52,11 +52,11 @@ class Ticking(Protocol):
 class Node:
     """Simulated node of one robot with two sockets; call `open`, then `tick` at the rate, then `close`.
 
-    To exchange messages without sockets, call `exchange` instead. `around` replaces the environment that the options
-    name.
+    To exchange messages without sockets, call `exchange` instead. `around` is used instead of the environment that the
+    options name.
 
     Raises:
-        SetupError: If a camera or pose of the options does not exist.
+        SetupError: If a camera or pose in the options does not exist.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Node:
         return self._sockets.addresses
 
     def tick(self, seconds: float) -> None:
-        """Execute the received commands, move for `seconds`, publish an observation."""
+        """Execute the received commands, move for `seconds`, and publish an observation."""
         assert self._sockets is not None
         self._sockets.publish(self.exchange(self._sockets.received(), seconds))
 
@@ -110,7 +110,9 @@ class Node:
         self._sockets = None
 
     def _obey(self, payloads: Sequence[bytes]) -> None:
-        """Filter all received messages and execute them; of several targets only the newest takes effect."""
+        """Filter the received messages and execute the accepted ones; of several targets only the newest takes
+        effect.
+        """
         newest = None
         for payload in payloads:
             accepted = self._gate.accept(payload, self._clock.now())
@@ -128,7 +130,7 @@ class Node:
             self._plant.target = newest
 
     def _control(self, accepted: AcceptedCommand) -> None:
-        """Execute a control word; words are sent several times, so repetitions change nothing."""
+        """Execute a control word; it may be received several times, which has no further effect."""
         if accepted.control == "collect_start" and self._leader_phase is None:
             self._leader_phase = self._leader.phase_of(self._plant.q)
         elif accepted.control == "collect_stop" and self._leader_phase is not None:
@@ -192,7 +194,7 @@ class Node:
 
 
 def run(node: Ticking, clock: Clock, rate: float, told: Event) -> None:
-    """Call `tick` at absolute deadlines until `told` is set; missed ticks are skipped.
+    """Call `tick` at absolute deadlines until the event `told` is set; missed ticks are skipped.
 
     A tick that is late by less than half a period still runs at once, so that the next one is on time again.
     """
@@ -275,7 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def start_pose(robot: Robot, name: str) -> Float64:
-    """Return the joints [D] of a pose.
+    """Return the joints [D] of the pose `name`.
 
     Raises:
         SetupError: If the robot has no such pose; the message lists its poses.
@@ -286,7 +288,7 @@ def start_pose(robot: Robot, name: str) -> Float64:
 
 
 def positive(text: str) -> float:
-    """Return a number of the command line that is above zero and below 1e6."""
+    """Parse a number of the command line that is above zero and below 1e6."""
     number = float(text)
     if not 0 < number < 1e6:
         raise argparse.ArgumentTypeError(f"{text} is not above zero and below 1,000,000")

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def names(text: str) -> list[str]:
-    """Split names that are separated by commas."""
+    """Return the names in a text in which commas separate them."""
     return [name.strip() for name in text.split(",")]
 
 
@@ -35,7 +35,10 @@ def announce_ready(ready: Mapping[str, object], path: Path | None) -> None:
 
 
 def stop_event(lifeline: bool) -> threading.Event:
-    """Return an event that SIGTERM and SIGINT set, and the end of standard input if `lifeline`; main thread only."""
+    """Return an event that is set by SIGTERM and SIGINT, and with `lifeline` also by the end of standard input.
+
+    Call it in the main thread.
+    """
     told = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: told.set())

@@ -37,7 +37,10 @@ _LOGGING = "version: 1\ndisable_existing_loggers: false\n"
 
 
 class Ros1Node(RosRobot):
-    """ROS 1 node of one simulated robot; `open`, then `tick` at the rate, then `close`. A process can open only one."""
+    """ROS 1 node of one simulated robot; call `open`, then `tick` at the rate, then `close`.
+
+    A process can open only one.
+    """
 
     VERSION = 1
 
@@ -141,7 +144,9 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the ground truth of the bench as JSON."""
+    """Run the node until SIGTERM, SIGINT or the end of the lifeline; then print the ground truth of the bench
+    as JSON.
+    """
     import robots
 
     options = parser().parse_args(arguments)

@@ -36,7 +36,7 @@ _COMMANDS_TAKEN = 32  # samples per topic and tick
 
 
 class Ros2Node(RosRobot):
-    """ROS 2 node of one simulated robot; `open`, then `tick` at the rate, then `close`."""
+    """ROS 2 node of one simulated robot; call `open`, then `tick` at the rate, then `close`."""
 
     VERSION = 2
 
@@ -108,7 +108,10 @@ class Ros2Node(RosRobot):
         return DataWriter(self._entities[1], channel, Qos(how, Policy.History.KeepLast(10)))
 
     def _reader(self, topic: str) -> Any:
-        """Return a reader with the default QoS of ROS 2 drivers: reliable, so best-effort commands do not match."""
+        """Return a reader of commands with the default QoS of ROS 2 drivers.
+
+        It is reliable, so that a best-effort publisher of commands is not connected.
+        """
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
@@ -139,7 +142,9 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run until SIGTERM, SIGINT or the end of the lifeline; then print the ground truth of the bench as JSON."""
+    """Run the node until SIGTERM, SIGINT or the end of the lifeline; then print the ground truth of the bench
+    as JSON.
+    """
     import robots
 
     options = parser().parse_args(arguments)

@@ -15,7 +15,7 @@ _DRAINED_COMMANDS = 1000  # per tick; a flood must not stop publishing
 
 
 class Sockets:
-    """Publisher of observations and subscriber of commands, bound on construction.
+    """Publisher of observations and subscriber of commands, both bound on construction.
 
     Raises:
         SetupError: If an address is in use, or reachable from other machines without `insecure`.

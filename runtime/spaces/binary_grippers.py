@@ -1,4 +1,4 @@
-"""Binary grippers: snapping of numbers to open or closed, and the least interval between two switches."""
+"""Binary grippers: snapping of numbers to open or closed, and the shortest time between two switches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _EARLY_S = 1e-6  # [s] rounding tolerance of summed times
 
 @dataclass(frozen=True, slots=True)
 class BinaryGripper:
-    """A binary gripper: its index in the robot's vector, its two values, its threshold and hysteresis.
+    """Binary gripper: its index in the robot's vector, its two values, its threshold and hysteresis.
 
     A number farther than half the `hysteresis` from the `threshold` opens or closes the gripper; a nearer number does
     not switch it. Without hysteresis a number at the threshold opens it.
@@ -35,14 +35,19 @@ class BinaryGripper:
         return number >= self.threshold if self.open > self.close else number <= self.threshold
 
     def snap(self, wanted: float, before: float) -> float:
-        """Snap `wanted` to the open or closed value, with hysteresis around the previous command `before`."""
+        """Return the open or closed value for the number `wanted`, with hysteresis; `before` is the previous
+        command.
+        """
         beyond = (wanted - self.threshold) * (1.0 if self.open > self.close else -1.0)
         half = 0.5 * self.hysteresis * _ROUNDING
         opens = beyond >= half or (beyond > -half and self.is_open(before))
         return self.open if opens else self.close
 
     def snap_sequence(self, wanted: Float64, before: float) -> Float64:
-        """Snap the numbers `wanted` [H] in order, each with the result before it as previous command."""
+        """Return the open or closed values for the numbers `wanted` [H], with hysteresis.
+
+        `before` is the command before the first number; each result is the previous command for the next number.
+        """
         return np.array([before := self.snap(number, before) for number in wanted.tolist()], np.float64)
 
 
@@ -59,7 +64,7 @@ def binary_grippers_of(robot: Robot) -> tuple[BinaryGripper, ...]:
 
 
 def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commanded: Float64) -> Float64:
-    """Return `action` [D] with every binary gripper snapped, given the previous command `commanded` [D].
+    """Return `action` [D] with every binary gripper snapped; `commanded` [D] is the previous command.
 
     Numbers that are not finite are not changed, nor is an action of another shape.
     """
@@ -75,7 +80,10 @@ def snap_grippers(switches: tuple[BinaryGripper, ...], action: Float64, commande
 
 
 class Dwell:
-    """Hold of each binary gripper for MIN_SWITCH_INTERVAL_S after a switch, for commands of any origin."""
+    """Limit on switches of binary grippers: each is held for MIN_SWITCH_INTERVAL_S after a switch.
+
+    It applies to commands of any origin.
+    """
 
     def __init__(self, limits: Limits) -> None:
         self._names = limits.names
@@ -84,7 +92,9 @@ class Dwell:
         self._switched = np.full(len(limits.binary), -np.inf)  # time of the last switch [s]
 
     def apply(self, action: Float64, commanded: Float64, now: float) -> tuple[Float64, tuple[str, ...]]:
-        """Return `action` [D] with grippers that would switch too soon held at `commanded` [D], and notes on them."""
+        """Return `action` [D], with grippers that would switch too soon held at `commanded` [D], and a note on each of
+        them.
+        """
         early = now - self._switched < MIN_SWITCH_INTERVAL_S - _EARLY_S
         if not early.any() or action.shape != commanded.shape:
             return action, ()
@@ -99,7 +109,9 @@ class Dwell:
         return np.where(kept, commanded, action), notes
 
     def record_command(self, before: Float64, now_sent: Float64, now: float) -> None:
-        """Record that `now_sent` [D] was sent after `before` [D]: a gripper that switched is held from `now` [s] on."""
+        """Record that `now_sent` [D] was sent after `before` [D]; grippers that switched are held from the time `now`
+        [s] on.
+        """
         self._switched[self._switches(now_sent, before)] = now
 
     def _switches(self, action: Float64, before: Float64) -> np.ndarray:

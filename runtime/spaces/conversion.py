@@ -29,9 +29,9 @@ _LONGEST = 2000  # rows per chunk, as received and at control rate: IK is sequen
 class ChunkStart:
     """Point at which a chunk takes over from the present command; vectors float64 [D].
 
-    `commanded` is the present command: grippers and joints that the rows do not contain hold it. `previous_command`
-    is the command of the step before row `first_row`, the first row that will be executed: from there on the solved
-    joints respect their velocity limits. For a robot at rest it is the measured position.
+    `commanded` is the present command: grippers and joints that the rows do not contain hold it. `previous_command` is
+    the command of the step before row `first_row`, the first row that will be executed: from that row on the solved
+    joints respect their velocity limits. For a robot at rest `previous_command` is the measured position.
     """
 
     commanded: Float64
@@ -41,11 +41,12 @@ class ChunkStart:
 
 @dataclass(frozen=True, slots=True)
 class CommandRows:
-    """A chunk in command space at control rate.
+    """Chunk in command space at control rate.
 
-    `rows` float64 [H', D] are absolute joint targets; `source_rows` int64 [H'] is the policy's row that each was made
-    from; `ik_result` has the errors of the solved poses and `targets` [H', arms, 7] the poses, both None for a joint
-    chunk. `first` [D] are the joints of the first pose without velocity limits, None if rows[0] is already that.
+    `rows` float64 [H', D] are absolute joint targets; `source_rows` int64 [H'] is the index of the policy's row from
+    which each was made. `ik_result` has the errors of the solved poses and `targets` [H', arms, 7] the poses; both are
+    None for a joint chunk. `first` [D] are the joints of the first pose without velocity limits, None if rows[0]
+    already has them.
     """
 
     rows: Float64
@@ -61,10 +62,10 @@ class CommandRows:
 
 
 class ActionSpaces(EndEffectors):
-    """A robot's action spaces: joint rows [H, D], and pose rows, which inverse kinematics converts to joints.
+    """Action spaces of a robot: joint rows [H, D], and pose rows, which inverse kinematics converts to joints.
 
     An arm's vector is x, y, z [m], unit quaternion w, x, y, z, gripper, in the arm's declared frame, whatever the
-    format of the rows. `control_rate` [Hz] is the rate of commands, and that of chunks that declare none.
+    format of the rows. `control_rate` [Hz] is the rate of commands, and of chunks that declare no rate.
     """
 
     def __init__(self, robot: Robot, kinematics: Kinematics, control_rate: float) -> None:
@@ -93,15 +94,15 @@ class ActionSpaces(EndEffectors):
     ) -> CommandRows:
         """Convert a chunk that was computed from `observation` to absolute joint rows at control rate.
 
-        The steps, in order: check; decode poses from their format; make them absolute with the observation (poses
-        with its poses, or those of its joints, in the declared frame); snap binary grippers, with hysteresis from the
-        present command; resample; solve poses, row 0 from the observed joints, each further row from its predecessor,
-        with velocity limits from `onset` on (without it the robot is assumed to be at rest where it was observed);
-        unwrap joints without limits from the observed joints on. Other grippers are copied. Joints that the rows do
-        not contain hold `onset.commanded`.
+        The steps, in order: check the rows; decode poses from their format; make them absolute with the observation
+        (poses with its poses, or with those of its joints, in the declared frame); snap binary grippers, with
+        hysteresis from the present command; resample; solve poses, row 0 from the observed joints, each further row
+        from its predecessor; unwrap joints without limits from the observed joints on. Solved joints respect velocity
+        limits from `onset` on; without `onset` the robot is assumed to be at rest at the observed joints. Other
+        grippers are copied. Joints that the rows do not contain hold `onset.commanded`.
 
         Raises:
-            PolicyError: wrong width, a number that is not finite, or numbers that determine no orientation.
+            PolicyError: Wrong width, a number that is not finite, or numbers that determine no orientation.
         """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         rate = chunk.rate or self._control_rate
@@ -124,10 +125,10 @@ class ActionSpaces(EndEffectors):
     def _snap_grippers(
         self, rows: Float64, columns: Mapping[int, int], onset: ChunkStart, rate: float
     ) -> list[int]:
-        """Snap binary grippers in `rows` [H, W] in place; `columns` by dimension. Return their columns.
+        """Snap the binary grippers in `rows` [H, W] in place; return their columns, which `columns` has by dimension.
 
-        The hysteresis starts from the present command twice: the first executable row follows that command, and not
-        the rows before it, which will never be executed.
+        The hysteresis starts from the present command twice: at row 0, and at the first row that will be executed,
+        because that row follows the present command and not the rows before it.
         """
         first = int(onset.first_row * rate / self._control_rate + 1e-9)
         found = [(switch, columns[switch.dim]) for switch in self._switches if switch.dim in columns]
@@ -139,7 +140,9 @@ class ActionSpaces(EndEffectors):
         return [column for _, column in found]
 
     def pose_mismatch(self, measured: ArrayLike, q: ArrayLike) -> str:
-        """Describe by how much measured poses [8 * arms] differ from those of q [D], worst arm; "" if equal."""
+        """Describe how much measured poses [8 * arms] differ from those of joints `q` [D], for the worst arm; "" if
+        equal.
+        """
         joints = np.asarray(q, dtype=np.float64)
         expected = self.vectors(joints)
         given = np.asarray(measured, dtype=np.float64).reshape(self._count, EEF_WIDTH)
@@ -158,7 +161,7 @@ class ActionSpaces(EndEffectors):
         )
 
     def _layout_of(self, pose: PoseFormat | None) -> PoseRows:
-        """Return the row layout of a format; the last one is cached, because a policy uses a single format."""
+        """Return the row layout of a pose format; the last layout is cached, because a policy uses a single format."""
         wanted = CANONICAL if pose is None else pose
         if self._layout is None or self._layout.pose != wanted:
             self._layout = PoseRows(wanted, self._robot, "the policy's pose format")
@@ -179,7 +182,9 @@ class ActionSpaces(EndEffectors):
     def _absolute_poses(
         self, rows: Float64, layout: PoseRows, chunk: ActionChunk, observation: Observation
     ) -> Float64:
-        """Return absolute vectors in each arm's own frame, flat, and the following joints: [H, 8 * arms + n]."""
+        """Return absolute vectors in each arm's own frame, followed by the joints after the poses: [H, 8 * arms
+        + n].
+        """
         qpos = np.asarray(observation.qpos, dtype=np.float64)
         vectors, joints = layout.decode(rows)
         joints = self._absolute_joints(joints, chunk, qpos, layout.dims)
@@ -201,7 +206,9 @@ class ActionSpaces(EndEffectors):
         return layout.normalize_quaternions(vectors, f"the chunk is {chunk.mode} to an observation with")
 
     def _with_joints(self, qpos: Float64, layout: PoseRows, joints: Float64) -> Float64:
-        """Return `qpos` [D] repeated for each row, with the joints that follow the poses: [H, D]."""
+        """Return `qpos` [D] repeated for each row, with its values replaced by `joints` that follow the poses:
+        [H, D].
+        """
         made = np.tile(qpos, (len(joints), 1))
         made[:, layout.dims] = joints
         return made
@@ -223,7 +230,10 @@ class ActionSpaces(EndEffectors):
         return CommandRows(self._unwrapped(commands, qpos, self._all), source, solved, first, targets)
 
     def meet(self, made: CommandRows, row: int) -> tuple[IkResult, float]:
-        """Solve row `row` without velocity limits; return the result and its distance from the row's joints [rad]."""
+        """Solve the pose of row `row` again without velocity limits.
+
+        Return the result, and its largest distance from that row's joints [rad].
+        """
         assert made.ik_result is not None
         assert made.targets is not None
         free = self._kinematics.solve(made.targets[row : row + 1], made.ik_result.q[row])
@@ -232,7 +242,10 @@ class ActionSpaces(EndEffectors):
     def _assembled(
         self, solved: Float64, poses: Float64, layout: PoseRows, joints: Float64, onset: ChunkStart
     ) -> Float64:
-        """Combine solved arms, grippers and appended joints; all other joints hold, and a base stops."""
+        """Return rows of commands [H, D] from the solved arms, the grippers and the joints that follow the poses.
+
+        All other joints hold the present command, and a base stops.
+        """
         commands = solved.copy()
         commands[:, self._still] = onset.commanded[self._still]
         commands[:, self._speeds] = 0.0  # a base without commands in the rows stops
@@ -244,10 +257,10 @@ class ActionSpaces(EndEffectors):
     def _compensate_carrier(
         self, poses: Float64, layout: PoseRows, joints: Float64, qpos: Float64
     ) -> Float64:
-        """Return poses [H, arms, 7] for a solver that assumes the arms' carrier (a torso) at `qpos`.
+        """Return poses [H, arms, 7] for a solver that assumes the arms' carrier (a torso) to be at `qpos`.
 
-        If the rows move the carrier, each pose is moved with it, so that the solved joints are right when it has
-        moved.
+        If the rows move the carrier, each pose is moved in the opposite way, so that the solved joints are right when
+        the carrier has moved.
         """
         made = poses
         for index, arm in enumerate(self._robot.arms):
@@ -261,7 +274,7 @@ class ActionSpaces(EndEffectors):
         return made
 
     def _unwrap_start(self, onset: ChunkStart, qpos: Float64) -> ChunkStart:
-        """Return `onset` with endless joints on the branch on which they were observed."""
+        """Return `onset` with joints without limits shifted by whole turns to within half a turn of `qpos`."""
 
         def on_branch(joints: Float64) -> Float64:
             made = np.array(joints, dtype=np.float64)
@@ -272,7 +285,9 @@ class ActionSpaces(EndEffectors):
         return ChunkStart(on_branch(onset.commanded), on_branch(onset.previous_command), onset.first_row)
 
     def _unwrapped(self, rows: Float64, qpos: Float64, dims: NDArray[np.intp]) -> Float64:
-        """Return rows of the joints `dims`; endless joints start on the branch nearest `qpos` and do not jump."""
+        """Return rows of the joints `dims` without jumps in joints without limits, which start within half a turn of
+        `qpos`.
+        """
         endless = np.flatnonzero(np.isin(dims, self._wrapping))
         turning = np.concatenate([qpos[dims[endless]][None], rows[:, endless]])
         rows[:, endless] = np.unwrap(turning, axis=0)[1:]

@@ -1,4 +1,4 @@
-"""End-effector vectors of joints, by forward kinematics."""
+"""End-effector vectors for given joints, by forward kinematics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _GRIPPER = EEF_WIDTH - 1
 
 
 class EndEffectors:
-    """End-effector vectors of a robot's arms: x, y, z [m], unit quaternion w, x, y, z, gripper.
+    """Calculator of the end-effector vectors of a robot's arms: x, y, z [m], unit quaternion w, x, y, z, gripper.
 
     Poses are in each arm's declared frame.
     """
@@ -27,10 +27,10 @@ class EndEffectors:
         self._grippers = [arm.gripper_dim for arm in arms if arm.gripper_dim is not None]
 
     def eef_of(self, q: ArrayLike, previous: ArrayLike | None = None) -> Float32:
-        """Return end-effector vectors float32 [..., 8 * arms] of joints [..., D].
+        """Return end-effector vectors float32 [..., 8 * arms] for joints [..., D].
 
-        Quaternions of rows [T, D] have continuous signs. The (first) quaternion has w >= 0 or, if `previous` [8 *
-        arms] is given, the sign closer to it, so that a sequence of single calls is continuous too.
+        Quaternions of rows [T, D] have continuous signs. The (first) quaternion has w >= 0 or, if `previous` [8 * arms]
+        is given, the sign closer to it, so that a sequence of single calls is continuous, too.
         """
         joints = np.asarray(q, dtype=np.float64)
         vectors = self.vectors(joints)
@@ -44,7 +44,9 @@ class EndEffectors:
         return vectors.reshape(*joints.shape[:-1], -1).astype(np.float32)
 
     def vectors(self, joints: Float64) -> Float64:
-        """Return the vectors as float64 [..., arms, 8]; w >= 0, and 0 for the gripper of an arm without one."""
+        """Return the vectors as float64 [..., arms, 8], with w >= 0; an arm without a gripper has 0 as gripper
+        value.
+        """
         vectors = np.zeros((*joints.shape[:-1], self._count, EEF_WIDTH))
         vectors[..., :_GRIPPER] = self._forward.forward(joints)
         vectors[..., self._gripped, _GRIPPER] = joints[..., self._grippers]

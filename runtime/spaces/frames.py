@@ -19,13 +19,13 @@ _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 
 
 class Frame:
-    """One declared frame for all arms of a robot; "" is the frame that each arm declares itself.
+    """Declared frame for the poses of all arms of a robot; "" means the frame that each arm declares itself.
 
-    A link is found in the copy of the URDF to which the arm belongs: the base of an arm is its own base. Joints of
-    other groups (a torso) between that link and the arm's frame have the values of the given joints.
+    A link is found in the copy of the URDF to which the arm belongs: each arm has its own base. Joints of other groups
+    (a torso) between that link and the arm's frame have the values of the given joints.
 
     Raises:
-        ConfigurationError: an unknown frame, or a link that is moved by an arm itself.
+        ConfigurationError: An unknown frame, or a link that is moved by an arm itself.
     """
 
     def __init__(self, robot: Robot, name: str, key: str) -> None:
@@ -43,7 +43,7 @@ class Frame:
         self._frames = [self._body.link_of(arm.name, str(arm.frame)) for arm in robot.arms]
 
     def express(self, vectors: Float64, joints: Float64) -> Float64:
-        """Transform vectors [T, arms, 7 or more] from each arm's frame to this frame, at joints [T or 1, D]."""
+        """Transform vectors [T, arms, 7 or more] from each arm's frame to this frame; joints are [T, D] or [1, D]."""
         if self.own:
             return vectors
         turn, shift = self._relation(joints)
@@ -64,7 +64,9 @@ class Frame:
         return made
 
     def _relation(self, joints: Float64) -> tuple[Float64, Float64]:
-        """Return the arms' frames in this frame: rotations [T or 1, arms, 3, 3], positions [T or 1, arms, 3]."""
+        """Return the pose of each arm's frame in this frame: rotations [T or 1, arms, 3, 3], positions [T or 1, arms,
+        3].
+        """
         poses = self._body.poses(joints)
         below = poses[..., self._frames, :, :]
         if self._mounted:

@@ -21,7 +21,7 @@ SHORTEST = 1e-3  # shortest usable vector: a network's error is per cents, never
 
 
 class Orientation(ABC):
-    """An orientation format: `fields` names its numbers, `allowed` describes the valid ones."""
+    """Orientation format: `fields` names its numbers, `allowed` describes the valid ones."""
 
     fields: tuple[str, ...]
     allowed: str
@@ -30,16 +30,18 @@ class Orientation(ABC):
     def encode(self, quaternions: Float64, previous: Float64 | None = None) -> Float64:
         """Encode unit quaternions as numbers [T, arms, n], each row as close to its predecessor as possible.
 
-        The first row continues `previous` [arms, n]; without it, it is in the usual range.
+        The first row is as close as possible to `previous` [arms, n]; if that is None, it is in the usual range.
         """
 
     @abstractmethod
     def decode(self, numbers: Float64) -> tuple[Float64, Bools]:
-        """Return unit quaternions, and whether [T, arms] the numbers determine them; if not, they are the identity."""
+        """Return unit quaternions, and bool [T, arms]: whether the numbers determine them; if not, they are the
+        identity.
+        """
 
 
 class QuaternionOrientation(Orientation):
-    """Four numbers, scalar first or last; signs are continuous from the first row on."""
+    """Four numbers of a quaternion, scalar first or last; signs are continuous from the first row on."""
 
     def __init__(self, scalar_first: bool) -> None:
         self.fields = ("qw", "qx", "qy", "qz") if scalar_first else ("qx", "qy", "qz", "qw")
@@ -59,7 +61,7 @@ class QuaternionOrientation(Orientation):
 
 
 class RotationVector(Orientation):
-    """Axis times angle; the angle is in [0, pi] at the first row, and beyond if a chunk turns further."""
+    """Axis times angle; the angle is in [0, pi] at the first row, and may be larger in further rows."""
 
     fields = ("rx", "ry", "rz")
     allowed = "any three numbers"
@@ -68,7 +70,9 @@ class RotationVector(Orientation):
         self._unit = np.pi / 180.0 if degrees else 1.0
 
     def encode(self, quaternions: Float64, previous: Float64 | None = None) -> Float64:
-        """Encode; of all vectors of the same orientation the closest to the previous row is chosen."""
+        """Encode unit quaternions; of all vectors of the same orientation the one closest to the previous row is
+        chosen.
+        """
         upright = quaternions * np.where(quaternions[..., :1] < 0, -1.0, 1.0)
         imaginary = upright[..., 1:]
         sine = np.linalg.norm(imaginary, axis=-1, keepdims=True)
@@ -94,8 +98,8 @@ class RotationVector(Orientation):
 class EulerAngles(Orientation):
     """Three angles in one of the twelve orders: "xyz" about fixed axes, "XYZ" about moving axes.
 
-    Angles of a quaternion by Bernardes and Viollet, PLoS ONE 17 (2022) e0276302. In a gimbal lock one angle is free:
-    the third is then left unchanged (0 at the first row).
+    They are computed from a quaternion as in Bernardes and Viollet, PLoS ONE 17 (2022) e0276302. In a gimbal lock one
+    angle is free: the third is then left unchanged (0 at the first row).
     """
 
     allowed = "any three angles"
@@ -193,7 +197,7 @@ class SixD(Orientation):
 
 
 def continuous_signs(quaternions: Float64) -> Float64:
-    """Return factors +-1 [T, arms, 1] that make the signs of quaternions [T, arms, 4] continuous along T."""
+    """Return factors +1 or -1 [T, arms, 1] that make the signs of quaternions [T, arms, 4] continuous along T."""
     dots = np.sum(quaternions[1:] * quaternions[:-1], axis=-1, keepdims=True)
     signs = np.ones((*quaternions.shape[:-1], 1))
     signs[1:] = np.cumprod(np.where(dots < 0, -1.0, 1.0), axis=0)
@@ -217,7 +221,8 @@ def _directions(vectors: Float64, otherwise: list[float]) -> tuple[Float64, Bool
 
 
 def _nearest_turns(before: Float64, axis: Float64, angle: Float64) -> Float64:
-    """Return whole turns about `axis` [arms, 3] that bring rotation vectors of `angle` [arms, 1] closest to `before`.
+    """Return the whole turns about `axis` [arms, 3] that bring rotation vectors of `angle` [arms, 1] closest to
+    `before`.
 
     If there is no axis, because the rotation is zero, the whole turns of `before` are repeated.
     """

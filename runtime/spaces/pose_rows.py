@@ -52,7 +52,7 @@ class PoseRows:
     table in error messages.
 
     Raises:
-        ConfigurationError: the format does not fit the robot.
+        ConfigurationError: The format does not fit the robot.
     """
 
     def __init__(self, pose: PoseFormat, robot: Robot, key: str = "pose") -> None:
@@ -76,31 +76,33 @@ class PoseRows:
 
     @property
     def width(self) -> int:
-        """Numbers per row."""
+        """Number of values in a row."""
         return len(self.names)
 
     @property
     def commanded(self) -> list[tuple[int, int]]:
-        """Pairs (index in a row, index in the robot's vector) of the numbers that are commanded unchanged."""
+        """Pairs (index in a row, index in the robot's vector) of the values that become commands without conversion."""
         grippers = enumerate(self._grippers if self.pose.gripper else [])
         appended = enumerate(self.dims.tolist(), len(self._arms) * self._each)
         return [((arm + 1) * self._each - 1, dim) for arm, dim in grippers if dim is not None] + [*appended]
 
     def encode(self, vectors: Float64, joints: Float64, previous: Float64 | None = None) -> Float64:
-        """Return rows float64 [T, width] of vectors [T, arms, 8] at joints [T or 1, D], which determine the frame.
+        """Return rows float64 [T, width] of vectors [T, arms, 8]; the frame depends on the joints [T, D] or [1, D].
 
         Each row is written as close to its predecessor as its orientation format permits. With `previous` [width] the
-        first row is written close to it; with `previous` [T, width] each row close to the corresponding row.
+        first row is written close to it; with `previous` [T, width] each row is written close to the corresponding row.
 
         Raises:
-            PolicyError: a quaternion has no direction.
+            PolicyError: A quaternion is nearly zero or not a number.
         """
         upright = self.normalize_quaternions(vectors)
         appended = np.broadcast_to(joints, (len(vectors), joints.shape[-1]))[:, self.dims]
         return self.written(self.frame.express(upright, joints), appended, previous)
 
     def written(self, vectors: Float64, appended: Float64, previous: Float64 | None = None) -> Float64:
-        """Return rows of vectors (unit quaternions, this frame) and of the joints [T, n] that follow them."""
+        """Return rows for `vectors`, which are in this frame with unit quaternions, and the joints [T, n] that follow
+        them.
+        """
         poses = np.empty((len(vectors), len(self._arms), self._each))
         poses[..., _POSITION] = vectors[..., _POSITION]
         poses[..., self._turning] = self._turned(vectors[..., _QUATERNION], previous)
@@ -118,12 +120,12 @@ class PoseRows:
         return each.reshape(before.shape)
 
     def decode(self, rows: Float64, whose: str = "the policy answered with") -> tuple[Float64, Float64]:
-        """Return vectors [T, arms, 8] in the declared frame and the joints [T, n] that follow, of rows [T, width].
+        """Return vectors [T, arms, 8] in the declared frame and the joints [T, n] that follow, from rows [T, width].
 
         Quaternions are unit, w >= 0 in the first row, with continuous signs; a gripper that is not in the row is 0.
 
         Raises:
-            PolicyError: numbers determine no orientation; the message begins with `whose` and names arm and row.
+            PolicyError: Numbers determine no orientation; the message begins with `whose` and names arm and row.
         """
         poses = self._poses_of(rows)
         vectors = np.zeros((len(rows), len(self._arms), EEF_WIDTH))
@@ -143,7 +145,7 @@ class PoseRows:
         """Return the vectors [T, arms, 8] with unit quaternions; signs are unchanged, as a robot chooses its own.
 
         Raises:
-            PolicyError: a quaternion has no direction; the message begins with `whose`.
+            PolicyError: A quaternion is nearly zero or not a number; the message begins with `whose`.
         """
         codec = QuaternionOrientation(scalar_first=True)
         made = vectors.copy()
@@ -187,7 +189,7 @@ def _dims(pose: PoseFormat, robot: Robot, key: str) -> NDArray[np.intp]:
 
 
 class PosePublisher:
-    """Converter of each sent joint command [D] to a pose row float32 [W], which continues the previous row."""
+    """Converter of each sent joint command [D] to a pose row float32 [W] close to the previous row."""
 
     def __init__(self, rows: PoseRows, end_effectors: EndEffectors) -> None:
         self._rows = rows

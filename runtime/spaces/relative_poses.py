@@ -15,9 +15,9 @@ _POSITION, _QUATERNION = slice(0, 3), slice(3, 7)
 
 
 def to_absolute(vectors: Float64, start: Float64, mode: ActionMode, frame: RelativeFrame) -> Float64:
-    """Return absolute poses of relative `vectors` (unit quaternions), relative to the pose `start` [arms, 8].
+    """Return absolute poses for relative `vectors` (unit quaternions); `start` [arms, 8] is the pose at the start.
 
-    Mode "relative": each row from `start`; "delta": each from its predecessor. Frame "base": p0 + dp, dq q0; "tool":
+    Mode "relative": each row is relative to `start`; "delta": to its predecessor. Frame "base": p0 + dp, dq q0; "tool":
     p0 + R0 dp, q0 dq. Grippers are absolute in every mode and are copied. Quaternions are returned unit and
     sign-continuous, w >= 0 in the first row.
     """
@@ -62,7 +62,7 @@ def relative(vectors: Float64, start: Float64, mode: ActionMode, frame: Relative
 
 
 def _after(before: Float64, turns: Float64, frame: RelativeFrame) -> Float64:
-    """Return unit quaternions `before` rotated by `turns`, about their own axes ("tool") or the frame's axes."""
+    """Return unit quaternions `before` rotated by `turns`, about their own axes ("tool") or about the frame's axes."""
     made = quaternion_product(before, turns) if frame == "tool" else quaternion_product(turns, before)
     unit: Float64 = made / np.linalg.norm(made, axis=-1, keepdims=True)
     return unit

@@ -1,4 +1,6 @@
-"""Codec of arrays in openpi's own format for stand-ins; independent of the client's codec, so that it can test it."""
+"""Codec of arrays in openpi's format for stand-ins; it shares no code with the client's codec, so that it can test
+that.
+"""
 
 from __future__ import annotations
 

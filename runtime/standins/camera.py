@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until SIGTERM, SIGINT or the end of the lifeline; exit code 2 if the port is in use."""
+    """Serve a camera until SIGTERM, SIGINT or the end of the lifeline; return 0, or 2 if the port is in use."""
     options = parser().parse_args(arguments)
     told = program.stop_event(options.lifeline)
     server = KINDS[options.kind](options.width, options.height, options.rate, options.port)

@@ -1,4 +1,4 @@
-"""Base class of stand-in network cameras: a port, images at a rate, faults on demand."""
+"""Base class of stand-in network cameras, which serve images at a rate on a port, with faults on demand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ FAULTS = {
 
 
 def picture(number: int, width: int, height: int) -> UInt8:
-    """Return an RGB image [height, width, 3]: red left, blue right, above a white bar that grows per image."""
+    """Return an RGB image [height, width, 3]: red on the left, blue on the right, with a white bar that grows per
+    image.
+    """
     made = np.zeros((height, width, 3), np.uint8)
     made[:, : width // 2, 0] = 220
     made[:, width // 2 :, 2] = 220
@@ -35,7 +37,10 @@ def picture(number: int, width: int, height: int) -> UInt8:
 
 
 class CameraServer(ABC):
-    """Server of one camera on loopback, with a thread per client; `size`, `rate` and `fault` may change any time."""
+    """Server of one camera on loopback, with a thread per client.
+
+    `size`, `rate` and `fault` may be changed at any time.
+    """
 
     scheme: str
 
@@ -108,7 +113,7 @@ class CameraServer(ABC):
             client.close()
 
     def _send_picture(self, client: socket.socket, data: bytes) -> None:
-        """Send encoded data, byte by byte with the fault "trickle"."""
+        """Send an encoded image to a client, byte by byte with the fault "trickle"."""
         if self.fault != "trickle":
             client.sendall(data)
             return

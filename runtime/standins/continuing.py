@@ -1,6 +1,6 @@
-"""Continuation of the previous chunk by a stand-in policy: a copy of the prefix, as RTC's contract demands.
+"""Continuation of the previous chunk by a stand-in policy, which copies the prefix as RTC requires.
 
-It is no evidence for how well a model continues chunks.
+It does not show how well a model continues chunks.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ _TRANSITION = 8  # rows of the transition from the prefix to the plan
 
 @dataclass(frozen=True, slots=True)
 class CommittedPrefix:
-    """Committed joint rows [L, D] of a request, of which the first `delay` will have been executed.
+    """Joint rows [L, D] of a request that the robot is committed to.
 
-    From row `end` on, the chunk is independent of them.
+    The first `delay` rows will have been executed when the chunk arrives. From row `end` on, the chunk is independent
+    of the prefix.
     """
 
     rows: Float64
@@ -35,9 +36,9 @@ class CommittedPrefix:
 
 
 def continue_prefix(plan: Float32, prefix: CommittedPrefix, switched: Sequence[int] = ()) -> Float32:
-    """Return `plan` [H, D] with the first `delay` rows of the prefix, followed by a transition to its own rows.
+    """Return `plan` [H, D] with its start replaced by the first `delay` rows of the prefix and a transition to `plan`.
 
-    Dimensions in `switched` (binary grippers) are those of the plan after the delay, without a transition.
+    Dimensions in `switched` (binary grippers) follow `plan` from row `delay` on, without a transition.
     """
     delay = min(prefix.delay, len(prefix.rows), len(plan))
     end = max(delay, min(prefix.end, delay + _TRANSITION, len(prefix.rows), len(plan)))
@@ -73,7 +74,7 @@ class ModelSpace:
         return made
 
     def joints(self, rows: ArrayLike) -> Float64:
-        """Convert model rows to joint rows [H, D]; joint rows are returned unchanged.
+        """Convert model rows to joint rows [H, D]; rows as wide as the joints are returned unchanged.
 
         Raises:
             ValueError: If the rows have another width, or there are none.

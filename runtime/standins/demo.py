@@ -21,7 +21,9 @@ _DEPLOYMENT = Path(__file__).parents[2] / "deployments" / "demo.toml"
 
 
 class StandIns:
-    """Child processes of the demo: node and policy server; they end with their standard input, so with the demo."""
+    """Child processes of the demo: node and policy server; they end when their standard input closes, so with the
+    demo.
+    """
 
     def __init__(self) -> None:
         self._children: list[subprocess.Popen[str]] = []
@@ -30,7 +32,7 @@ class StandIns:
         """Start `python -m module`; return its addresses from the first line of its output.
 
         Raises:
-            SetupError: If it ends before it is ready.
+            SetupError: If the process ends before it is ready.
         """
         child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments, "--lifeline"],
@@ -104,9 +106,9 @@ def start_standins(standins: StandIns, robot: str) -> list[str]:
 
 
 def run_station(option: str, assignments: Sequence[str]) -> tuple[int, dict[str, Any]]:
-    """Run the demo's supervisor until it ends; return its exit code and the run's result, {} if it wrote none.
+    """Run the demo's supervisor until it ends; return its exit code and the run's result, {} if it wrote no result.
 
-    Ctrl-C is passed on to it, and raised again after it has ended.
+    Ctrl-C is passed on to the supervisor, and raised again after that has ended.
     """
     result = deployment.load(_DEPLOYMENT, assignments).deployment.station_dir / RESULT_NAME
     result.unlink(missing_ok=True)

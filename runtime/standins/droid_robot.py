@@ -1,4 +1,7 @@
-"""Robot in the conventions of DROID's policies: grippers separate, 0 open and 1 closed; positions or velocities."""
+"""Robot in the conventions of DROID's policies.
+
+Grippers are separate from the joints, 0 open and 1 closed; actions are positions or velocities.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +42,11 @@ class DroidRobot:
         self._above = [camera.key for camera in robot.cameras if camera_arm(robot, camera) is None]
 
     def joints(self, message: Mapping[str, Any]) -> Float64:
-        """Return the robot's joints [D] of a request.
+        """Return the robot's joints [D] in a request.
 
         Raises:
             KeyError: If the request lacks them.
-            ValueError: If their number is that of another robot.
+            ValueError: If their number is not that of this robot.
         """
         angles = np.asarray(message["observation/joint_position"], np.float64)
         grips = np.asarray(message["observation/gripper_position"], np.float64)
@@ -58,7 +61,7 @@ class DroidRobot:
         return q
 
     def pictures(self, message: Mapping[str, Any]) -> dict[str, UInt8]:
-        """Return the newest image of each view by the robot's own camera key."""
+        """Return the newest image of each view by the key of the robot's camera."""
         pairs = [
             (f"observation/exterior_image_{self._first + n}_left", key) for n, key in enumerate(self._above)
         ]

@@ -51,13 +51,13 @@ TOO_LARGE = 64 * 1024 * 1024 + 1  # [bytes] of an oversized message
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Fault of a server, one of NAMES or "none"; `argument` is the text after the colon."""
+    """Fault of a server, one of NAMES or "none"; `argument` is the text after the colon on the command line."""
 
     name: str
     argument: str = ""
 
     def number(self, default: float) -> float:
-        """Return the argument as a number, `default` if there is none."""
+        """Return the argument as a number; `default` if there is no argument."""
         return float(self.argument) if self.argument else default
 
 

@@ -35,9 +35,9 @@ LANGUAGE = "annotation.human.task_description"
 class Gr00tBehaviour:
     """Behaviour of the server: rows per chunk, their rate [Hz], duration of an inference [s], fault.
 
-    `flat` is the option --use-sim-policy-wrapper of N1.6 and N1.7. `seen` are the time steps of which images are
-    required. "n1.7-early" is the early access of N1.7, which reads arrays of msgpack_numpy only; "starvla" is StarVLA's
-    server of this protocol, which has no modality configurations.
+    `flat` is the option --use-sim-policy-wrapper of N1.6 and N1.7. `seen` are the time steps of the images that a
+    request must have. "n1.7-early" is the early access of N1.7, which reads arrays of msgpack_numpy only; "starvla" is
+    StarVLA's server of this protocol, which has no modality configurations.
     """
 
     version: Version = "n1.6"
@@ -141,11 +141,14 @@ class Gr00tServer:
 
     @property
     def _modern(self) -> bool:
-        """Whether the server supports arrays of msgpack_numpy, in which it then answers."""
+        """Whether the server accepts arrays as msgpack_numpy encodes them; it then also answers with such arrays."""
         return self._behaviour.version.startswith("n1.7")
 
     def _spoilt_frames(self) -> Sequence[bytes] | None:
-        """Return the frames that a fault sends instead of the answer, None for no answer; `_RIGHT` if none applies."""
+        """Return the frames that the fault sends instead of the answer; `_RIGHT` if the right answer is to be sent.
+
+        None if nothing is to be sent.
+        """
         fault, number = self._behaviour.fault, self._asked
         self._asked += 1
         due = number >= fault.number(0)
@@ -184,7 +187,9 @@ class Gr00tServer:
         return self._action(message["data"])
 
     def _contract(self) -> dict[str, object]:
-        """Return StarVLA's contract: prefixed state and action keys with their numbers of dimensions; no images."""
+        """Return what a StarVLA server states: state and action keys with prefix and number of dimensions; no
+        images.
+        """
         groups: dict[str, object] = {group.name: len(group.joints) for group in self._robot.groups}
         actions = {"poses": self._script.metadata["action_dim"]} if self._in_poses else groups
         said: dict[str, object] = {"unnorm_key": "stand_in"}
@@ -233,7 +238,7 @@ class Gr00tServer:
         return [named, {}]
 
     def _read(self, data: Mapping[str, Any]) -> tuple[dict[str, UInt8], Float64, str]:
-        """Return images, joints [D] and instruction of a request, checked as strictly as by GR00T.
+        """Return images, joints [D] and instruction of a request, checked as strictly as in GR00T's server.
 
         Raises:
             AssertionError: If a part is missing, or has another type or shape.
@@ -263,7 +268,7 @@ class Gr00tServer:
         return pictures, joints, str(spoken[0])
 
     def _parts(self, rows: Float32) -> dict[str, Any]:
-        """Return the rows by action key, modified by the fault."""
+        """Return the answer's rows by action key, modified by the fault."""
         fault = self._behaviour.fault.name
         if fault == "nan":
             rows[min(3, len(rows) - 1), 2] = np.nan

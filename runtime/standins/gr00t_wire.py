@@ -1,6 +1,6 @@
 """Codec of GR00T's messages for its stand-in: arrays are .npy files, or maps in the format of msgpack_numpy.
 
-It is independent of the client's codec, so that it can test it.
+It shares no code with the client's codec, so that it can test that.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ def packed(value: object, modern: bool, foreign: bool = False) -> bytes:
 
 
 def unpacked(payload: bytes, npy: bool = True, mnp: bool = True) -> Any:
-    """Unpack one message; arrays in formats that the server does not read remain maps, as in GR00T's server."""
+    """Unpack one message; arrays are read as .npy if `npy`, and as msgpack_numpy encodes them if `mnp`.
+
+    Arrays in other formats remain maps, as in GR00T's server.
+    """
 
     def read(fields: dict[Any, Any]) -> object:
         if npy and "__ndarray_class__" in fields:

@@ -1,4 +1,6 @@
-"""Stand-in for LeRobot's policy server: gRPC with its rules and silences, a script as policy, faults on demand."""
+"""Stand-in for LeRobot's policy server: gRPC with the same rules and empty answers, a script as policy, faults on
+demand.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +158,10 @@ class LerobotServer:
         return np.array([observation.observation[name] for name in names], np.float32)
 
     def _act(self, request: Any, context: Any) -> Any:
-        """Return the actions for the pending observation; empty if none arrives in time, and after any error."""
+        """Return the actions for the pending observation.
+
+        The message is empty if no observation arrives in time, and after any error.
+        """
         try:
             observation = self._waiting.get(timeout=self._behaviour.patience)
             self._predicted.add(observation.timestep)
@@ -211,7 +216,7 @@ class LerobotServer:
         return rows[: self._told.actions_per_chunk]
 
     def _actions(self, observation: Any, rows: Float32) -> bytes:
-        """Return the pickled rows, modified by the fault."""
+        """Return the pickled actions for the rows of an answer, modified by the fault."""
         fault = self._behaviour.fault.name
         if fault == "nan":
             rows[min(3, len(rows) - 1), 2] = np.nan

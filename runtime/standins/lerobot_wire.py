@@ -1,4 +1,4 @@
-"""Codec of LeRobot's messages for its stand-in, independent of the client's codec, so that it can test it.
+"""Codec of LeRobot's messages for its stand-in, which shares no code with the client's codec, so that it can test that.
 
 Messages use protobuf. Pickles are written instruction by instruction, as torch and LeRobot would write them, and read
 by Python's unpickler restricted to a table of names.
@@ -76,7 +76,7 @@ def unpickle(data: bytes, helpers: str = HELPERS) -> Any:
 def timed_actions(rows: Float32, timesteps: list[int], timestamps: list[float]) -> bytes:
     """Return a pickled list[TimedAction] whose rows are views of one tensor.
 
-    Each action contains the whole storage, as those of the real server do.
+    As with the real server, each action contains the storage of all rows.
     """
     storage = _storage(rows)
     return b"\x80\x04](" + b"".join(
@@ -90,7 +90,7 @@ def timed_actions(rows: Float32, timesteps: list[int], timestamps: list[float]) 
 
 
 def command_pickle(line: str) -> bytes:
-    """Return a pickle that runs a command if it is read without restrictions."""
+    """Return a pickle that runs the shell command `line` if it is read without restrictions."""
     return b"\x80\x04" + _name("os", "system") + b"(" + _text(line) + b"tR."
 
 

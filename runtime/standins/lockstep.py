@@ -3,7 +3,7 @@
 Node, bench, policy servers and station are one process with one clock; pages and programs connect to the station as to
 any other. With the same seeds, the same commands in the same order have the same result, to the tick, on any machine
 and under any load. A run ends by itself once the bench's ground truth has reported success for a second; with --paced,
-the station is at most as fast as real time, and runs end only as on a real bench.
+the station is at most as fast as real time, and runs do not end by themselves.
 """
 
 from __future__ import annotations
@@ -44,10 +44,7 @@ _PATIENT = ["policy.connect_deadline=60.0", "policy.inference_deadline=60.0"]
 
 
 class SuccessDetector:
-    """Detector of the end of a run: the bench's ground truth has reported success for REST_S.
-
-    Call it regularly with whether a run is active; it returns the reason why the run is over, "" if it is not.
-    """
+    """Detector of the end of a run: the bench's ground truth has reported success for REST_S."""
 
     def __init__(self, truth: Callable[[], Mapping[str, Any] | None], clock: Clock) -> None:
         self._truth, self._clock = truth, clock
@@ -66,7 +63,7 @@ class SuccessDetector:
 def in_process_peers(
     made: StationSpec, clock: Clock, around: Environment, options: argparse.Namespace
 ) -> Peers:
-    """Return peers with a simulated node in this process instead of the transport, and a simulated leader.
+    """Return the station's peers, with a simulated node in this process as transport and with a simulated leader.
 
     Raises:
         SetupError: If the deployment does not declare a simulated node with a bench.
@@ -131,7 +128,7 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until SIGTERM, SIGINT or the end of the lifeline."""
+    """Serve the station until SIGTERM, SIGINT or the end of the lifeline."""
     options = parser().parse_args(arguments)
     log.configure_logging("lockstep")
     told = program.stop_event(options.lifeline)

@@ -15,8 +15,8 @@ _ERRORS = {"not_found": "404 Not Found", "no_login": "401 Unauthorized"}
 class MjpegServer(CameraServer):
     """Server of multipart/x-mixed-replace with one part per image.
 
-    `headers` are the lines of each part; {length} stands for its size [bytes]. Further faults: "html" answers with a
-    page, "png" with parts of another type, "still" with a single image.
+    `headers` are the lines before each image, in which {length} is replaced by its size [bytes]. Further faults: "html"
+    answers with a page, "png" with parts of another type, "still" with a single image.
     """
 
     scheme = "http"

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 class Behaviour:
     """Behaviour of the server: rows per chunk, their rate [Hz], duration of an inference [s], fault.
 
-    `rtc` is the dialect of committed rows in requests; "prev_action" accepts plain requests too. With `declared` the
-    server does not spend `latency`: its answers state it, for clients that account for it in lockstep.
+    `rtc` is the format in which requests contain committed rows; "prev_action" accepts plain requests, too. With
+    `declared` the server answers at once and states `latency` in its answer, for clients that account for it in
+    lockstep.
     """
 
     horizon: int = 50
@@ -58,23 +59,25 @@ class OpenpiServer(WebsocketServer):
         self._wire = WIRES[behaviour.rtc](self._space, behaviour.horizon, behaviour.fault)
 
     def greeting(self) -> Frames | None:
-        """Return the metadata."""
+        """Return the metadata, which are the first frame of a connection."""
         metadata = dict(self._script.metadata) | self._wire.metadata()
         if self._behaviour.fault.name == "action_mode":
             metadata["action_mode"] = self._behaviour.fault.argument
         return packed(metadata)
 
     def begin(self) -> Answering:
-        """Return the answers of a new connection."""
+        """Return the object that answers the requests of a new connection."""
         return _Conversation(self, self._script.begin())
 
     def on_answered(self, answer: Answering, seconds: float) -> None:
-        """Store the duration of an answer, which the next answer reports."""
+        """Store the duration of `answer`, which the next answer on its connection reports."""
         assert isinstance(answer, _Conversation)
         answer.previous_ms = 1e3 * seconds
 
     def failure(self, traceback: str, request: Frames) -> Frames:
-        """Return the error as text, or with RTC envelopes as an envelope with the request's number if it has one."""
+        """Return the frame that reports an error: its text, or with RTC envelopes an envelope with the request's
+        number.
+        """
         try:
             message = unpacked(request) if isinstance(request, bytes) else None
         except ValueError:
@@ -82,7 +85,7 @@ class OpenpiServer(WebsocketServer):
         return self._wire.failure(traceback, message)
 
     def reply(self, request: Frames, answer: Answer, previous_ms: float | None) -> bytes:
-        """Return the frame that answers a request; an exception is raised if it cannot be answered."""
+        """Return the frame that answers a request. Raises an exception if the request cannot be answered."""
         if isinstance(request, str):
             raise TypeError("the request is a text frame; expected a binary one")
         asked = self._wire.read(unpacked(request))
@@ -107,7 +110,11 @@ class OpenpiServer(WebsocketServer):
         }
 
     def _took(self, started: float) -> float:
-        """Return the duration [s] of an answer begun at `started` [s]: as declared, or measured after the latency."""
+        """Return the duration [s] of an answer that was begun at `started` [s].
+
+        It is the declared latency; if none is declared, wait until the latency has passed and return the measured
+        duration.
+        """
         if self._behaviour.declared:
             return self._behaviour.latency
         time.sleep(max(0.0, self._behaviour.latency - (time.monotonic() - started)))
@@ -131,7 +138,7 @@ class OpenpiServer(WebsocketServer):
 
 @dataclass(slots=True)
 class _Conversation:
-    """Answers to the requests of one connection; `previous_ms` is the duration of the previous answer."""
+    """Function that answers the requests of one connection; `previous_ms` is the duration of its previous answer."""
 
     server: OpenpiServer
     answer: Answer

@@ -33,7 +33,8 @@ class RoboarenaBehaviour:
     """Behaviour of the server: its requirements, its answers, its fault.
 
     `reply` is the form of an answer: a map with `actions`, the bare array, or named parts. `numbering` is the number of
-    the first exterior view. `idle` [s] is the silence after which a connection is closed; None: never, 30 s for vllm.
+    the first exterior view. `idle` [s] is the time without requests after which a connection is closed; None: never, or
+    30 s for vllm.
     """
 
     horizon: int = 24
@@ -55,7 +56,7 @@ class RoboarenaBehaviour:
 
 @dataclass
 class RequestLog:
-    """Requests so far, in order: (endpoint, session) pairs, and the number of frames that each session has sent."""
+    """Requests that the server has received: (endpoint, session) in order, and the number of frames by session."""
 
     calls: list[tuple[str, str | None]] = field(default_factory=list)
     frames: dict[str | None, int] = field(default_factory=dict)
@@ -81,11 +82,11 @@ class RoboarenaServer(WebsocketServer):
         return found | {"url": f"{found['url']}{path}"}
 
     def serves_path(self, path: str) -> bool:
-        """Return True for any path of RoboArena's server, and for the path of vLLM-Omni."""
+        """Return True if a policy is served at this path: at any path as RoboArena, at a single path as vLLM-Omni."""
         return self._arena.variant == "roboarena" or path == VLLM_PATH
 
     def greeting(self) -> Frames | None:
-        """Return the six fields of the metadata; None with the fault "not_loaded"."""
+        """Return the metadata with their six fields; None with the fault "not_loaded"."""
         arena = self._arena
         if arena.fault.name == "not_loaded":
             return None
@@ -102,16 +103,19 @@ class RoboarenaServer(WebsocketServer):
         )
 
     def refusal(self) -> Frames:
-        """Return the error of a server whose model is not for robots."""
+        """Return the error that a server sends if its model is not for robots."""
         return json.dumps({"type": "error", "error": "Robot policy not available", "code": "unsupported"})
 
     def begin(self) -> Answering:
-        """Return the answers of a new connection."""
+        """Return the function that answers the requests of a new connection."""
         answer = self._script.begin()
         return lambda request: self._reply(answer, request)
 
     def failed(self, connection: ServerConnection, error: Exception, request: Frames) -> bool:
-        """Report an error; vLLM-Omni sends a short binary message and keeps the connection open."""
+        """Send the error to the client; return False if the connection is then closed.
+
+        vLLM-Omni sends a short binary message and keeps the connection open.
+        """
         if self._arena.variant == "roboarena":
             return super().failed(connection, error, request)
         known = "Invalid request payload" if isinstance(error, ValueError) else "Internal inference error"

@@ -1,4 +1,4 @@
-"""Wire formats in which the stand-in policy server receives the rows that the robot is committed to."""
+"""Formats in which the stand-in policy server receives the rows that the robot is committed to."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FIELDS = (
 
 @dataclass(frozen=True, slots=True)
 class ParsedRequest:
-    """Parsed request: the observation, the prefix to continue if any, and its number if it has one."""
+    """Parsed request: the observation, the prefix to continue (or None), and the request's number (or None)."""
 
     observation: dict[str, Any]
     prefix: CommittedPrefix | None = None
@@ -51,7 +51,7 @@ class Wire(ABC):
 
     @abstractmethod
     def answer(self, result: dict[str, object], asked: ParsedRequest) -> bytes:
-        """Return the frame that answers a request."""
+        """Return the frame with `result` that answers the request `asked`."""
 
     @abstractmethod
     def failure(self, traceback: str, message: Any) -> str | bytes:
@@ -79,7 +79,10 @@ class NoRtcWire(Wire):
 
 
 class PrevActionWire(NoRtcWire):
-    """Format with RTC keys in the observation; it has no delay: as many rows are fixed as were consumed last."""
+    """Format with RTC keys in the observation.
+
+    The request does not state a delay; the answer repeats as many rows as the robot consumed of the previous chunk.
+    """
 
     def metadata(self) -> dict[str, object]:
         dialect = "prev_action" if self._continues else "none"

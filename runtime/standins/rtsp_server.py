@@ -20,7 +20,9 @@ _ERRORS = {"not_found": "404 Not Found", "no_login": "401 Unauthorized"}
 
 
 class RtspServer(CameraServer):
-    """Server of one H.264 track; `stamp_offset` [s] is added to the images' time stamps and may change any time."""
+    """Server of one H.264 track; `stamp_offset` [s] is added to the images' time stamps, and may be changed at any
+    time.
+    """
 
     scheme = "rtsp"
     stamp_offset = 0.0
@@ -87,7 +89,7 @@ class RtspServer(CameraServer):
             self.sent += 1
 
     def _still_wanted(self, client: socket.socket) -> bool:
-        """Answer keep-alives; return False if the client ends the session."""
+        """Answer the client's keep-alives; return False if the client ends the session."""
         got = client.recv(4096).decode("latin-1")
         if not got or got.startswith("TEARDOWN"):
             return False
@@ -105,7 +107,7 @@ class RtspServer(CameraServer):
         return encoder
 
     def _units(self, encoder: Any, number: int) -> Iterator[tuple[bytes, bool]]:
-        """Yield the NAL units of an image, each with True if it is the last."""
+        """Yield the NAL units of an image, each with whether it is the last one."""
         import av
 
         frame = av.VideoFrame.from_ndarray(picture(number, *self.size), format="rgb24")
@@ -126,7 +128,7 @@ class RtspServer(CameraServer):
 
 
 def _payloads(unit: bytes, last: bool) -> Iterator[tuple[bytes, bool]]:
-    """Yield the payloads that carry one NAL unit, whole or in fragments (FU-A), each with True if it ends an image."""
+    """Yield the payloads that carry one NAL unit, whole or in fragments (FU-A), each with whether it ends an image."""
     if len(unit) <= _LARGEST:
         yield unit, last
         return

@@ -106,7 +106,7 @@ def parser() -> argparse.ArgumentParser:
 
 @exit_on_broken_pipe
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve until SIGTERM, SIGINT or the end of the lifeline."""
+    """Run a stand-in server until SIGTERM, SIGINT or the end of the lifeline."""
     import robots
 
     options = parser().parse_args(arguments)
@@ -124,8 +124,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def build_server(options: argparse.Namespace, clock: Clock | None = None) -> StandInServer:
     """Return the server that a command line describes, not yet started.
 
-    With a virtual `clock` the server uses it, and its answers declare their duration instead of spending it; only
-    openpi with pick_place supports this.
+    With a virtual `clock` the server answers at once and states how long the answer would take; only openpi with
+    pick_place supports this.
 
     Raises:
         RuntimeFault: If an option is invalid.
@@ -224,7 +224,7 @@ _PROTOCOLS: dict[str, Callable[[Robot, float, Script, argparse.Namespace], Stand
 
 
 def _rtc(options: argparse.Namespace) -> Name:
-    """Return the RTC dialect of the server.
+    """Return the name of the server's RTC format.
 
     Raises:
         SetupError: If the server could not continue a chunk.
@@ -238,7 +238,7 @@ def _rtc(options: argparse.Namespace) -> Name:
 
 
 def _spoken(script: Script, robot: Robot, rate: float, options: argparse.Namespace) -> Script:
-    """Return the script, converted to poses if requested."""
+    """Return the script, converted to poses if the options request that."""
     if options.space == "joint":
         if options.pose:
             raise SetupError(f"--pose {' '.join(options.pose)}: allowed with --space eef")
@@ -266,7 +266,7 @@ def _script(robot: Robot, rate: float, options: argparse.Namespace, clock: Clock
 
 
 def _length(text: str) -> float:
-    """Parse millimetres from 0 to 100."""
+    """Parse a length of 0 to 100 mm."""
     return _number(text, 100.0)
 
 
@@ -276,7 +276,7 @@ def _share(text: str) -> float:
 
 
 def _resolution(text: str) -> tuple[int, int] | None:
-    """Parse height and width; None for "none"."""
+    """Parse height and width; return None for "none"."""
     if text == "none":
         return None
     height, _, width = text.partition("x")

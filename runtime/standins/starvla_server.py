@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 class StarvlaBehaviour:
     """Behaviour of the server; `views` are the robot's cameras in the order of a request, None for all.
 
-    `size` is the image size of training that the server declares; `batched` is whether answers are [1, T, D]. `old` is
-    the behaviour of servers until May 2026, which declare almost nothing and leave statistics to the client.
+    `size` is the image size of training that the server declares; `batched` is whether answers are [1, T, D]. If `old`,
+    it behaves like servers until May 2026, which declare almost nothing and leave statistics to the client.
     """
 
     horizon: int = 16
@@ -61,7 +61,7 @@ class StarvlaServer(WebsocketServer):
         self.high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
 
     def greeting(self) -> Frames | None:
-        """Return the greeting of an old or a present server."""
+        """Return the server's first frame, as old or present servers send it."""
         star = self._star
         if star.old:
             return packed({"env": "simpler_env"})
@@ -77,7 +77,7 @@ class StarvlaServer(WebsocketServer):
         )
 
     def begin(self) -> Answering:
-        """Return the answers of a new connection."""
+        """Return the function that answers the requests of a new connection."""
         answer = self._script.begin()
         return lambda request: packed(self._reply(answer, unpacked(_binary(request))))
 

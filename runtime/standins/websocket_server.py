@@ -51,7 +51,7 @@ class WebsocketServer(ABC):
 
     @abstractmethod
     def greeting(self) -> Frames | None:
-        """Return the first frame; None if nothing is served, after which the connection is closed."""
+        """Return the first frame of a connection; None to refuse it, after which it is closed."""
 
     @abstractmethod
     def begin(self) -> Answering:
@@ -114,14 +114,17 @@ class WebsocketServer(ABC):
                     return
 
     def on_answered(self, answer: Answering, seconds: float) -> None:  # noqa: B027  # most keep no account of it
-        """Handle an answer that was sent `seconds` after its request was received; the default does nothing."""
+        """Handle the fact that a reply was sent `seconds` [s] after its request; the default does nothing.
+
+        `answer` is the function that answers the requests of the connection.
+        """
 
     def refusal(self) -> Frames:
-        """Return the frame that is sent if nothing is served."""
+        """Return the frame that is sent to a connection that is refused."""
         return "nothing is served here"
 
     def _answer(self, connection: ServerConnection, answer: Answering, request: str | bytes) -> bool:
-        """Answer one request, correctly or as the fault demands; return False if the connection is over."""
+        """Answer one request, correctly or as the fault demands; return False if the connection has ended."""
         started = time.monotonic()
         with self._device:
             number, self._asked = self._asked, self._asked + 1

@@ -1,4 +1,4 @@
-"""Inference strategies, one file each, which declares `Config`, `USES`, `query` and `merge`."""
+"""Inference strategies, one module each, which declares `Config`, `USES`, `query` and `merge`."""
 
 # Module of each kind; imported only if a deployment names the kind.
 KINDS = {

@@ -54,7 +54,7 @@ class StrategyParameters(Settings):
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Facts from which a `Query` decides."""
+    """State on which a `Query` decides."""
 
     remaining: int  # steps still planned
     in_flight: bool  # a request is pending, or its chunk is not merged yet
@@ -63,10 +63,10 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class ArrivedChunk:
-    """A chunk at the control loop: rows [H, D] in command space and at control rate.
+    """Chunk at the control loop: rows [H, D] in command space and at control rate.
 
-    Row 0 is for `observation_step`. If the chunk was `requested_while_stopped`, no row is stale: row 0 is for the
-    first free step.
+    Row 0 is for `observation_step`. If the chunk was `requested_while_stopped`, no row is stale: row 0 is for the first
+    free step.
     """
 
     chunk_id: int
@@ -77,9 +77,9 @@ class ArrivedChunk:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """The rows of a chunk that are used, [N, D]; row 0 is for step `first`; empty if the chunk is dropped.
+    """Rows of a chunk that are used, [N, D]; row 0 is for step `first`; empty if the chunk is dropped.
 
-    `before` [D] is the chunk's row before them, None if there is none.
+    `before` [D] is the row of the chunk that precedes them, None if there is none.
     """
 
     rows: Float64
@@ -88,12 +88,12 @@ class Placement:
 
     @property
     def first(self) -> int:
-        """The step of row 0."""
+        """Step of row 0."""
         return self.merged.arrival_step
 
 
 class Query(ABC):
-    """The half of a strategy that decides when to query the policy."""
+    """Part of a strategy that decides when to query the policy."""
 
     requests_while_stopped: bool = False  # queries only while the robot stands, so that no row is stale
     uses_rtc: bool = False  # requests carry the committed rows (RTC)
@@ -104,7 +104,7 @@ class Query(ABC):
 
 
 class Paced(Query):
-    """Query during motion, back to back or at a rate [Hz], with at most one request in flight."""
+    """Query during motion, at a rate [Hz] or (with None) as soon as possible, with at most one pending request."""
 
     def __init__(self, inference_rate: float | None) -> None:
         self._period = 0.0 if inference_rate is None else 1.0 / inference_rate
@@ -114,21 +114,21 @@ class Paced(Query):
 
 
 class Merge(ABC):
-    """The half of a strategy that merges chunks: a function of timeline, chunk and first free step only."""
+    """Part of a strategy that merges chunks; it depends on timeline, chunk and first free step only."""
 
     requests_while_stopped: bool = False  # an empty timeline is waiting, not starvation
     uses_rtc: bool = False  # reports contributions, because requests continue the chunks (RTC)
 
     @abstractmethod
     def place(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> Placement:
-        """Return the rows to use and their first step, or the reason to drop the chunk; changes nothing."""
+        """Return the rows to use and their first step, or the reason to drop the chunk; the timeline is not changed."""
 
     @abstractmethod
     def apply(self, timeline: Timeline, placed: Placement) -> None:
         """Change the plan from `placed.first` on; not called for a dropped chunk."""
 
     def __call__(self, timeline: Timeline, arrival: ArrivedChunk, free_step: int) -> MergeResult:
-        """Merge `arrival` into `timeline` from `free_step` on, without a fade from anything before it."""
+        """Merge `arrival` into `timeline` from `free_step` on, without a fade from earlier actions."""
         return join(self, timeline, arrival, free_step, None, DimensionKinds())
 
 
@@ -143,23 +143,23 @@ def join(
     joining: bool = False,
     commanded: Float64 | None = None,
 ) -> MergeResult:
-    """Merge a chunk; if it does not continue the motion before it, fade over from that: no strategy may cause a jump.
+    """Merge a chunk by its strategy; fade over if it does not continue the motion, so that no strategy causes a jump.
 
-    Nothing is changed if the chunk is dropped. Chunks may be merged while a fade is active: it continues over the new
+    If the chunk is dropped, nothing is changed. Chunks may be merged while a fade is active: it continues over the new
     plan. The contributions of every step sum to 1; chunk id HELD is a held target.
 
     Args:
-        merge: the strategy's merge.
-        timeline: the timeline to change.
-        arrival: the chunk.
-        free_step: first step not yet sent.
-        held: target [D] that is held because nothing was planned (starvation, a distant first chunk of a run). The
-            chunk takes over from it within JOIN_WINDOW steps, or its own length if that is shorter.
-        dims: dimensions that do not blend linearly.
-        joining: True if the kind of strategy was changed since the last merged chunk; leave it set until a chunk is
-            not dropped. The new plan then takes over from the old plan, whose last target is held as long as needed,
-            or from `commanded` if nothing is planned. Without `held` and `joining` the strategy alone decides.
-        commanded: last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole turn.
+        merge: The strategy's merge.
+        timeline: The timeline to change.
+        arrival: The chunk.
+        free_step: First step not yet sent.
+        held: Target [D] that is held because nothing was planned (starvation, a distant first chunk of a run), or None.
+        The chunk takes over from it within JOIN_WINDOW steps, or within its own length if that is shorter.
+        dims: Dimensions that do not blend linearly.
+        joining: True if the kind of strategy was changed since the last merged chunk; the caller passes True until a
+        chunk is not dropped. The new plan then takes over from the old plan, whose last target is held as long as
+        needed, or from `commanded` if nothing is planned. Without `held` and `joining` the strategy alone decides.
+        commanded: Last target sent [D]; if nothing is planned, wrapping angles continue from it without a whole turn.
     """
     placed = merge.place(timeline, arrival, free_step)
     if placed.merged.dropped:
@@ -200,9 +200,10 @@ def _fade(
     count: int,
     dims: DimensionKinds,
 ) -> None:
-    """Let the next plan take over from `rows` within `count` steps; the last row is held if they end earlier.
+    """Start a fade in which the next plan takes over from `rows` within `count` steps.
 
-    Rows beyond `makers` are held targets.
+    If there are fewer rows than steps, the last row is held. `makers` are the contributions of the first rows; further
+    rows are held targets.
     """
     last = np.minimum(np.arange(count), len(rows) - 1)
     made = [*makers[:count], *single_contribution(HELD, max(0, count - len(makers)))]

@@ -1,4 +1,4 @@
-"""Strategy `ensemble`: query during motion, average all chunks that cover a step (ACT, arXiv 2304.13705)."""
+"""Strategy `ensemble`: query during motion, and average all chunks that cover a step (ACT, arXiv 2304.13705)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Config(StrategyParameters):
 
 
 class EnsembleMerge(Merge):
-    """Weighted mean, step by step, of the chunks that cover it; weight exp(-m * rank), rank 0 the oldest.
+    """Merge by the weighted mean, step by step, of the chunks that cover it; weight exp(-m * rank), rank 0 the oldest.
 
-    Chunks are not cropped, and each row is used at its intended step; at most `horizon` chunks, the newest, take
-    part. The timeline stores the chunks that still cover a step. The mean is computed as the newest chunk plus
-    weighted differences, so that equal chunks average to themselves exactly.
+    Chunks are not cropped, and each row is used at its intended step; of more than `horizon` chunks the newest take
+    part. The timeline stores the chunks that still cover a step. The mean is computed as the newest chunk plus weighted
+    differences, so that equal chunks average to themselves exactly.
     """
 
     def __init__(self, k_max: int | None, m: float, horizon: int, dims: DimensionKinds) -> None:
@@ -72,10 +72,12 @@ class EnsembleMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """Return the query half of the strategy."""
+    """Return the part of the strategy that decides when to query."""
     return Paced(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """Return the merge half; `dims` are the dimensions that must not be averaged linearly."""
+    """Return the part of the strategy that merges chunks; `dims` are the dimensions that must not be averaged
+    linearly.
+    """
     return EnsembleMerge(config.k_max, config.ensemble_m, config.ensemble_horizon, dims)

@@ -34,10 +34,10 @@ class NaiveMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """Return the query half of the strategy."""
+    """Return the part of the strategy that decides when to query."""
     return Paced(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """Return the merge half of the strategy."""
+    """Return the part of the strategy that merges chunks."""
     return NaiveMerge(config.execution_horizon, config.k_max)

@@ -1,6 +1,6 @@
-"""Strategy `async`: query during motion, blend each new chunk with the remaining plan.
+"""Strategy `async`: query during motion, and blend each new chunk with the remaining plan.
 
-A linear blend over the whole overlap ("all") is the published scheme of asynchronous chunk execution; the default
+A linear blend over the whole overlap ("all") is the published scheme of asynchronous chunk execution. The default
 window is shorter, because with "all" a change of the policy's intention takes effect only after 30 steps.
 """
 
@@ -50,10 +50,12 @@ class OverlapMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """Return the query half of the strategy."""
+    """Return the part of the strategy that decides when to query."""
     return Paced(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """Return the merge half; `dims` are the dimensions that must not be blended linearly."""
+    """Return the part of the strategy that merges chunks; `dims` are the dimensions that must not be blended
+    linearly.
+    """
     return OverlapMerge(config, dims)

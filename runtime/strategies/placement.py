@@ -1,4 +1,4 @@
-"""Placement rule of all strategies: which row of a chunk is for which step."""
+"""Rule of all strategies for the assignment of a chunk's rows to control steps."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from runtime.strategies.base import ArrivedChunk, Placement
 def place(
     arrival: ArrivedChunk, free_step: int, horizon: int | None = None, k_max: int | None = None
 ) -> Placement:
-    """Place row i at observation_step + i; drop rows for steps before `free_step` as stale.
+    """Assign row i to step observation_step + i, and drop rows for steps before `free_step` as stale.
 
-    Only the first `horizon` rows are used. At most `k_max` rows are dropped as stale: if more are due, the chunk is
+    Only the first `horizon` rows are used. At most `k_max` rows are dropped as stale: if more would be, the chunk is
     shifted to later steps, which counts as mistimed. A chunk that was requested while the robot was stopped starts at
-    `free_step` with row 0. A chunk whose rows are all in the past is dropped, whatever `k_max` is. A chunk that
-    arrives before its observation's step (the step was estimated too high) starts at once.
+    `free_step` with row 0. A chunk whose rows are all for past steps is dropped, whatever `k_max` is. A chunk that
+    arrives before the step of its observation (which was estimated too high) starts at once.
     """
     delay = free_step - arrival.observation_step
     count = len(arrival.rows) if horizon is None else min(horizon, len(arrival.rows))

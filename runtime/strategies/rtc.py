@@ -1,8 +1,8 @@
 """Strategy `rtc`: query during motion, with the committed rows in the request, so that the chunk continues them.
 
 Real-time chunking (arXiv 2506.07339). The requester builds the conditioning. A chunk that continues the executed
-actions replaces the plan as it is; otherwise (it arrived later than predicted, or the policy ignored the prefix) it
-is blended as in `async`.
+actions replaces the plan as it is. Otherwise (it arrived later than predicted, or the policy ignored the prefix) it is
+blended as in `async`.
 """
 
 from __future__ import annotations
@@ -28,13 +28,15 @@ class Config(StrategyParameters):
 
 
 class RtcQuery(Paced):
-    """Query during motion, back to back or at a rate; requests carry the committed rows."""
+    """Query during motion, at a rate or as soon as possible; requests carry the committed rows."""
 
     uses_rtc = True
 
 
 class RtcMerge(OverlapMerge):
-    """Merge that uses a chunk unchanged if it passes through the last executed step, else blends it."""
+    """Merge that uses a chunk unchanged if it contains the action executed last, at its step; otherwise it
+    blends it.
+    """
 
     uses_rtc = True
 
@@ -57,10 +59,12 @@ class RtcMerge(OverlapMerge):
 
 
 def query(config: Config) -> Query:
-    """Return the query half of the strategy."""
+    """Return the part of the strategy that decides when to query."""
     return RtcQuery(config.inference_rate)
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """Return the merge half; `dims` are the dimensions that must not be blended linearly."""
+    """Return the part of the strategy that merges chunks; `dims` are the dimensions that must not be blended
+    linearly.
+    """
     return RtcMerge(config, dims)

@@ -1,4 +1,4 @@
-"""Strategy `sync`: query, execute the chunk in order, query again; the robot holds while it waits."""
+"""Strategy `sync`: query, execute the whole chunk, query again; the robot holds while it waits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SyncQuery(Query):
 
 
 class SyncMerge(Merge):
-    """Merge that executes a chunk completely if it was requested while the robot was stopped, else drops it."""
+    """Merge that uses a whole chunk if it was requested while the robot was stopped, and drops it otherwise."""
 
     requests_while_stopped = True
 
@@ -50,10 +50,10 @@ class SyncMerge(Merge):
 
 
 def query(config: Config) -> Query:
-    """Return the query half of the strategy."""
+    """Return the part of the strategy that decides when to query."""
     return SyncQuery()
 
 
 def merge(config: Config, dims: DimensionKinds) -> Merge:
-    """Return the merge half of the strategy."""
+    """Return the part of the strategy that merges chunks."""
     return SyncMerge(config.execution_horizon)

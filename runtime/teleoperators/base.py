@@ -32,7 +32,7 @@ class LeaderPose:
 
 
 class Leader(ABC):
-    """One leader. A thread receives its messages; readers get the newest pose without waiting."""
+    """One leader. A thread receives its messages; its newest pose can be read without waiting."""
 
     def __init__(self, robot: Robot, clock: Clock) -> None:
         self._robot = robot
@@ -49,7 +49,7 @@ class Leader(ABC):
 
     @abstractmethod
     def connect(self) -> None:
-        """Start to listen; a leader that starts later is found by itself. Raises RuntimeFault."""
+        """Start to listen; a leader that starts later is connected then. Raises RuntimeFault."""
 
     @abstractmethod
     def close(self) -> None:
@@ -63,7 +63,7 @@ class Leader(ABC):
 
     @property
     def rate(self) -> float:
-        """Poses per second [Hz]; 0 after 2 s of silence."""
+        """Poses per second [Hz]; 0 if there was none for 2 s."""
         with self._lock:
             times = list(self._arrivals)
         if len(times) < 2 or self._clock.now() - times[-1] > _SILENT_S:
@@ -72,7 +72,7 @@ class Leader(ABC):
 
     @property
     def problem(self) -> str:
-        """Reason why its newest message could not be used, "" if it could."""
+        """Reason why the newest message could not be used, "" if it could."""
         with self._lock:
             return self._refused
 

@@ -1,4 +1,4 @@
-"""Leader as a policy: its pose becomes a chunk of equal rows, requested like any policy's.
+"""Leader as a policy: its pose becomes a chunk of equal rows, requested like a policy's chunk.
 
 A person's motion thereby uses the same path as a policy's: timeline, locks, safety and recording.
 """
@@ -44,9 +44,9 @@ _SPARE_ROWS = 2  # rows beyond the age limit: silence is reported by its age, no
 class LeaderPolicy(Policy):
     """Policy that follows a leader: to its pose ("absolute"), or by its motion since the engagement ("relative").
 
-    The engagement is the first request after a reset or a hold; earlier motion of the leader is not caught up.
-    Grippers are absolute in both modes. Joints of groups that the leader lacks stay as they were at the engagement:
-    at their commanded position if that is within `steady_error` of the measured one, because starting from the
+    The engagement is the first request after a reset or a hold; motion of the leader before it has no effect. Grippers
+    are absolute in both modes. Joints of groups that the leader lacks remain where they were at the engagement: at
+    their commanded position if that is within `steady_error` of the measured position, because starting from the
     measured position would let gravity lower the arm at each engagement.
     """
 
@@ -75,7 +75,7 @@ class LeaderPolicy(Policy):
         self._wanted: Float64 = np.zeros(robot.dim)
 
     def connect(self) -> PolicyInfo:
-        """Start to listen and wait for the leader's first pose. Raises PolicyLostError if none comes in time."""
+        """Start to listen and wait for the leader's first pose. Raises PolicyLostError if none arrives in time."""
         self.leader.connect()
         deadline = self._clock.now() + _FOUND_S
         while self.leader.latest_pose is None:
@@ -96,7 +96,7 @@ class LeaderPolicy(Policy):
         return ""
 
     def infer(self, observation: Observation, conditioning: Conditioning | None = None) -> ActionChunk:
-        """Return equal rows float32 [H, D]. Raises PolicyLostError if the leader is silent for too long."""
+        """Return equal rows float32 [H, D]. Raises PolicyLostError if the leader has been silent for too long."""
         if observation.qpos.shape != (self._dim,):
             raise PolicyError(_JOINTS_SHAPE(shape=list(observation.qpos.shape)))
         pose = self._pose()
@@ -144,11 +144,11 @@ class LeaderPolicy(Policy):
         return self._wanted
 
     def reset(self) -> None:
-        """Engage anew at the next request."""
+        """Let the next request be a new engagement."""
         self._last = None
 
     def resume(self) -> None:
-        """Engage anew: the robot was held, or there were no observations."""
+        """Let the next request be a new engagement, because the robot was held or there were no observations."""
         self.reset()
 
     def close(self) -> None:
@@ -156,7 +156,7 @@ class LeaderPolicy(Policy):
 
 
 class NodeDrivenPolicy(Policy):
-    """Policy of a robot whose own node reads the leader and drives: nothing is requested, its actions are recorded."""
+    """Policy of a robot whose own node follows the leader: nothing is requested, the node's actions are recorded."""
 
     is_queried = False
     uses_images = False
@@ -168,7 +168,7 @@ class NodeDrivenPolicy(Policy):
         raise PolicyError(_NODE_DRIVES)
 
     def reset(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no state."""
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no connection."""

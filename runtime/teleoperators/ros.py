@@ -1,4 +1,4 @@
-"""Leader on ROS topics of either generation: a sensor_msgs/JointState for each group of the robot that it leads."""
+"""Leader on ROS 1 or ROS 2 topics: a sensor_msgs/JointState for each group of the robot that it leads."""
 
 from __future__ import annotations
 
@@ -49,10 +49,9 @@ class LeaderGroups(Settings):
 class RosLeader(Leader):
     """Leader with one topic per group, or one topic for several groups.
 
-    A pose is complete when each topic has sent something new, and as old as the oldest of these messages.
-
-    A message with the stamp of its predecessor is not new: a publisher that only repeats itself counts as silent.
-    Messages without a stamp are always new.
+    There is a new pose once every topic has sent a new message; its age is that of the oldest of them. A message with
+    the stamp of its predecessor is not new: a publisher that only repeats itself counts as silent. Messages without a
+    stamp are always new.
     """
 
     def __init__(
@@ -99,7 +98,9 @@ class RosLeader(Leader):
 
     @property
     def problem(self) -> str:
-        """Reason why a message could not be used, else the topics that send nothing new and why; "" if all do."""
+        """Reason why a message could not be used, else a sentence on each topic without new messages; "" if all have
+        some.
+        """
         if said := super().problem:
             return said
         waiting = [part.topic for group, part in self._parts.items() if group not in self._fresh]

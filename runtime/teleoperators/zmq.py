@@ -1,7 +1,7 @@
-"""Leader over ZMQ: it publishes its joints, we subscribe; single frames, openpi arrays.
+"""Leader over ZMQ that publishes its joints, to which we subscribe; single frames, openpi's arrays.
 
-A message is a map: `t`, its own clock [s], and `state`, joints by the robot's groups, in the form of an execution
-node. The protocol has no authentication, so an endpoint beyond this machine needs `insecure_link`.
+A message is a map: `t`, its own clock [s], and `state`, joints by the robot's groups, in the form of an execution node.
+The protocol has no authentication, so an endpoint beyond this machine needs `insecure_link`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def build(config: Config, robot: Robot, clock: Clock) -> ZmqLeader:
 
 
 class ZmqLeader(Leader):
-    """SUB socket that keeps only the newest message, read by a thread.
+    """Leader that a thread receives on a SUB socket that keeps only the newest message.
 
     A message with the `t` of its predecessor is not new: a publisher that only repeats itself counts as silent.
     """
@@ -117,7 +117,7 @@ class ZmqLeader(Leader):
             socket.close()
 
     def handle_message(self, payload: bytes) -> None:
-        """Process one message; an unusable message becomes the `problem` of the leader."""
+        """Process one message; an unusable message becomes the leader's `problem`."""
         try:
             stamp, joints = self._parse(payload)
         except CodecError as error:

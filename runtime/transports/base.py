@@ -27,7 +27,7 @@ class Capabilities:
 
 
 class Source(ABC):
-    """Source of observations; the newest one by arrival counts."""
+    """Source of observations; of several, the one that arrived last is the newest."""
 
     @abstractmethod
     def connect(self) -> None:
@@ -45,17 +45,17 @@ class Source(ABC):
         """Release all resources. Safe to call twice."""
 
     def begin_run(self) -> None:  # noqa: B027  # not abstract: a live robot needs nothing
-        """Start a run; a recording plays from its first frame."""
+        """Start a run; a source that plays a recording starts from its first frame."""
 
     def end_run(self) -> None:  # noqa: B027
-        """End the run; a video returns to its first picture."""
+        """End the run; a source that plays a video returns to its first picture."""
 
     def faults(self) -> dict[str, int]:
         """Return the count of each fault since `connect`, e.g. {"clock_backwards": 1, "malformed": 3}."""
         return {}
 
     def describe_fault(self, fault: str) -> str:
-        """Return the newest sentence about one of `faults`, or "" if its name is sufficient."""
+        """Return a sentence about the latest occurrence of a fault in `faults`, "" if its name is sufficient."""
         return ""
 
     def camera_health(self) -> dict[str, dict[str, Any]]:
@@ -63,7 +63,7 @@ class Source(ABC):
         return {}
 
     def pop_events(self) -> list[Event]:
-        """Return the events for the operator since the last call."""
+        """Return the events for the operator that have occurred since the last call."""
         return []
 
 
@@ -89,7 +89,7 @@ class Sink(ABC):
         raise TransportError(f"this transport takes no control words; {word!r} was to be sent")
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Map each command topic without a subscriber to the reason, "" if unknown; {} if the transport cannot tell.
+        """Return the reason ("" if unknown) by command topic without a subscriber; {} if the transport cannot tell.
 
         Sends no request and does not block. Raises TransportError.
         """

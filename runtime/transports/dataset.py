@@ -1,4 +1,4 @@
-"""Recorded episode in place of a robot: it plays at its own rate, and commands move nothing."""
+"""Transport that plays a recorded episode at its own rate in place of a robot; commands move nothing."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Config(Settings):
 
 
 class DatasetSource(Source):
-    """Source that plays an episode: frame k is due at the start of the run plus k / fps on the given clock.
+    """Source that plays an episode: frame k is due k / fps after the start of the run, on the given clock.
 
     Before and between runs the first frame is delivered repeatedly, at most at the recording's rate, like a robot at
     rest. A late reader receives the newest frame that is due; missed frames are counted as `skipped_frames`. The last
@@ -156,7 +156,7 @@ class DatasetSource(Source):
         return self._clock.now() + TOLERANCE >= due
 
     def _prefetch(self, row: int) -> None:
-        """Decode `row` while waiting for it. Errors are reported when the row is due."""
+        """Decode the pictures of `row` while waiting for its due time, when errors in them are reported."""
         with suppress(RecordingError):
             self._decode(row)
 
@@ -207,18 +207,21 @@ class DatasetSink(Sink):
         self.commands = 0
 
     def connect(self) -> None:
-        """Do nothing."""
+        """Do nothing, because there is no robot."""
 
     def send(self, command: RobotCommand) -> None:
         """Count `command`."""
         self.commands += 1
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing, because nothing is open."""
 
 
 def capabilities(config: Config) -> Capabilities:
-    """Return the abilities of a recording: finite, moves nothing, measures poses if the mapping names their column."""
+    """Return the abilities of a recording: it ends, and moves no robot.
+
+    It measures poses if the mapping names a column of poses.
+    """
     return Capabilities(moves_robot=False, is_finite=True, measures_eef=config.mapping.eef is not None)
 
 

@@ -1,4 +1,7 @@
-"""Detection of frozen cameras. A node stamps its messages, not the pictures, so an old picture seems new."""
+"""Detection of frozen cameras.
+
+A node stamps its messages and not the pictures, so that an old picture seems new.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,16 @@ _SAMPLED_ROWS = 16  # every 16th row is compared first: enough to tell two pictu
 
 
 class FrozenCameraDetector:
-    """Detector of cameras whose picture does not change. Pass the pictures of one source, in their order."""
+    """Detector of cameras whose picture does not change; pass it the pictures of one source in order."""
 
     def __init__(self) -> None:
         self._newest: dict[str, tuple[UInt8, float]] = {}  # by camera: picture and first time
         self._frozen: set[str] = set()
 
     def captured(self, pictures: Mapping[str, UInt8], time: float) -> dict[str, float]:
-        """Return when each picture first appeared: `time`, or earlier if it equals the previous one."""
+        """Return by camera when its picture first appeared: `time`, or earlier if the picture equals the
+        previous one.
+        """
         times = {}
         for camera, picture in pictures.items():
             before = self._newest.get(camera)
@@ -31,7 +36,10 @@ class FrozenCameraDetector:
         return times
 
     def newly_frozen(self, time: float) -> list[str]:
-        """Return cameras whose picture is unchanged for over FROZEN_S at `time`; each once until it changes again."""
+        """Return the cameras whose picture has not changed for FROZEN_S at `time`.
+
+        Each is returned once, and again only after its picture has changed.
+        """
         frozen = {camera for camera, (_, since) in self._newest.items() if time - since > FROZEN_S}
         new = sorted(frozen - self._frozen)
         self._frozen |= frozen

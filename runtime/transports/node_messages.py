@@ -1,4 +1,6 @@
-"""Messages of an execution node, checked against the robot and refused by a named fault."""
+"""Messages of an execution node, checked against the robot; an invalid message is refused under the name of its
+fault.
+"""
 
 from __future__ import annotations
 
@@ -51,10 +53,11 @@ class NodeStatus:
 
 @dataclass(frozen=True, slots=True)
 class NodeFrame:
-    """One complete observation as sent: `stamp` in the node's own clock [s], pictures in its own `encoding`.
+    """One complete observation as sent.
 
-    `truth` is the ground truth of a simulated bench, as JSON. `drives` is {"enabled": bool, "faults": [str]}, or None
-    if the node does not report it. `remarks` are (fault, text) of optional parts that were dropped as unusable.
+    `stamp` is in the node's own clock [s], pictures are in the `encoding` of the node. `truth` is the ground truth of a
+    simulated bench, as JSON. `drives` is {"enabled": bool, "faults": [str]}, or None if the node does not report it.
+    `remarks` are (fault, text) of optional parts that were dropped as unusable.
     """
 
     stamp: float
@@ -137,7 +140,10 @@ class NodeMessages:
     def _optional(
         self, remarks: list[tuple[str, str]], name: str, read: Callable[[str, object], Part], given: object
     ) -> Part | None:
-        """Return the part as read, or None if it is absent or unusable; an unusable part is added to `remarks`."""
+        """Return the part that `read` reads from `given`; None if it is absent or unusable.
+
+        An unusable part is added to `remarks`.
+        """
         if given is None:
             return None
         try:
@@ -227,7 +233,7 @@ def _truth(name: str, given: object) -> Mapping[str, Any]:
 
 
 def _drives(name: str, given: object) -> Mapping[str, Any]:
-    """Return the state of the drives: enabled or not, and their faults; other keys are dropped."""
+    """Return the state of the drives: whether they are enabled, and their faults; other keys are dropped."""
     if not isinstance(given, dict):
         raise MessageRefused("malformed", f"{name} is a {type(given).__name__}; expected a map")
     enabled, faults = given.get("enabled"), given.get("faults", [])

@@ -1,4 +1,6 @@
-"""Observations of an execution node over ZMQ: the newest by arrival, on our clock, with counted faults."""
+"""Observations of an execution node over ZMQ: the newest by arrival, with times on our clock, and with counted
+faults.
+"""
 
 from __future__ import annotations
 
@@ -118,9 +120,9 @@ _BACKWARDS_S = 0.1  # [s]; one socket keeps the order, so an earlier stamp means
 class NodeSource(Source):
     """SUB socket that a thread empties continuously, so that no frame ages in a queue.
 
-    Newest means newest by arrival: after a restart a node's clock is smaller, and its frames count at once.
-    `Observation.sequence` counts the usable frames since `connect`, independent of the node's own numbers. Errors in
-    the thread are counted; if the socket fails, the thread opens another.
+    The newest frame is the one that arrived last: after a restart a node's clock is smaller, and its frames count at
+    once. `Observation.sequence` counts the usable frames since `connect`, independent of the node's own numbers. Errors
+    in the thread are counted; if the socket fails, the thread opens another.
     """
 
     _told: str  # last reported reason why no frame arrives
@@ -170,8 +172,9 @@ class NodeSource(Source):
             self._thread = None
 
     def faults(self) -> dict[str, int]:
-        """Return the number of refused messages by reason, lost frames, and jumps of the node's clock.
+        """Return the number of refused messages by reason, and these counts:
 
+        `clock_backwards` and `clock_forwards` count jumps of the node's clock.
         `frames_lost` counts gaps in the node's own numbers.
         `frozen_<camera>` counts how often that camera's picture stayed the same for too long.
         `truth_ignored` is 1 if a node that is not declared simulated sends the ground truth of a bench.
@@ -183,7 +186,9 @@ class NodeSource(Source):
             return dict(self._faults) | refused
 
     def describe_fault(self, fault: str) -> str:
-        """Return the newest sentence about a fault; for refusals by the node, an explanation of its reason."""
+        """Return a sentence about the latest occurrence of a fault; if the node refused commands, an explanation of its
+        reason.
+        """
         if fault == "node_refused.other_master":
             return _SEVERAL_CLIENTS(client=self._status.master)
         if fault in _REFUSED:
@@ -265,7 +270,7 @@ class NodeSource(Source):
             socket.close()
 
     def _handle_messages(self, payloads: list[memoryview], arrived: float) -> None:
-        """Store the newest usable message; a partial or broken message never replaces an older complete one."""
+        """Store the newest usable message of `payloads`; an unusable newer one does not replace a usable older one."""
         self._heard_at = arrived
         for payload in reversed(payloads):
             try:
@@ -278,7 +283,7 @@ class NodeSource(Source):
                     return
 
     def _store_frame(self, frame: NodeFrame, arrived: float) -> bool:
-        """Store the frame for `receive`; return False if it is older than an earlier frame."""
+        """Store the frame for `receive`; return False if its stamp is older than that of an earlier frame."""
         for fault, text in frame.remarks:
             self._count_fault(fault, text)
         if frame.truth is not None and not self._simulated:
@@ -302,13 +307,15 @@ class NodeSource(Source):
         return True
 
     def _ignore_truth(self) -> None:
-        """Count the fault only once: every message of such a node carries a ground truth."""
+        """Count one fault, however many messages contain a ground truth: every message of such a node does."""
         if "truth_ignored" not in self._faults:
             text = _TRUTH_UNDECLARED
             self._count_fault("truth_ignored", text)
 
     def _captured(self, frame: NodeFrame, time: float) -> dict[str, float]:
-        """Return the capture time of each stream: the message's, but an earlier one for unchanged pictures."""
+        """Return the capture time by stream: `time`, but for an unchanged picture the time at which it first
+        appeared.
+        """
         times = dict.fromkeys(["joints", *(["eef"] if frame.eef is not None else []), *frame.pictures], time)
         if self._detect_frozen:
             times |= self._freshness.captured(frame.pictures, time)
@@ -317,7 +324,8 @@ class NodeSource(Source):
         return times
 
     def _mapped(self, stamp: float, arrived: float) -> float | None:
-        """Return the node's stamp on our clock, or None if it is older than the newest: time never goes back.
+        """Return the node's stamp on our clock, or None if it is older than an earlier stamp, because time never goes
+        back.
 
         If the node's clock jumps, the jump is counted and the map starts anew.
         """
@@ -352,7 +360,7 @@ class NodeSource(Source):
 
 
 def _drain(socket: zmq.Socket[bytes]) -> list[memoryview]:
-    """Return all messages that have arrived, oldest first; bounded, so that a flood cannot block the thread.
+    """Return all messages that have arrived, oldest first, up to a limit, so that a flood cannot block the thread.
 
     The messages stay in ZMQ's own buffers without a copy; decoding copies the parts that it needs.
     """
@@ -384,7 +392,10 @@ def _observation(
 
 
 def _bgr_to_rgb(bgr: UInt8) -> UInt8:
-    """Convert BGR to RGB, ten times as fast as numpy. cv2 is imported here: control locks its imports into memory."""
+    """Convert BGR to RGB with cv2, which is ten times as fast as numpy.
+
+    cv2 is imported only here, because control locks everything that it imports into memory.
+    """
     import cv2
 
     rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

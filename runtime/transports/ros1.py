@@ -1,7 +1,7 @@
-"""ROS 1 topics of a robot through rospy, which runs in a process of its own with the Python that has it.
+"""ROS 1 topics of a robot through rospy, which runs in a child process with a Python that has it.
 
-ROS 1 has no protection: any peer that reaches the master or a node can command the robot. A master or an address
-beyond this machine therefore needs `insecure_link`.
+ROS 1 has no protection: any peer that reaches the master or a node can command the robot. A master or an address beyond
+this machine therefore needs `insecure_link`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Config(Link, RosSettings):
 
 
 def capabilities(config: Config) -> Capabilities:
-    """Return the abilities of the transport, which commands a robot. Raises SetupError if rospy is not installed."""
+    """Return the abilities of the transport. Raises SetupError if rospy is not installed."""
     require(config.python)
     return config.capabilities
 
@@ -108,7 +108,7 @@ def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
 
 
 def middleware(config: Link, name: str) -> Middleware:
-    """Create a node, which registers as soon as the master is there. Raises SetupError if rospy is not installed."""
+    """Return a node that registers as soon as there is a master. Raises SetupError if rospy is not installed."""
     return TcpRosMiddleware(RosEnvironment(config.python, config.master, config.address), name)
 
 
@@ -118,7 +118,10 @@ def _subscribed_topics(parts: tuple[StreamSpec, ...]) -> tuple[Subscription, ...
 
 
 def _host(table: str, master: str) -> str:
-    """Return the host of a master's URI. Raises ConfigurationError if the URI is invalid."""
+    """Return the host of a master's URI; `table` is the configuration table that errors name.
+
+    Raises ConfigurationError if the URI is invalid.
+    """
     try:
         parts = urlsplit(master)
         fits = parts.scheme == "http" and parts.hostname and parts.port and parts.path in ("", "/")

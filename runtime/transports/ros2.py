@@ -75,7 +75,7 @@ class Config(Link, RosSettings):
 
 
 def capabilities(config: Config) -> Capabilities:
-    """Return the abilities of the transport, which commands a robot. Raises SetupError without the middleware."""
+    """Return the abilities of the transport. Raises SetupError if the middleware is not installed."""
     (dds_middleware.require if config.middleware == "dds" else rclpy_middleware.require)()
     return config.capabilities
 
@@ -103,7 +103,7 @@ def sink(config: Config, robot: Robot, clock: Clock) -> RosSink:
 
 
 def middleware(config: Link, name: str) -> Middleware:
-    """Create a node of the chosen middleware. Raises SetupError if it is not installed."""
+    """Return a node of the chosen middleware. Raises SetupError if that is not installed."""
     if config.middleware == "rclpy":
         return rclpy_middleware.RclMiddleware(config.domain, name)
     return dds_middleware.DdsMiddleware(config.domain, config.network, tuple(config.peers))

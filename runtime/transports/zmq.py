@@ -1,4 +1,4 @@
-"""ZMQ link to an execution node: the node binds, we connect; PUB/SUB, single frames, openpi arrays.
+"""ZMQ link to an execution node, to which we connect; single frames over PUB and SUB sockets, with openpi's arrays.
 
 The protocol has no handshake, authentication or encryption, so endpoints beyond loopback need `insecure_link`.
 """
@@ -63,13 +63,16 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def _has_port(endpoint: str) -> bool:
-    """Return True if the port is valid; libzmq accepts any number and then waits for ever."""
+    """Return True if the endpoint has a valid port; libzmq accepts any number and then waits without an error."""
     port = endpoint.rpartition(":")[2]
     return port.isascii() and port.isdigit() and 0 < int(port) < 65536
 
 
 def capabilities(config: Config) -> Capabilities:
-    """Return the abilities of a node: it may command a real robot, and measures poses if it sends them."""
+    """Return the abilities of a node.
+
+    It may command a real robot, send measured poses, follow its own leader and, if declared simulated, reset its bench.
+    """
     return Capabilities(
         moves_robot=True, measures_eef=True, drives_itself=True, resets_bench=config.simulated
     )

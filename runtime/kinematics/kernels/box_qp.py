@@ -11,7 +11,10 @@ _DEFINITE = 1e-13  # share of the diagonal that a pivot must exceed
 
 
 def box_qp_type(size: int) -> np.dtype[np.void]:
-    """Return the type of a quadratic problem in `size` variables: data, box around 0, solution, and scratch."""
+    """Return the type of a quadratic problem in `size` variables.
+
+    It contains the problem's numbers, the bounds around 0, the solution, and scratch memory.
+    """
     vector, square = (size,), (size, size)
     return np.dtype(
         [
@@ -74,7 +77,7 @@ def _set_slope(box: Record, damping: float) -> None:
 
 @device_function
 def _release_bound(box: Record, damping: float) -> bool:
-    """Release the fixed variable with the largest inward slope; return whether there was one."""
+    """Release the fixed variable with the largest inward slope; return True if there was one."""
     n = len(box.step)
     holding = 0
     for i in range(n):
@@ -96,8 +99,9 @@ def _release_bound(box: Record, damping: float) -> bool:
 def _solve(box: Record, damping: float) -> bool:
     """Write to box.move the step that makes the slope of all free variables zero, by Cholesky's L D L^T.
 
-    Column by column: below the diagonal is the rest of the system, on it 1 / D, above it L transposed. A fixed
-    variable is a row of the identity: its move is zero. Returns False if the system is not positive definite.
+    The factors are computed column by column: below the diagonal is the rest of the system, on it 1 / D, above it L
+    transposed. A fixed variable is a row of the identity, so that its move is zero. Returns False if the system is not
+    positive definite.
     """
     factors, move, held = box.factors, box.move, box.held
     n = len(move)

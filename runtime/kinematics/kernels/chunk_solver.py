@@ -39,9 +39,9 @@ _SHORTEST = 1e-12  # square of the shortest valid quaternion
 def arm_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
     """Return the type of an arm with `moving` joints driven by `size` numbers, on a carrier of `carrying` joints.
 
-    Of the numbers the first `joints` are the arm's own, at the indices `dims` of the robot's vector, within `lower`
-    and `upper`, not faster than `speed`; the rest is padding at 0. Limits repel joints that are nearer than `below`
-    and `above`.
+    Of the numbers the first `joints` are the arm's own, at the indices `dims` of the robot's vector, within `lower` and
+    `upper`, not faster than `speed`; the rest is padding at 0. A limit repels a joint that is nearer to it than `below`
+    (for `lower`) or `above` (for `upper`).
     """
     return np.dtype(
         [
@@ -65,7 +65,7 @@ def scratch_type(moving: int, carrying: int, size: int) -> np.dtype[np.void]:
 
 
 class Tolerances(NamedTuple):
-    """Errors [m, rad] within which a frame is reached, and singular value below which it is near singular."""
+    """Errors [m, rad] within which a frame is reached, and the singular value below which it is near singular."""
 
     position: float
     rotation: float
@@ -91,8 +91,9 @@ def solve_chunk(
 ) -> int:
     """Compute joints q [T, D], errors and flags [T, A] for targets [T, A, 7], from seed [1, D].
 
-    dt [s], 0: no velocity limit; anchor [D], ignored if anchor_row is -1; guide [T, D] are joints that rows should
-    approach, [0, D]: none; `scratches` needs one element. Returns FINE, NOT_FINITE or NO_QUATERNION.
+    `dt` [s] is 0 if there is no velocity limit; `anchor` [D] is ignored if `anchor_row` is -1; `guide` [T, D] are
+    joints that rows should approach, or [0, D]; `scratches` needs one element. Returns FINE, NOT_FINITE or
+    NO_QUATERNION.
     """
     wrong = _wrong(targets, seed, anchor)
     if wrong != FINE:
@@ -155,7 +156,7 @@ def _wrong(targets: Float64, seed: Float64, anchor: Float64) -> int:
 
 @device_function
 def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
-    """Set the start of the first frame: the seed, clipped to the limits."""
+    """Set the start of the first frame to the seed, clipped to the limits."""
     for i in range(len(frame.q)):
         there = seed[0, arm.dims[i]] if i < arm.joints else 0.0
         frame.q[i] = min(max(there, arm.lower[i]), arm.upper[i])
@@ -164,7 +165,7 @@ def _set_first_seed(arm: Record, seed: Float64, frame: Record) -> None:
 
 @device_function
 def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
-    """Set the box of a frame: joint limits and, if dt is given, the reach of each joint's velocity from `before`."""
+    """Set the bounds of a frame: joint limits and, if `dt` is above 0, how far each joint can move from `before`."""
     for i in range(len(frame.q)):
         frame.lower[i], frame.upper[i] = arm.lower[i], arm.upper[i]
         if dt > 0:
@@ -178,8 +179,9 @@ def _set_bounds(arm: Record, dt: float, frame: Record) -> None:
 def _set_start(going: bool, frame: Record) -> None:
     """Set the start of a frame's search and its rest position.
 
-    If the previous frame reached its target, the start extrapolates its motion, and the rest position most of it: on
-    a smooth path one iteration then suffices, and where branches meet (a singularity) the motion continues straight.
+    If the previous frame reached its target, the start is a full extrapolation of its motion, and the rest position
+    most of one: on a smooth path one iteration then suffices, and where branches meet (a singularity) the motion
+    continues straight.
     """
     for i in range(len(frame.q)):
         begin = min(max(frame.q[i], frame.lower[i]), frame.upper[i])
@@ -191,7 +193,9 @@ def _set_start(going: bool, frame: Record) -> None:
 
 @device_function
 def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Record) -> None:
-    """Set start and rest position to the joints closest to the guide's row within reach of the previous frame."""
+    """Set start and rest position to the joints closest to the guide's row that are within reach of the previous
+    frame.
+    """
     for i in range(arm.joints):
         way = _GUIDED * arm.speed[i] * dt
         there = min(max(guide[row, arm.dims[i]], frame.before[i] - way), frame.before[i] + way)
@@ -201,7 +205,10 @@ def _follow_guide(arm: Record, guide: Float64, row: int, dt: float, frame: Recor
 
 @device_function
 def _set_goal(targets: Float64, row: int, index: int, carried: Float64, goal: Float64) -> None:
-    """Write to `goal` [12] the target relative to the base of the arm's own chain, the last frame of `carried`."""
+    """Write to `goal` [12] the target pose relative to the base of the arm's own chain.
+
+    That base is the last frame of the carrier's frames `carried`.
+    """
     base = len(carried) - 1
     matrix = matrix_of(
         targets[row, index, 3], targets[row, index, 4], targets[row, index, 5], targets[row, index, 6]

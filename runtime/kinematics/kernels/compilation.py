@@ -19,7 +19,9 @@ _FAST = {"contract", "nsz"}  # fused multiply-add; no reordering, which would sp
 
 
 def kernel(loop: Loop) -> Loop:
-    """Compile a loop that Python calls, at its first call with each set of types; cached if a folder is writable."""
+    """Compile a loop that Python calls, at its first call with each set of types; cached on disk if a folder is
+    writable.
+    """
     made = numba.njit(cache=CACHE is not None, nogil=True, fastmath=_FAST, error_model="numpy")(loop)
     return cast(Loop, made)
 

@@ -15,13 +15,17 @@ from runtime.kinematics.kernels.rotations import compute_sincos, quaternion_of
 
 
 def fk_buffer_type(moving: int) -> np.dtype[np.void]:
-    """Return the type of: values, sines and cosines of a chain's joints; frames of its joints and, last, its tip."""
+    """Return the type of the scratch buffer for a chain.
+
+    It contains values, sines and cosines of the chain's joints, and the frames of its joints followed by that of its
+    tip.
+    """
     return np.dtype([("turns", np.float64, (3, moving)), ("frames", np.float64, (moving + 1, 12))])
 
 
 @device_function
 def compute_fk(chain: Record, q: Float64, row: int, reach: Record) -> None:
-    """Compute joint frames and tip of the chain for the driving numbers q[row], in `reach`."""
+    """Compute in `reach` the joint frames and the tip of the chain for the driving numbers q[row]."""
     turns, frames = reach.turns, reach.frames
     for i in range(len(chain.drive)):
         drive = chain.drive[i]
@@ -46,7 +50,7 @@ def compute_fk(chain: Record, q: Float64, row: int, reach: Record) -> None:
 
 @device_function
 def _compose_frame(chain: Record, index: int, frames: Float64) -> None:
-    """Set frames[index] from its predecessor and the chain's `fixed` transform."""
+    """Set frames[index] from the frame before it and the chain's `fixed` transform."""
     fixed = chain.fixed
     for i in range(3):
         a, b, c = frames[index - 1, 3 * i], frames[index - 1, 3 * i + 1], frames[index - 1, 3 * i + 2]
@@ -61,7 +65,10 @@ def _compose_frame(chain: Record, index: int, frames: Float64) -> None:
 def compute_jacobian(
     chain: Record, reach: Record, position: float, rotation: float, jacobian: Float64
 ) -> None:
-    """Write to jacobian [6, n] d(position, rotation vector)/dq of the tip, multiplied by the weights."""
+    """Write to jacobian [6, n] the derivatives of the tip's position and rotation vector with respect to q.
+
+    They are multiplied by the weights `position` and `rotation`.
+    """
     frames, last = reach.frames, len(chain.drive)
     for k in range(6):
         for i in range(jacobian.shape[1]):
@@ -92,9 +99,9 @@ def compute_jacobian(
 
 @kernel
 def compute_poses(chains: Records, q: Float64, reaches: Records, poses: Float64) -> None:
-    """Write to poses [T, A, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) the tips for q [T, D].
+    """Write to poses [T, A, 7] (x, y, z, qw, qx, qy, qz with qw >= 0) the poses of the tips for joints q [T, D].
 
-    `reaches` needs one element, as scratch.
+    `reaches` needs one element, as scratch memory.
     """
     reach = reaches[0]
     frames, last = reach.frames, len(reach.frames) - 1

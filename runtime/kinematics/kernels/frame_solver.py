@@ -21,9 +21,10 @@ _LEAST_DAMPING = 1e-8  # smaller values become 0
 
 
 class Costs(NamedTuple):
-    """Weights of a solve: position and rotation errors [per m, rad], and distance from the rest position [per rad, m].
+    """Weights in the cost of a solution, and the largest number of iterations.
 
-    `home_rate` [1/s] is the rate at which redundant joints return to home.
+    The weights are those of position error [per m], rotation error [per rad] and distance from the rest position [per
+    rad or m]. `home_rate` [1/s] is the rate at which redundant joints return to home.
     """
 
     position: float
@@ -34,7 +35,10 @@ class Costs(NamedTuple):
 
 
 def frame_type(moving: int, size: int) -> np.dtype[np.void]:
-    """Return the type of one frame during its solution, for a chain of `moving` joints that `size` numbers drive."""
+    """Return the type of the data of one frame during its solution.
+
+    It is for a chain of `moving` joints that `size` numbers drive.
+    """
     vector = (size,)
     return np.dtype(
         [
@@ -113,7 +117,7 @@ def solve_frame(chain: Record, costs: Costs, frame: Record) -> float:
 
 @device_function
 def _evaluate(costs: Costs, frame: Record) -> float:
-    """Write to frame.attempt the weighted error of the tip; return its square.
+    """Write to frame.attempt the weighted error of the tip; return the sum of its squares.
 
     The geometric Jacobian is used as derivative of the rotation vector; the gradient remains exact.
     """
@@ -130,7 +134,9 @@ def _evaluate(costs: Costs, frame: Record) -> float:
 
 @device_function
 def _set_quadratic(rest: float, frame: Record) -> None:
-    """Set system and gradient of half the cost at q, and the bounds of the step."""
+    """Set the system and the gradient of the quadratic problem, half the cost around frame.q, and the bounds of the
+    step.
+    """
     box, jacobian = frame.box, frame.jacobian
     for i in range(len(frame.q)):
         slope = rest * (frame.q[i] - frame.centre[i])
@@ -162,7 +168,7 @@ def _predicted_decrease(box: Record) -> float:
 def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> bool:
     """Return True if the smallest singular value of the unweighted Jacobian of `joints` joints is less than `below`.
 
-    That is so if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot that is not positive.
+    This is the case if J J^T - below^2 I (J^T J with fewer than six joints) has a pivot that is not positive.
     """
     normal = frame.normal
     set_normal_matrix(joints, costs, frame)
@@ -181,7 +187,7 @@ def is_near_singular(joints: int, below: float, costs: Costs, frame: Record) -> 
 
 @device_function
 def set_normal_matrix(joints: int, costs: Costs, frame: Record) -> None:
-    """Set the lower triangle of J J^T; with fewer than six joints, of J^T J, padded."""
+    """Set the lower triangle of frame.normal to J J^T; with fewer than six joints, to J^T J, padded."""
     normal, jacobian = frame.normal, frame.jacobian
     metre, radian = 1 / (costs.position * costs.position), 1 / (costs.rotation * costs.rotation)
     mixed = 1 / (costs.position * costs.rotation)

@@ -13,10 +13,10 @@ from runtime.kinematics.kernels.rotations import compute_sincos
 
 
 class LinkTable(NamedTuple):
-    """Links [P], parents first: the transform of each relative to its parent, as a function of its joint value.
+    """Table of links [P], parents first, with the pose of each relative to its parent as a function of its joint value.
 
-    `motions` [P, 4, 12] are weighted by 1, the cosine, the sine and the value itself, and added: a rotation row by
-    row, then the origin. The value is factor * q[drive] + offset (drive -1: the offset) within `low` and `high`;
+    `motions` [P, 4, 12] are weighted by 1, the cosine, the sine and the value itself, and added; the sum is a rotation
+    row by row, then the origin. The value is factor * q[drive] + offset (drive -1: the offset) within `low` and `high`;
     `above` is the parent's index.
     """
 
@@ -31,7 +31,7 @@ class LinkTable(NamedTuple):
 
 @kernel
 def compute_link_poses(parts: LinkTable, q: Float64, placed: Float32) -> None:
-    """Write to placed [T, P, 16] the transforms scene <- link, column by column, for q [T, D]."""
+    """Write to placed [T, P, 16] the transforms scene <- link, column by column, for joints q [T, D]."""
     count = len(parts.drive)
     frames, turns, own = np.empty((count, 12)), np.empty((3, count)), np.empty(12)
     for row in range(len(q)):

@@ -19,7 +19,7 @@ _DEFINITE = 1e-9  # least pivot
 
 @device_function
 def update_jacobian(chain: Record, costs: Costs, frame: Record) -> None:
-    """Write to frame.jacobian that of frame.q, before a frame is solved."""
+    """Write to frame.jacobian the Jacobian at frame.q, before a frame is solved."""
     for i in range(len(frame.q)):
         frame.tried[0, i] = frame.q[i]
     compute_fk(chain, frame.tried, 0, frame.reach)
@@ -54,9 +54,9 @@ def add_nullspace_bias(arm: Record, costs: Costs, dt: float, going: bool, frame:
 
 @device_function
 def _potential_gradient(arm: Record, joint: int, frame: Record) -> float:
-    """Return the negative gradient of the potential [rad, m]: towards home, and away from near limits.
+    """Return the negative gradient of the potential [rad, m], which points to home and away from near limits.
 
-    Write to frame.stiffness its derivative with respect to the joint.
+    Write to frame.stiffness the second derivative of the potential with respect to the joint.
     """
     value = frame.begin[joint]
     away = arm.home[joint] - value
@@ -76,10 +76,10 @@ def _potential_gradient(arm: Record, joint: int, frame: Record) -> float:
 
 @device_function
 def _project_nullspace(joints: int, costs: Costs, frame: Record) -> float:
-    """Project both rows of frame.free to the null space; return the distance from a singularity, 0 to 1.
+    """Project both rows of frame.free to the null space; return the distance from a singularity, from 0 to 1.
 
-    free - J^T (J J^T)^-1 J free, by L D L^T: in `normal`, L D of J J^T remains below the diagonal and D on it, and L
-    transposed is written above it.
+    The projection is free - J^T (J J^T)^-1 J free, by L D L^T: in `normal`, L D of J J^T remains below the diagonal and
+    D on it, and L transposed is written above it.
     """
     normal, jacobian, free, moved = frame.normal, frame.jacobian, frame.free, frame.moved
     set_normal_matrix(joints, costs, frame)

@@ -1,4 +1,6 @@
-"""Sine and cosine of several angles at once; quaternions (w, x, y, z), matrices and rotation vectors, on scalars."""
+"""Sines and cosines of several angles at once, and conversions of quaternions (w, x, y, z), matrices and rotation
+vectors.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ _C4, _C5, _C6 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.1359
 
 @device_function
 def compute_sincos(turns: Float64) -> None:
-    """Write sines and cosines of row 0 of `turns` [3, N] [rad] to rows 1 and 2; within 2e-16 up to 1e5 rad."""
+    """Write sines and cosines of the angles [rad] in row 0 of `turns` [3, N] to rows 1 and 2.
+
+    The error is below 2e-16 for angles up to 1e5 rad.
+    """
     for index in range(turns.shape[1]):
         angle = turns[0, index]
         quarters = np.floor(angle * _QUARTERS + 0.5)
@@ -68,7 +73,7 @@ def matrix_of(w: float, x: float, y: float, z: float) -> Matrix:
 
 @device_function
 def quaternion_of(matrix: Matrix) -> Quaternion:
-    """Return the unit quaternion with w >= 0, from the largest of its four squares (Shepperd 1978)."""
+    """Return the unit quaternion with w >= 0, computed from the largest of its four squares (Shepperd 1978)."""
     a, b, c = matrix[0], matrix[4], matrix[8]
     x, y, z = matrix[7] - matrix[5], matrix[2] - matrix[6], matrix[3] - matrix[1]
     xy, xz, yz = matrix[3] + matrix[1], matrix[2] + matrix[6], matrix[7] + matrix[5]
@@ -87,7 +92,7 @@ def quaternion_of(matrix: Matrix) -> Quaternion:
 
 @device_function
 def rotation_vector(matrix: Matrix) -> Vector:
-    """Return axis times angle; the angle is in [0, pi] rad."""
+    """Return the rotation vector of a matrix, axis times angle; the angle is in [0, pi] rad."""
     x, y, z = 0.5 * (matrix[7] - matrix[5]), 0.5 * (matrix[2] - matrix[6]), 0.5 * (matrix[3] - matrix[1])
     square = x * x + y * y + z * z
     cosine = 0.5 * (matrix[0] + matrix[4] + matrix[8] - 1)
@@ -105,7 +110,7 @@ def rotation_vector(matrix: Matrix) -> Vector:
 
 @device_function
 def relative_rotation(frames: Float64, row: int, wanted: Float64) -> Matrix:
-    """Return the rotation of frames[row] [12] times the transpose of that of `wanted` [12]."""
+    """Return the rotation of frames[row] [12] times the transpose of the rotation of `wanted` [12]."""
     a, b, c = frames[row, 0], frames[row, 1], frames[row, 2]
     d, e, f = frames[row, 3], frames[row, 4], frames[row, 5]
     g, h, i = frames[row, 6], frames[row, 7], frames[row, 8]

@@ -51,7 +51,10 @@ class ArenaActionSettings(Settings):
 
 
 class ArenaActions:
-    """Reader of responses. Raises ConfigurationError if a setting does not fit the robot."""
+    """Reader of responses; it returns chunks in the robot's values.
+
+    Raises ConfigurationError if a setting does not fit the robot.
+    """
 
     def __init__(self, settings: ArenaActionSettings, convention: Convention, robot: Robot) -> None:
         self._settings = settings
@@ -67,7 +70,10 @@ class ArenaActions:
         self._parts: tuple[str, ...] = tuple(settings.action_keys or ())
 
     def configure(self, wants: ServerRequirements) -> None:
-        """Compare the server's requirements with the deployment. Raises ActionSpaceError with both sides."""
+        """Check that the server's requirements agree with the deployment's action space and width.
+
+        Raises ActionSpaceError, whose message has both values, if they differ.
+        """
         settings = self._settings
         if wants.space != settings.action_space:
             raise ActionSpaceError(
@@ -82,7 +88,7 @@ class ArenaActions:
         self._parts = tuple(settings.action_keys or wants.parts)
 
     def chunk(self, reply: Any, timing: Mapping[str, float]) -> ActionChunk:
-        """Return the chunk of a response: an array, a map with `actions`, or a map of named parts."""
+        """Return the chunk of a response, which is an array, a map with `actions`, or a map of named parts."""
         rows = parse_action_rows("actions", self._array(reply), self.width)
         if self.velocity:
             rows = self._steps_of_joints(rows) if self._poses is None else self._steps_of_poses(rows)

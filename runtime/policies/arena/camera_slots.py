@@ -1,4 +1,4 @@
-"""Assignment of cameras to the slots of a RoboArena request: declared, never derived from an order.
+"""Assignment of cameras to the slots of a RoboArena request, which the deployment declares; their order has no meaning.
 
 Servers and most clients number the exterior cameras from 0, the original client from 1. A server that receives the
 other numbering uses a picture for the wrong view, or drops it, without an error.
@@ -21,7 +21,7 @@ _FIRST: dict[Numbering, int] = {"0-based": 0, "1-based": 1}
 
 
 class Cameras:
-    """Slots of a robot's cameras by observation key.
+    """Slots of a RoboArena request and the robot's cameras (observation keys) that fill them.
 
     Raises ConfigurationError for unknown cameras or repeated slots.
     """
@@ -41,9 +41,9 @@ class Cameras:
         self._numbering: Numbering = numbering
 
     def assign(self, wants: ServerRequirements) -> dict[str, str]:
-        """Return request key = observation key for the server's views, in its order; other cameras are not sent.
+        """Return the observation key by request key for the views that the server needs, in the server's order.
 
-        Raises ContradictionError if it needs a view for which no camera is declared.
+        Cameras for other views are not sent. Raises ContradictionError if no camera is declared for a needed view.
         """
         found: dict[str, str] = {}
         for slot, key in _keys(wants, self._numbering):

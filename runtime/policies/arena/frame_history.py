@@ -1,4 +1,4 @@
-"""History of pictures before a request, at the moments that a policy was trained with."""
+"""History of pictures before a request, at the steps that a policy was trained with."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ Pictures = Mapping[str, UInt8]
 
 
 class History:
-    """Pictures of the newest observations; `rate` steps before a request are one second.
+    """Pictures of the newest observations, for requests that also contain earlier pictures.
 
-    Read by the thread that queries the policy, and filled by other threads as well.
+    `steps` are the numbers of steps before the request at which pictures are sent; `rate` is the number of steps per
+    second. One thread, which queries the policy, reads it; other threads may add observations.
     """
 
     def __init__(self, steps: tuple[int, ...], rate: float) -> None:
@@ -25,7 +26,7 @@ class History:
         self._lock = threading.Lock()
 
     def add(self, observation: Observation) -> None:
-        """Add an observation's pictures, unless it is no newer than the newest one."""
+        """Add an observation's pictures, unless a stored observation arrived at the same time or later."""
         with self._lock:
             if self._kept and observation.arrived <= self._kept[-1][0]:
                 return
@@ -35,10 +36,10 @@ class History:
                 self._kept.popleft()
 
     def frames_before(self, observation: Observation) -> list[Pictures]:
-        """Return the pictures nearest to each of the steps before `observation`, in their order.
+        """Return for each of `steps` before `observation` the pictures nearest to it in time, in the order of `steps`.
 
-        Pictures of a later moment are never returned; steps before the oldest observation yield the oldest. The
-        observation itself is added like any other.
+        Pictures that arrived after `observation` are never returned. For steps before the oldest stored observation the
+        pictures of the oldest are returned. `observation` itself is added to the history.
         """
         self.add(observation)
         with self._lock:

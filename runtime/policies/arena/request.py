@@ -81,7 +81,10 @@ class ArenaRequestSettings(Settings):
 
 
 class ArenaRequest:
-    """Builder of requests; call `configure` first. Raises ConfigurationError if a setting does not fit the robot."""
+    """Builder of requests; call `configure` first.
+
+    Raises ConfigurationError if a setting does not fit the robot.
+    """
 
     def __init__(self, settings: ArenaRequestSettings, robot: Robot) -> None:
         self._settings = settings
@@ -101,17 +104,17 @@ class ArenaRequest:
 
     @property
     def glances_s(self) -> float | None:
-        """Period at which pictures are stored [s]; None if none are."""
+        """Period at which pictures are stored [s]; None if requests have no earlier pictures."""
         return None if self._history is None else 1.0 / self._settings.frame_rate
 
     def observe(self, observation: Observation) -> None:
-        """Store its pictures, if a history is sent."""
+        """Store the observation's pictures, if requests contain earlier pictures."""
         if self._history is not None:
             self._history.add(observation)
 
     @property
     def uses_poses(self) -> bool:
-        """True if poses are sent."""
+        """True if requests contain poses."""
         return self._poses is not None
 
     def configure(self, wants: ServerRequirements) -> None:
@@ -122,7 +125,7 @@ class ArenaRequest:
         self.forget()  # pictures for another server may have another size
 
     def forget(self) -> None:
-        """Forget all pictures."""
+        """Drop all stored pictures."""
         self._seen.clear()
         self._begun = False
         if self._history is not None:

@@ -23,9 +23,10 @@ _PIXELS = range(1, 4097)
 
 @dataclass(frozen=True, slots=True)
 class ServerRequirements:
-    """Configuration of the server; `resolution` is (height, width), None without resizing.
+    """Requirements of the server; `resolution` is (height, width), None if pictures are not resized.
 
-    The last three are extras of vLLM-Omni: rows per response, values per row, names of its parts.
+    `horizon` (rows per response), `width` (values per row) and `parts` (names of the parts of a row) are extras of
+    vLLM-Omni.
     """
 
     resolution: tuple[int, int] | None
@@ -40,7 +41,10 @@ class ServerRequirements:
 
 
 def parse_requirements(metadata: Mapping[str, Any]) -> ServerRequirements:
-    """Parse the metadata, with the defaults of the original clients. Raises PolicyError with the wrong key."""
+    """Parse the metadata, with the defaults of the original clients.
+
+    Raises PolicyError, whose message names the wrong key.
+    """
     if not any(name in metadata for name in _FIELDS):
         found = ", ".join(map(str, metadata)) or "nothing"
         raise WrongProtocolError(

@@ -27,10 +27,10 @@ _LARGEST_MESSAGE = 4 * 1024 * 1024  # [bytes]; largest message that the server a
 
 
 class Channel:
-    """Channel that can be opened again until it is aborted. For one thread at a time, except `abort`.
+    """gRPC channel that can be opened again until it is aborted; `abort` is for any thread, the rest for one at a time.
 
     Responses of more than `limit` bytes are refused. `dial` returns the host and port to connect to, if they differ
-    from the url's. Raises ConfigurationError if gRPC is not installed.
+    from those of the url. Raises ConfigurationError if gRPC is not installed.
     """
 
     def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:
@@ -50,7 +50,7 @@ class Channel:
         return self._channel is not None
 
     def open(self) -> float:
-        """Check that a server listens, and open a channel; return the rest of the connect deadline [s]."""
+        """Check that a server listens, and open a channel; return the time left until the connect deadline [s]."""
         self.drop()
         deadline = time.monotonic() + self._connect_deadline
         parts = urlsplit(self._url)
@@ -75,7 +75,7 @@ class Channel:
         Raises:
             PolicyTimeout: No response within `seconds` [s]; the channel is dropped.
             PolicyDisconnected: The server closed the connection; the channel is dropped.
-            ServerReportedError: The server's own code failed; it continues to serve.
+            ServerReportedError: The server's code raised an exception; the server still runs.
         """
         channel = self._channel
         if channel is None:
@@ -107,7 +107,7 @@ class Channel:
                 self._call.cancel()
 
     def drop(self) -> None:
-        """Close the channel with its present call. Safe to call twice."""
+        """Close the channel and end its pending call. Safe to call twice."""
         channel, self._channel = self._channel, None
         if channel is not None:
             channel.close()
@@ -117,7 +117,7 @@ class Channel:
             raise PolicyError(f"the connection to {self._url} was closed from our side")
 
     def _to_policy_error(self, error: Any, method: str, seconds: float) -> PolicyError:
-        """Convert an error of gRPC to a PolicyError."""
+        """Return the PolicyError for an error of gRPC; unless the server reported it, drop the channel."""
         code, details = error.code(), str(error.details())
         codes, name = _grpc().StatusCode, method.rpartition("/")[2]
         if code is codes.UNKNOWN:  # the server's own code failed; it continues to serve
@@ -154,7 +154,7 @@ class Channel:
 
 
 def _is_foreign(details: str) -> bool:
-    """Return True if the peer responded in another protocol."""
+    """Return True if the details of a gRPC error show that the peer does not use HTTP/2."""
     return "Failed parsing HTTP/2" in details or "http1.x" in details
 
 

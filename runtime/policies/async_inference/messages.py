@@ -1,4 +1,4 @@
-"""Protobuf messages of LeRobot's service `transport.AsyncInference`, coded by hand because there are only two fields.
+"""Protobuf messages of LeRobot's service `transport.AsyncInference`, encoded by hand because they have only two fields.
 
 Observation has `transfer_state` = 1 (varint) and `data` = 2 (bytes); Actions and PolicySetup have `data` = 1; Empty has
 no bytes.
@@ -37,7 +37,7 @@ def encode_setup(data: bytes) -> bytes:
 
 
 def decode_actions(message: bytes) -> bytes:
-    """Return the data of an Actions message, b"" of an empty one; other fields are skipped.
+    """Return the field `data` of an Actions message, b"" if it has none; other fields are skipped.
 
     Raises CodecError for invalid protobuf.
     """
@@ -72,7 +72,7 @@ def _field(number: int, data: bytes) -> bytes:
 
 
 def _varint(message: bytes, place: int) -> tuple[int, int]:
-    """Return a number and the position after it."""
+    """Return the varint at byte `place` and the position after it."""
     number = 0
     for index, byte in enumerate(message[place : place + _LONGEST_VARINT]):
         number |= (byte & 0x7F) << 7 * index

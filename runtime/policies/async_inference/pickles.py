@@ -1,8 +1,8 @@
 """Pickles of LeRobot's policy server, without LeRobot and without executing anything of the peer.
 
-Written are instances of its classes, by name alone. Read are lists of its TimedAction: only the pickle instructions
-that these need exist here, names are resolved by a table of ours, and every other name is refused. Source:
-lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
+Instances of the server's classes are written, whose names are all that the pickle needs. Lists of its TimedAction are
+read: only the pickle instructions that these need exist here, names are looked up in a table of this module, and every
+other name is refused. Source: lerobot.async_inference.helpers; in 0.3 the module was lerobot.scripts.server.helpers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PROTOCOL = 4
 
 @dataclass(frozen=True)
 class RemotePolicyConfig:
-    """Model that a server is to load. The order of the fields is that of the message."""
+    """Model that a server is to load. The order of the fields is that of LeRobot's class."""
 
     policy_type: str
     pretrained_name_or_path: str
@@ -46,7 +46,7 @@ class TimedObservation:
 
 @dataclass(frozen=True, slots=True)
 class TimedAction:
-    """One row of a response."""
+    """One row of a response, with its time and step."""
 
     timestamp: float
     timestep: int
@@ -61,7 +61,7 @@ def dump(value: RemotePolicyConfig | TimedObservation, module: str) -> bytes:
 
 
 def load_actions(data: bytes, limit: int) -> list[TimedAction]:
-    """Return the actions in their transmitted order. Raises CodecError for invalid or refused content."""
+    """Return the actions in the order of the message. Raises CodecError for invalid or refused content."""
     if len(data) > limit:
         raise CodecError(f"actions of {len(data)} bytes exceed the limit of {limit}")
     try:
@@ -99,7 +99,7 @@ class _Writer(pickle._Pickler):
 
 
 class _Record:
-    """Instance of a peer's class: its fields, without behaviour."""
+    """Instance of a class of the peer, which here has only fields."""
 
     __slots__ = ("fields",)
 
@@ -108,7 +108,7 @@ class _Record:
 
 
 class _Name:
-    """Name of the peer's code, with our constructor for its instances. Its attributes cannot be changed."""
+    """Class or function that a pickle names, with our function that is called instead; its attributes are read-only."""
 
     __slots__ = ("make", "what")
     what: str
@@ -142,7 +142,7 @@ class Reader(pickle._Unpickler):
 
 
 class _Reader(Reader):
-    """Pickle interpreter for lists of TimedAction; its names live as long as one message."""
+    """Pickle interpreter for one list of TimedAction; only the names that such a list needs are accepted."""
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = dict(Reader.dispatch)
     stack: list[Any]  # of Python's unpickler, like the next one

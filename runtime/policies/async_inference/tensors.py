@@ -1,8 +1,8 @@
 """Tensors from pickled torch storages, with numpy alone.
 
 A storage is a torch file in the old format: five consecutive pickles (magic number, version, machine, description,
-keys), the number of elements as int64, and the elements. A tensor is a view of one: offset, sizes, strides. Several
-tensors may be different rows of the same storage, as those of LeRobot's server are.
+keys), the number of elements as int64, and the elements. A tensor is a view of a storage: offset, sizes, strides.
+Several tensors may be different rows of the same storage, as in the responses of LeRobot's server.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ Array = np.ndarray[Any, Any]
 
 
 class Tensors:
-    """Tensors of one message, with a cache of storages by their bytes: a server sends the same one with each row.
+    """Tensors of one message; storages are cached by their bytes, because a server sends the same storage with each
+    row.
 
     `reader` is a pickle interpreter for plain data.
     """
 
     def __init__(self, reader: type[Any]) -> None:
         class Reader(reader):  # type: ignore[misc]
-            """Pickle interpreter for the names and description of a storage."""
+            """Pickle interpreter for the names and the description of a storage."""
 
             def find_class(self, module: str, name: str) -> Any:
                 if module != "torch" or name not in _KINDS:
@@ -61,7 +62,7 @@ class Tensors:
         self._left = _MOST_ELEMENTS
 
     def storage(self, data: object) -> Array:
-        """Return the elements [n]. Raises CodecError if the bytes are not a storage."""
+        """Return the elements [n] of a pickled storage. Raises CodecError if `data` is not one."""
         if not isinstance(data, bytes):
             raise CodecError(f"a storage is {type(data).__name__}; expected bytes")
         if data not in self._known:
@@ -95,9 +96,9 @@ class Tensors:
         return np.frombuffer(raw, dtype)
 
     def tensor(self, storage: object, offset: object, size: object, stride: object, *_: object) -> Array:
-        """Return a copy of the elements [*size] from `offset` on, `stride` elements apart. Raises CodecError.
+        """Return a copy of the elements of `storage` from `offset` on, as an array with these sizes and strides.
 
-        Further arguments (gradient, hooks) have no meaning here.
+        Raises CodecError if they do not fit. Further arguments (gradient, hooks) are ignored.
         """
         if not isinstance(storage, np.ndarray) or type(size) is not tuple or type(stride) is not tuple:
             raise CodecError("a tensor is not made of a storage, sizes and strides")

@@ -28,7 +28,7 @@ _MOST_DIMENSIONS = 32
 
 
 def pack(value: object, mnp: bool = False) -> bytes:
-    """Return `value` as one message, arrays as NPY or `mnp`, numpy scalars as numbers.
+    """Return `value` as one message: arrays as MNP if `mnp`, else as NPY; numpy scalars as numbers.
 
     Raises CodecError for other types.
     """
@@ -40,10 +40,10 @@ def pack(value: object, mnp: bool = False) -> bytes:
 
 
 def unpack(payload: bytes, limit: int) -> Any:
-    """Return the value of one message; arrays of bools, integers and floats are **read-only**.
+    """Return the value in one message; arrays of bools, integers and floats are **read-only**.
 
     Raises CodecError for more than `limit` bytes, invalid msgpack, an array whose data do not fill its shape, object
-    arrays and other dtypes, and openpi's arrays (which the message names).
+    arrays and other dtypes, and for arrays in openpi's form (which the message then names).
     """
     if len(payload) > limit:
         raise CodecError(f"a message of {len(payload)} bytes exceeds the limit of {limit}")
@@ -103,7 +103,10 @@ def _text(key: object) -> object:
 
 
 def _from_npy(data: object) -> np.ndarray[Any, Any]:
-    """Return the array of a .npy file. Its header is parsed here, because numpy's would allocate any size."""
+    """Return the array of a .npy file.
+
+    Its header is parsed here, because numpy would allocate whatever size the header states.
+    """
     if not isinstance(data, bytes) or data[:6] != _MAGIC:
         raise CodecError(f"an array's as_npy is {_short(data)}; expected the bytes of a .npy file")
     start, length = {1: (10, "<H"), 2: (12, "<I")}.get(data[6] if len(data) > 6 else 0, (0, ""))

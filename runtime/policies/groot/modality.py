@@ -1,4 +1,4 @@
-"""Modality configuration of a GR00T server, i.e. its inputs and outputs, in the forms of three versions."""
+"""Modality configuration of a GR00T server: the inputs and outputs of its model, in the forms of three versions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PLAIN = ("state_keys", "action_keys")  # keys of a server without configuration
 
 @dataclass(frozen=True, slots=True)
 class ActionFormat:
-    """Format of an action in N1.6 and newer."""
+    """Format of an action that servers since N1.6 state."""
 
     representation: str  # "ABSOLUTE", "DELTA" or "RELATIVE", whose responses are absolute, too
     format: str  # "DEFAULT", "XYZ_ROT6D", "XYZ_ROTVEC"
@@ -30,10 +30,10 @@ class ActionFormat:
 
 @dataclass(frozen=True, slots=True)
 class Modality:
-    """Keys without their prefix, and the steps that each has, relative to the newest observation.
+    """Keys of one modality, without their prefix, and their time steps relative to the newest observation.
 
-    `keys` is None if the server does not list them. `written` is the format of actions and `widths` their number of
-    values, by key, as far as the server states them.
+    `keys` is None if the server does not list them. By key, as far as the server states them: `written` is the format
+    of an action, `widths` the number of its values.
     """
 
     keys: tuple[str, ...] | None = ()
@@ -44,11 +44,11 @@ class Modality:
 
 @dataclass(frozen=True, slots=True)
 class Modalities:
-    """Modalities of a server. `is_n15`: it has version N1.5; `reads_mnp`: it reads arrays like N1.7.
+    """Modalities of a server.
 
-    `reads_mnp` is None if its response has no version mark.
-
-    `contract` is the response of a server with this protocol but without modality configurations.
+    `is_n15` is True for version N1.5. `reads_mnp` is True if the server reads arrays like N1.7, None if its response
+    does not show the version. `contract` is the response of a server that uses this protocol without modality
+    configurations.
     """
 
     video: Modality
@@ -60,7 +60,7 @@ class Modalities:
     contract: Mapping[str, Any] | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """Return the modalities in the form of a recording's manifest."""
+        """Return the modalities as they are written to a recording's manifest."""
         if self.contract is not None:
             return dict(self.contract)
         each = {name: getattr(self, name) for name in _NAMES}
@@ -68,9 +68,10 @@ class Modalities:
 
 
 def parse_modalities(reply: object) -> Modalities:
-    """Parse the response to get_modality_config; a missing modality has no keys. Raises PolicyError if it is invalid.
+    """Parse the response to get_modality_config; a missing modality has no keys.
 
-    StarVLA's servers with this protocol have flat lists of keys instead.
+    Flat lists of keys, as StarVLA's servers with this protocol have, are accepted, too. Raises PolicyError for an
+    invalid response.
     """
     if isinstance(reply, Mapping) and any(name in reply for name in _PLAIN):
         return _contract(reply)
@@ -89,7 +90,7 @@ def parse_modalities(reply: object) -> Modalities:
 
 
 def _contract(given: Mapping[str, Any]) -> Modalities:
-    """Return modalities from flat lists of keys; the deployment decides about everything that is not stated."""
+    """Return modalities from flat lists of keys; everything that the server does not state follows the deployment."""
     horizon: Any = given.get("action_horizon")
     rows = horizon if type(horizon) is int and 0 < horizon <= _MOST_ROWS else 1
     return Modalities(
@@ -102,7 +103,7 @@ def _contract(given: Mapping[str, Any]) -> Modalities:
 
 
 def _flat(given: Mapping[str, Any], name: Name) -> tuple[str, ...] | None:
-    """Return a list's keys without their prefix; None without keys, because such a model does not use that modality."""
+    """Return the keys of a modality without their prefix; None if it has none, because the model does not use it."""
     keys = given.get(f"{name}_keys", [])
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
         raise WrongProtocolError(f"the server has {name}_keys {_short(keys)}; expected a list of names")
@@ -151,7 +152,9 @@ def _modality(given: Mapping[str, Any], name: Name) -> Modality:
 
 
 def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
-    """Return the formats by key; {} unless there is one for each key, which some servers get wrong without harm."""
+    """Return the formats by key; {} unless `configs` has one per key, because some servers list a wrong number
+    harmlessly.
+    """
     if not isinstance(configs, list) or len(configs) != len(keys):
         return {}
     return {
@@ -162,12 +165,12 @@ def _written(keys: tuple[str, ...], configs: object) -> dict[str, ActionFormat]:
 
 
 def _enum_name(given: object) -> str:
-    """Return the name of an enumeration member from its name or value."""
+    """Return the name of an enumeration member, which servers state by its name or its value."""
     return str(given).upper().replace("+", "_")
 
 
 def join_names(names: Iterable[str]) -> str:
-    """Return names for a message."""
+    """Return the names as one text for a message, "none" if there are none."""
     return ", ".join(names) or "none"
 
 

@@ -33,7 +33,7 @@ _WATCHED = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED | zmq.EVENT_DISCONNECTED
 class ReqLink:
     """REQ socket for one thread at a time, except `abort`; messages of more than `limit` bytes end the connection.
 
-    `dial` returns the host and port to connect to, if they differ from the url's.
+    `dial` returns the host and port to connect to, if they differ from those of the url.
     """
 
     def __init__(self, url: str, connect_deadline: float, limit: int, dial: Dial | None = None) -> None:
@@ -51,7 +51,7 @@ class ReqLink:
         return self._socket is not None
 
     def open(self) -> float:
-        """Connect anew; return the rest of the connect deadline [s].
+        """Connect anew; return the time left until the connect deadline [s].
 
         Raises:
             PolicyLostError: There is no server, or it sends no greeting in time.
@@ -85,7 +85,7 @@ class ReqLink:
         return max(0.0, deadline - time.monotonic())
 
     def exchange(self, request: bytes, seconds: float, what: str = "an answer") -> bytes:
-        """Return the response to `request`.
+        """Return the response to `request`; `what` names the response in errors.
 
         Raises:
             PolicyTimeout: No response within `seconds` [s]; the connection is dropped.
@@ -142,7 +142,7 @@ class ReqLink:
         return self._dial() if self._dial else (parts.hostname or "", parts.port or 0)
 
     def _probe(self, place: Place, deadline: float) -> None:
-        """Check who listens before ZMQ does, which would silently try again for ever."""
+        """Check that a ZMQ server listens before ZMQ connects, which would retry without end and without an error."""
         try:
             seconds = self._connect_deadline
             with open_connection(self._url, *place, deadline, seconds, self._require_not_aborted) as wire:
@@ -219,9 +219,9 @@ class ReqLink:
 
 
 def _receive_reply(wire: zmq.Socket[bytes]) -> list[bytes] | None:
-    """Return the frames of a response, None if none comes within a polling period.
+    """Return the frames of the response, None if it does not arrive within a polling period.
 
-    ZMQ drops those to other requests.
+    ZMQ itself drops responses to earlier requests.
     """
     try:
         return wire.recv_multipart(zmq.NOBLOCK) if wire.poll(_SPELL_MS) else None

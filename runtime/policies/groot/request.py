@@ -1,4 +1,4 @@
-"""GR00T requests from observations, and its responses as rows, by maps that a deployment declares."""
+"""GR00T requests from observations, and rows of actions from responses, by maps that a deployment declares."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class RequestSettings(ActionLayoutSettings):
 
 @dataclass(frozen=True, slots=True)
 class ModelInput:
-    """Content of one observation."""
+    """Pictures and state of one observation in the form that the model receives."""
 
     step: int
     pictures: Mapping[str, UInt8]  # by video key
@@ -88,7 +88,10 @@ class Gr00tRequest:
         self._moments: deque[ModelInput] = deque()
 
     def configure(self, wanted: Modalities) -> None:
-        """Compare the server's modalities with the deployment. Raises ContradictionError with both sides."""
+        """Check that the server's modalities agree with the deployment.
+
+        Raises ContradictionError, whose message has both sides, if they differ.
+        """
         settings = self._settings
         if wanted.is_n15 != (settings.dialect == "n1.5"):
             version = "of version N1.5" if wanted.is_n15 else "newer than N1.5"
@@ -115,22 +118,25 @@ class Gr00tRequest:
 
     @property
     def horizon(self) -> int | None:
-        """Rows of a response, if the server states them."""
+        """Number of rows of a response; None if the server does not state it."""
         steps = None if self._wanted is None else self._wanted.action.steps
         return len(steps) if steps is not None and len(steps) > 1 else None
 
     def reset(self) -> None:
-        """Forget earlier observations, because an episode ended."""
+        """Drop earlier observations, because an episode ended."""
         self._moments.clear()
 
     def model_input(self, observation: Observation) -> ModelInput:
-        """Return the content of an observation. Raises PolicyError if a part is missing."""
+        """Return the pictures and the state of an observation. Raises PolicyError if a part is missing."""
         shown = self._layout.build(self._grip.convert_observation(observation))
         pictures = {key: shown["images"][camera] for key, camera in self._settings.video.items()}
         return ModelInput(observation.step, pictures, shown["state"])
 
     def build(self, moment: ModelInput, prompt: str) -> dict[str, Any]:
-        """Return the data of get_action for the newest input, which is stored as long as later requests need it."""
+        """Return the arguments of get_action for the newest input `moment` and the stored inputs before it.
+
+        `moment` is stored as long as later requests need it.
+        """
         wanted = self._wanted
         assert wanted is not None, "configure comes first"
         self._remember(moment)
@@ -238,7 +244,10 @@ def _check_cover(parts: Mapping[str, Sequence[int]], width: int) -> None:
 
 
 def _same_keys(name: str, wanted: Modality, given: Iterable[str]) -> None:
-    """Check that the keys are equal: servers refuse a missing or surplus key without naming it."""
+    """Check that the server's keys equal the deployment's.
+
+    A server refuses a missing or surplus key without naming it.
+    """
     here = list(given)
     if wanted.keys is not None and set(here) != set(wanted.keys):
         kind = ActionSpaceError if name == "actions" else ContradictionError
@@ -285,7 +294,10 @@ def _check_steps(name: str, wanted: Modality, history: str) -> None:
 
 
 def _check_written(key: str, written: ActionFormat | None, settings: RequestSettings) -> None:
-    """Check that poses cannot be mistaken for joints, nor changes for targets. Raises ActionSpaceError."""
+    """Check that the server's format of an action agrees with the deployment.
+
+    Poses could be mistaken for joints, or changes for targets. Raises ActionSpaceError.
+    """
     if written is None:
         return
     orientation, mine = _ORIENTATIONS.get(written.format), settings.action_pose.orientation

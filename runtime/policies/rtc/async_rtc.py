@@ -1,4 +1,4 @@
-"""Versioned envelope openpi-async-rtc, version 2: requests are numbered, errors are messages."""
+"""Dialect openpi-async-rtc, version 2: a versioned envelope with numbered requests and with errors as messages."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ Schedule = Literal["exp", "linear", "ones", "zeros"]
 class AsyncRtc(Dialect):
     """Dialect with one request at a time, whose number the response must repeat.
 
-    `rtc` contains the rest of the previous chunk, the predicted delay, and `execution_horizon`, in this dialect the
-    end of the transition from those rows to new ones: never below the delay, never above the model's horizon.
+    The part `rtc` of a request contains the rest of the previous chunk, the predicted delay, and `execution_horizon`.
+    In this dialect that is the end of the transition from those rows to new rows: never below the delay, never above
+    the model's horizon.
     """
 
     def __init__(self, schedule: Schedule, max_guidance_weight: float) -> None:
@@ -31,7 +32,10 @@ class AsyncRtc(Dialect):
         self._horizon: int | None = None
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Return `rtc_supported`. Raises PolicyError if protocol, version, codec or that value is wrong."""
+        """Return the server's `rtc_supported`: whether it continues a previous chunk.
+
+        Raises PolicyError if protocol, version or codec is wrong, or `rtc_supported` is not a bool.
+        """
         said = metadata.get("async_rtc")
         if not isinstance(said, Mapping):
             found = ", ".join(map(str, metadata)) or "nothing"
@@ -65,9 +69,9 @@ class AsyncRtc(Dialect):
         }
 
     def unwrap(self, reply: Message) -> Message:
-        """Return the content of the envelope.
+        """Return the content of the response's envelope.
 
-        Raises PolicyError for a server's error, another version or request number.
+        Raises PolicyError if the server reports an error, or the version or request number differs.
         """
         _check_version(reply, "the answer")
         if reply.get("error"):

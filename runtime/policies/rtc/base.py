@@ -13,10 +13,11 @@ Message = dict[str, Any]
 
 
 class Dialect(ABC):
-    """Wrapper of requests and unwrapper of replies. One per policy, for one thread.
+    """Dialect of RTC messages: wraps requests and unwraps replies. Each policy has its own instance, for one thread.
 
-    There is no common standard. A dialect that meets a server of another dialect reports its finding.
-    `continues_model_rows`: whether a chunk is sent back in the model's own space, if the server returned that.
+    There is no common standard. A dialect raises an error if the metadata show that the server uses another one.
+    `continues_model_rows` is True if chunks are sent back in the model's own space, provided that the server returned
+    them in it.
     """
 
     continues_model_rows = True
@@ -30,26 +31,26 @@ class Dialect(ABC):
 
     @abstractmethod
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """Return the message to send for an observation."""
+        """Return the message that carries the request `observation` and the conditioning."""
 
     @abstractmethod
     def unwrap(self, reply: Message) -> Message:
-        """Return the part of a reply with the actions.
+        """Return the part of a reply that contains the actions.
 
-        Raises PolicyError for an error or a reply to another request.
+        Raises PolicyError for an error, or for a reply to another request.
         """
 
 
 class NoRtc(Dialect):
-    """No RTC: servers drop unknown keys, so conditioning would be sent without an effect."""
+    """Dialect without RTC: it sends no conditioning, because a server would drop the unknown keys without an error."""
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Return False."""
+        """Return False, because nothing is continued."""
         refuse_envelopes(metadata, "none")
         return False
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """Return the observation itself. Raises PolicyError for conditioning."""
+        """Return the observation itself. Raises PolicyError if there is conditioning."""
         if conditioning is not None:
             raise PolicyError(
                 "plain openpi servers drop RTC conditioning without a word; choose an RTC protocol (policy.rtc)"
@@ -62,9 +63,9 @@ class NoRtc(Dialect):
 
 
 def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
-    """Return the map under the metadata key `rtc`, as our bundled server has it; None without the key.
+    """Return the map under the metadata key `rtc`, which our bundled server has; None without the key.
 
-    Raises PolicyError if the server accepts only versioned envelopes, or the key has another content.
+    Raises PolicyError if the server accepts only versioned envelopes, or if the value is not such a map.
     """
     refuse_envelopes(metadata, name)
     said = metadata.get("rtc")
@@ -76,7 +77,7 @@ def declared_dialect(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any
 
 
 def refuse_envelopes(metadata: Mapping[str, Any], configured: str) -> None:
-    """Raise ContradictionError for a server that accepts only versioned envelopes."""
+    """Raise ContradictionError if the metadata show that the server accepts only versioned envelopes."""
     if "async_rtc" in metadata:
         raise ContradictionError(
             f"the server's metadata have async_rtc, so it takes envelopes alone; policy.rtc is {configured!r}, "

@@ -1,8 +1,8 @@
-"""Flat keys of kai0: the previous chunk as nested lists, the predicted delay, the end of the transition.
+"""Dialect of kai0, with flat keys: the previous chunk as nested lists, the predicted delay, the end of the transition.
 
-The server compares row n of that chunk with row n of the new one, so it must begin at the first row that the robot has
-not consumed. kai0's own client sends the whole chunk as received, which is right only if nothing was consumed; so does
-`rows` = "whole". Rows contain the robot's values, never the model's own.
+The server compares row n of that chunk with row n of the new chunk, so the chunk must begin at the first row that the
+robot has not consumed. kai0's own client sends the whole chunk as received, which is right only if nothing was
+consumed; with `rows` = "whole" this dialect does the same. Rows contain the robot's values, never the model's own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ _COLUMNS = 32  # width of the model: rows are padded with zeros or cropped
 
 
 class Kai0(Dialect):
-    """Dialect whose keys are in every request, except `prev_action_chunk`; the server ignores the last three."""
+    """Dialect whose keys are in every request, except `prev_action_chunk`, which needs a previous chunk.
+
+    The server ignores the last three keys.
+    """
 
     continues_model_rows = False
 
@@ -31,7 +34,7 @@ class Kai0(Dialect):
         self._weight = max_guidance_weight
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Return True if the metadata key `rtc` names this dialect, None without it."""
+        """Return True if the metadata key `rtc` names this dialect, False if another, None without the key."""
         said = declared_dialect(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 
@@ -53,7 +56,9 @@ class Kai0(Dialect):
         return reply
 
     def _continued(self, conditioning: Conditioning | None) -> tuple[Message, int, int]:
-        """Return the chunk, the delay, and the row from which none of it is followed."""
+        """Return the key with the previous chunk, the delay, and the first row that does not follow the previous
+        chunk.
+        """
         if conditioning is None:
             return {}, 0, 1
         delay, end = conditioning.predicted_delay, conditioning.execution_horizon

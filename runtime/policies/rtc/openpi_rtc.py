@@ -1,9 +1,9 @@
-"""Envelope of openpi-rtc and its forks: the observation in a map, with the previous chunk.
+"""Dialect of openpi-rtc and its forks: an envelope with the observation and the previous chunk.
 
-These servers remove rows from that chunk by themselves: the original always 25, whatever the robot has executed,
-forks as many as the request states. The rows are shifted so that the server's remainder begins at the first row that
-the robot has not consumed. If the robot has consumed exactly as many as the server removes, that is the chunk as
-received, which is all that these servers' own clients ever send.
+These servers remove rows from the start of that chunk by themselves: the original always removes 25, whatever the robot
+has executed, forks as many as the request states. The rows are therefore shifted so that the rows that remain on the
+server begin at the first row that the robot has not consumed. If the robot has consumed exactly as many rows as the
+server removes, the result is the chunk as received, which is all that these servers' own clients ever send.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class OpenpiRtc(Dialect):
         self._rows = rows
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Return True if `rtc` names this dialect, None without the key.
+        """Return True if the metadata key `rtc` names this dialect, False if another, None without the key.
 
-        Raises ContradictionError for other row counts.
+        Raises ContradictionError if the server removes another number of rows than the deployment states.
         """
         said = declared_dialect(metadata, NAME)
         if said is None:
@@ -69,7 +69,7 @@ class OpenpiRtc(Dialect):
         return bool(said["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """Return the envelope."""
+        """Return the envelope with the observation and, if there is conditioning, the previous chunk."""
         keys = self._keys
         message: Message = {keys.observation: observation}
         if conditioning is not None:

@@ -1,4 +1,4 @@
-"""Two flat keys in the observation: `prev_action` and `rtc_params`."""
+"""Dialect with two flat keys in the observation: `prev_action` and `rtc_params`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ NAME = "prev_action"
 
 
 class PrevAction(Dialect):
-    """Dialect with `prev_action` float32 [T, W], the rest of the previous chunk, padded with its last row to T.
+    """Dialect with `prev_action` float32 [T, W]: the rest of the previous chunk, padded with its last row to T rows.
 
-    `rtc_params` is {"s": number of removed rows}. Both are absent on the first request and after a reset. A server
-    that does not know them drops them silently, and most do not declare whether they do.
+    `rtc_params` is {"s": number of consumed rows}. Both are absent on the first request and after a reset. A server
+    that does not know the keys drops them without an error, and most do not declare whether they know them.
     """
 
     def check_supported(self, metadata: Mapping[str, Any]) -> bool | None:
-        """Return True if the metadata key `rtc` (of our bundled server) names this dialect, None without it."""
+        """Return True if the metadata key `rtc` (of our bundled server) names this dialect, False if another, None
+        without it.
+        """
         said = declared_dialect(metadata, NAME)
         return None if said is None else bool(said["dialect"] == NAME)
 
     def wrap(self, observation: Message, conditioning: Conditioning | None) -> Message:
-        """Return the observation with both keys, or unchanged."""
+        """Return the observation with both keys, or the observation itself without conditioning."""
         if conditioning is None:
             return observation
         return observation | {

@@ -31,7 +31,10 @@ _ALWAYS = (
 
 
 def far_end(url: str) -> Place:
-    """Return host and port of a policy server as reached from the far end. Raises ConfigurationError."""
+    """Return host and port of a policy server, as the machine at the far end of the tunnel resolves them.
+
+    Raises ConfigurationError if the url has no valid host and port.
+    """
     try:
         parts = urlsplit(url)
         host, port = parts.hostname or "", parts.port or _USUAL_PORTS.get(parts.scheme, 0)
@@ -46,7 +49,7 @@ def far_end(url: str) -> Place:
 
 
 def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[str]:
-    """Return the ssh command with the near end at `port` on the loopback, forwarded to `far`."""
+    """Return the arguments of ssh that forward `port` of the loopback to `far`."""
     options = [
         *_ALWAYS,
         f"StrictHostKeyChecking={'yes' if settings.host_keys == 'strict' else 'accept-new'}",
@@ -76,7 +79,7 @@ def command(ssh: str, settings: TunnelSettings, port: int, far: Place) -> list[s
 
 
 def require_files(settings: TunnelSettings) -> None:
-    """Raise ConfigurationError for an unreadable file: ssh would continue without it, and fail later."""
+    """Raise ConfigurationError if a file in the settings cannot be read: ssh would start without it and fail later."""
     files = ("identity_file", "known_hosts_file", "ssh_config")
     for name in files:
         given = getattr(settings, name)

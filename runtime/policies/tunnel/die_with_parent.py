@@ -1,7 +1,7 @@
-"""Launcher of a program that ends with its parent process, however that ends.
+"""Launcher of a program that ends with its parent process, however the parent ends.
 
-Run by its path: `die_with_parent.py PARENT PROGRAM ARGUMENTS...`. It imports nothing of ours, so that it starts the
-program at once.
+Run by its path: `die_with_parent.py PARENT PROGRAM ARGUMENTS...`. It imports only the standard library, so that it
+starts the program at once.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Request SIGTERM at the parent's death, and replace this process by the program. Never returns."""
+    """Request SIGTERM for the time when the parent dies, and replace this process by the program. Never returns."""
     parent, program = int(sys.argv[1]), sys.argv[2:]
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0):

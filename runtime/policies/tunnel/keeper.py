@@ -1,4 +1,4 @@
-"""Keeper of a tunnel: starts ssh, checks that its near end accepts connections, restarts it when it ends."""
+"""Keeper of a tunnel: starts ssh, checks that its local port accepts connections, and restarts ssh when it ends."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ _PORTS = 5  # ports tried without a pause if other processes take them first
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """State of a tunnel at one moment: its near end while it is up, since when, and why it was last down.
+    """State of a tunnel at one moment.
 
-    `since` is on the keeper's clock. `failures` counts failed starts and broken tunnels, `refusals` the connections
-    that the far end refused, and `refusal` is the newest reason for that.
+    `port` is the local port while the tunnel is up; `why` is why it was last down. `since` is the time of the last
+    change on the keeper's clock. `failures` counts failed starts and broken tunnels, `refusals` the connections that
+    the far end refused; `refusal` is the reason of the newest refusal.
     """
 
     up: bool
@@ -39,9 +40,9 @@ class Status:
 
 
 class TunnelKeeper:
-    """Tunnel from `start` to `close`.
+    """Tunnel that is kept up from `start` to `close`.
 
-    The function `start` launches one ssh with a near end of its own, or raises OSError.
+    The argument `start` is a function that launches ssh with a new local port, or raises OSError.
     """
 
     def __init__(
@@ -61,31 +62,31 @@ class TunnelKeeper:
         self.status = Status(False, now())
 
     def start(self) -> None:
-        """Run in a thread of its own: ssh ends with the thread that started it."""
+        """Start the thread that keeps the tunnel; each ssh is its child and ends with it."""
         threading.Thread(target=self._run, name="tunnel", daemon=True).start()
 
     def close(self) -> None:
-        """Return at once; the thread ends its ssh."""
+        """Stop the tunnel and return at once; the thread ends its ssh."""
         self._set_status(closed=True, why="it was closed from our side")
         self._stop.set()
 
     def duration(self, status: Status) -> float:
-        """Return the duration of the status so far [s]."""
+        """Return how long `status` has lasted so far [s]."""
         return self._now() - status.since
 
     def owns_port(self, port: int) -> bool:
-        """Return True if the near end at `port` is its own now; a former port may belong to another process."""
+        """Return True if the present ssh listens at `port`; a former port may belong to another process."""
         ssh = self._ssh
         return ssh is not None and ssh.port == port and ssh.is_listening()
 
     def wait_for(self, reached: Callable[[Status], bool], seconds: float) -> Status:
-        """Return the status as soon as `reached(status)`, or after `seconds` [s]."""
+        """Return the status as soon as `reached(status)` is true, but after `seconds` [s] at the latest."""
         with self._changed:
             self._changed.wait_for(lambda: reached(self.status), seconds)
             return self.status
 
     def poll(self) -> None:
-        """Start, check or replace ssh, as due."""
+        """Start ssh if it is due, check whether its port listens, or discard it if it has ended or is late."""
         now, ssh = self._now(), self._ssh
         if ssh is None:
             if not self._back_off.remaining_delay(now):
@@ -109,7 +110,7 @@ class TunnelKeeper:
             self._discard(ssh, f"it was not up within {self._deadline:g} s{last}")
 
     def stop(self) -> None:
-        """End its ssh, if there is one."""
+        """End the present ssh, if there is one."""
         ssh, self._ssh = self._ssh, None
         if ssh is not None:
             ssh.terminate()
@@ -128,7 +129,7 @@ class TunnelKeeper:
             self._set_status(refusals=self.status.refusals + new, refusal=ssh.refusal)
 
     def _discard(self, ssh: Ssh, reason: str) -> None:
-        """End this ssh and record the failure; retry at once if only its port was taken."""
+        """End this ssh and record the failure; if only its port was taken, a new start follows at once."""
         taken = not self.status.up and port_was_taken(ssh.said)
         self.stop()
         if taken and self._taken < _PORTS:

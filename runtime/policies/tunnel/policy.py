@@ -1,4 +1,4 @@
-"""Policy behind a tunnel: another policy that connects to the tunnel's near end."""
+"""Policy behind a tunnel: another policy that connects to the tunnel's local port."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _HEARD_S = 0.3  # time until ssh's end or its messages are known [s]
 
 
 def through_tunnel(policy: Policy, config: Settings) -> Policy:
-    """Return `policy` behind the tunnel of its section, or `policy` itself without one.
+    """Return `policy` behind the tunnel of its configuration, or `policy` itself if that has none.
 
-    Starts nothing. Raises ConfigurationError if ssh is not installed, or policy.url is not a valid far end.
+    Starts nothing. Raises ConfigurationError if ssh is not installed, or policy.url cannot be reached through a tunnel.
     """
     settings, url = getattr(config, "tunnel", None), getattr(config, "url", "")
     if settings is None:
@@ -48,7 +48,7 @@ def through_tunnel(policy: Policy, config: Settings) -> Policy:
 class TunnelledPolicy(Policy):
     """Policy whose tunnel is opened by `connect` and lives until `close`; while it is down, errors name the reason.
 
-    Each ssh has a near end of its own, so that stations and other programs cannot conflict.
+    Each ssh has a new local port, so that stations and other programs cannot conflict.
     """
 
     def __init__(self, policy: Policy, settings: TunnelSettings, far: Place, ssh: str) -> None:
@@ -121,7 +121,10 @@ class TunnelledPolicy(Policy):
         return Ssh(command(self._ssh, self._settings, port, self._far), port, self._settings.session)
 
     def _local_address(self) -> Place:
-        """Return the near end. Checked at each call: another process may have taken a former port of ours."""
+        """Return host and port of the tunnel's local end.
+
+        Its owner is checked at each call, because another process may have taken a former port of ours.
+        """
         keeper = self._keeper
         if keeper is None:
             raise self._never()
@@ -136,7 +139,7 @@ class TunnelledPolicy(Policy):
 
     @contextlib.contextmanager
     def _explain_errors(self) -> Iterator[None]:
-        """Convert errors of this context that are caused by the tunnel to errors that explain it."""
+        """Replace errors in this context that the tunnel caused by errors that explain its state."""
         keeper = self._keeper
         before = keeper.status if keeper else None
         try:

@@ -20,7 +20,7 @@ _JUMP = re.compile(rf"(?:{_USER}@)?(?P<host>{_NAME}|\[[0-9A-Fa-f:.]+\])(?::(?P<p
 
 
 def is_host(name: str) -> bool:
-    """Return True if it is a host name, an alias of ssh's configuration, or an address, and nothing else."""
+    """Return True if `name` is nothing but a host name, an alias of ssh's configuration, or an address."""
     if re.fullmatch(_NAME, name):
         return True
     try:
@@ -106,6 +106,6 @@ class TunnelSettings(Settings):
 
     @property
     def where(self) -> str:
-        """Far end, for messages."""
+        """Host of the far end as messages name it."""
         user, host = f"{self.user}@" if self.user else "", f"[{self.host}]" if ":" in self.host else self.host
         return f"{user}{host if self.port is None else f'{host}:{self.port}'}"

@@ -1,4 +1,4 @@
-"""Explanations of an ssh exit, as one sentence with advice."""
+"""Explanations of why ssh ended, each as one sentence with advice."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ _ADVICE = (
 
 
 def port_was_taken(said: Sequence[str]) -> bool:
-    """Return True if another process took the near end's port first."""
+    """Return True if ssh reports that another process took its local port first."""
     return any(_TAKEN.search(line) for line in said)
 
 
 def explain_exit(said: Sequence[str], code: int) -> str:
-    """Return the last two lines of ssh's output, with advice if there is some."""
+    """Return the last two lines of ssh's output, with advice if a known cause matches them."""
     told = "; ".join(list(said)[-2:]) or f"ssh exited with {code} and no output"
     if code not in (_OWN_FAULT, *_SIGNALS):
         return f"{told}: {_OVER}"
@@ -45,7 +45,7 @@ def explain_exit(said: Sequence[str], code: int) -> str:
 
 
 def explain_session_refused(refusal: str) -> str:
-    """Return why ssh ended without ever being up, when its only message was a refused session."""
+    """Return the reason with advice if the tunnel never came up because the far end refused a session."""
     return (
         f"no session was opened there ({refusal}): for an account or a server without any set "
         "policy.tunnel.session = false"

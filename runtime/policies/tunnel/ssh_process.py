@@ -1,4 +1,4 @@
-"""ssh process with one near end, its messages, and whether it listens there."""
+"""ssh process with one forwarded local port, its messages, and the check that it listens there."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _LOOPBACK = int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder)
 def is_listening(pid: int, port: int) -> bool:
     """Return True if the process `pid`, and no other, accepts connections on 127.0.0.1:`port`.
 
-    Read from the kernel's tables: a connection would reach the policy server, and could not distinguish our process
-    from another one on that port.
+    This is read from the kernel's tables: a test connection would reach the policy server, and could not tell our
+    process from another one on that port.
     """
     sockets = _sockets(pid)
     return any(f"socket:[{inode}]" in sockets for inode in _listeners(pid, port)) if sockets else False
 
 
 def _listeners(pid: int, port: int) -> list[str]:
-    """Return inodes of the sockets that listen there, in the process's own network namespace."""
+    """Return the inodes of the sockets that listen at `port` in the network namespace of the process `pid`."""
     here = f"{_LOOPBACK:08X}:{port:04X}"
     try:
         rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text("ascii").splitlines()[1:]]
@@ -69,7 +69,7 @@ def free_port() -> int:
 class Ssh:
     """ssh process in a session of its own, which ends with the thread that started it and with this process.
 
-    With `echoes` the far end echoes its input once it is connected; before that the near end is of no use.
+    With `echoes` the remote command echoes its input as soon as it runs; until then the local port is not usable.
     """
 
     def __init__(self, command: Sequence[str], port: int, echoes: bool = False) -> None:
@@ -109,11 +109,11 @@ class Ssh:
         return code
 
     def is_listening(self) -> bool:
-        """Return True if the near end accepts connections and the far end responds."""
+        """Return True if the local port accepts connections and the far end has responded."""
         return self._echoed and is_listening(self.pid, self.port)
 
     def terminate(self) -> None:
-        """End it with its children and wait for that."""
+        """End ssh and its children, and wait until they have ended."""
         if self._process.poll() is None:  # not reaped yet, so its session id cannot belong to another process
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGTERM)

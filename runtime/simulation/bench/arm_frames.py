@@ -24,7 +24,7 @@ _UPRIGHT = 0.999  # least vertical part of the unit axis of an upright joint
 
 
 class ArmFrames:
-    """Forward kinematics of one arm: transforms [4, 4] in the world, the robot's scene, for joints q [D].
+    """Forward kinematics of one arm: transforms [4, 4] in the world (the frame of the robot's scene) for joints q [D].
 
     Fixed parts are computed once, so that an arm on a fixed base costs only its own chain. `upright` is 1 if the arm's
     first joint turns it about the vertical, -1 if it does so in the opposite direction, else 0.
@@ -48,19 +48,21 @@ class ArmFrames:
         self.upright = round(float(axis[2])) if abs(axis[2]) > _UPRIGHT else 0
 
     def frame(self, q: Float64) -> Float64:
-        """Return the arm's declared frame."""
+        """Return the pose of the frame that the arm declares."""
         return self._base if self._below is None else self._base @ self._below.forward(q[self._dims])
 
     def eef(self, q: Float64) -> Float64:
-        """Return the end-effector link."""
+        """Return the pose of the end-effector link."""
         return np.asarray(self.frame(q) @ self.arm.transform(q))
 
     def tip(self, q: Float64) -> Float64:
-        """Return the fingertips (z ahead, y the opening direction), or the end-effector link without fingers."""
+        """Return the pose of the fingertips (z ahead, y the opening direction), without fingers that of the
+        end-effector link.
+        """
         return self.eef(q) if self.arm.tip is None else np.asarray(self.eef(q) @ self.arm.tip)
 
     def shoulder(self, q: Float64) -> Float64:
-        """Return the link behind the arm's first joint."""
+        """Return the pose of the link that the arm's first joint moves."""
         return np.asarray(self._body.poses(q)[self._first])
 
 
@@ -76,7 +78,9 @@ def _body_of(robot: Robot) -> Body:
 
 
 def _chain_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
-    """Return the chain from the root to an arm's frame and the dimensions of its joints; None, [] if it is fixed."""
+    """Return the chain from the root to an arm's frame, and the dimensions of its joints; None and [] if it is
+    fixed.
+    """
     tree, members = urdf.read(robot.urdf), copy_of(arm, robot.groups)
     movers = {
         name: int(dim)
@@ -94,7 +98,9 @@ def _chain_to_frame(robot: Robot, arm: Group) -> tuple[Chain | None, list[int]]:
 
 
 def _leader(tree: Urdf, joint: Joint) -> str:
-    """Return the joint that a mimic joint follows, through several mimics; any other joint itself."""
+    """Return the name of the joint that a mimic joint finally follows; the name of `joint` itself if it is no mimic
+    joint.
+    """
     while joint.mimic is not None:
         joint = tree.joint(joint.mimic.joint)
     return joint.name

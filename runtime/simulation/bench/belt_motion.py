@@ -1,4 +1,6 @@
-"""Motion of a belt: strokes to and fro of random lengths and speeds, drawn from a seed, unpredictable to a policy."""
+"""Motion of a belt: strokes to and fro of random lengths and speeds, drawn from a seed, so that no policy can predict
+it.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,8 @@ class BeltMotion:
 
 
 def draw_belt_motion(seed: int, belt: Belt, seconds: float) -> BeltMotion:
-    """Return the motion of a seed, the same for the same arguments; after `seconds` the belt brakes to a stop.
+    """Return the motion that `seed` decides, the same for the same arguments; after `seconds` the belt brakes to a
+    stop.
 
     Raises:
         BenchError: If the belt is too short for two of the shortest strokes and its stopping distances.
@@ -84,7 +87,7 @@ class _BeltMotionBuilder:
     speed: float
 
     def change(self, speed: float) -> None:
-        """Accelerate or brake to another speed [m/s]."""
+        """Change the belt's speed to `speed` [m/s] at constant acceleration."""
         seconds = abs(speed - self.speed) / ACCELERATION
         self._piece(seconds, math.copysign(ACCELERATION, speed - self.speed))
         self.speed = speed

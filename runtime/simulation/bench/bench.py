@@ -1,7 +1,7 @@
 """Objects of the simulated bench with their sizes and places, and its cameras; without robot and physics.
 
 World frame: the robot's scene, z up, the table's surface at z = 0; metres, radians. Robots are at the near side of the
-table, where y is below that of the area.
+table, where y is less than in the area for objects.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _WRIST_FOCAL = 0.75
 
 
 class BenchError(RuntimeFault):
-    """A requested layout is not possible on the bench."""
+    """Error that a requested layout is not possible on the bench."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +51,8 @@ class Belt:
 class Bench:
     """Sizes [m] and colours (red, green, blue; 0 to 255) of everything on the table.
 
-    `area` is where objects may be placed: x from, x to, y from, y to. The first block belongs to the task and has the
-    first of `block_colours`; the other blocks have the next colours in turn.
+    `area` bounds the places of objects: lowest x, highest x, lowest y, highest y. The first block belongs to the task
+    and has the first of `block_colours`; the other blocks have the next colours in turn.
     """
 
     block_edge: float = 0.04
@@ -68,7 +68,7 @@ class Bench:
 
 @dataclass(frozen=True, slots=True)
 class BenchLayout:
-    """Places of blocks (x, y, yaw) and plate (x, y) after a reset; the first block belongs to the task."""
+    """Places of the blocks (x, y, yaw) and of the plate (x, y) after a reset; the first block belongs to the task."""
 
     blocks: tuple[tuple[float, float, float], ...]
     plate: tuple[float, float]
@@ -76,7 +76,7 @@ class BenchLayout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockState:
-    """Pose [4, 4] of a block's centre and axes in the world, and the name of the arm that holds it, or ""."""
+    """Pose [4, 4] of a block's centre and axes in the world; `held_by` is the arm that holds it, or ""."""
 
     pose: Float64
     held_by: str = ""
@@ -135,22 +135,22 @@ def block_pose(block: tuple[float, float, float], bench: Bench) -> Float64:
 
 
 def yaw_of(pose: Float64) -> float:
-    """Return the rotation about z of a pose [4, 4], or that of its y axis if x points up or down."""
+    """Return the rotation about z of a pose [4, 4]: that of its x axis, or of its y axis if x points up or down."""
     if math.hypot(pose[0, 0], pose[1, 0]) > 0.1:
         return math.atan2(pose[1, 0], pose[0, 0])
     return math.atan2(-pose[0, 1], pose[1, 1])
 
 
 def tip_in_world(robot: Robot, arm: Group, q: Float64) -> Float64:
-    """Return an arm's fingertips in the world [4, 4] at the robot's joints q [D]: z ahead, y the opening direction."""
+    """Return the pose [4, 4] of an arm's fingertips in the world at joints q [D]: z ahead, y the opening direction."""
     return arm_frames(robot)[arm.name].tip(q)
 
 
 def camera_arm(robot: Robot, camera: Camera) -> Group | None:
-    """Return the arm that carries a camera; None for an overhead camera, which all others are.
+    """Return the arm that carries a camera; None for an overhead camera.
 
-    A camera belongs to an arm if its name begins with the arm's name without "_arm", or if it is named after a wrist
-    and the robot has one arm.
+    An arm carries a camera whose name begins with the arm's name without "_arm", or that is named after a wrist if the
+    robot has one arm. All other cameras are overhead.
     """
     for arm in robot.arms:
         if camera.name.startswith(arm.name.removesuffix("_arm")):
@@ -159,7 +159,7 @@ def camera_arm(robot: Robot, camera: Camera) -> Group | None:
 
 
 def cameras(robot: Robot, q: Float64, width: int, height: int) -> dict[str, PinholeCamera]:
-    """Return all cameras of the robot by key, placed for joints q [D]; a camera without an arm is overhead."""
+    """Return all cameras of the robot by key, placed for joints q [D]; a camera that no arm carries is overhead."""
     carriers = {camera.key: camera_arm(robot, camera) for camera in robot.cameras}
     return {
         key: overhead_camera(width, height)
@@ -176,7 +176,7 @@ def overhead_camera(width: int, height: int) -> PinholeCamera:
 
 
 def wrist_camera(tip: Float64, width: int, height: int, eye: CameraPlacement | None = None) -> PinholeCamera:
-    """Return the camera next to the fingers of an arm with fingertips at `tip` [4, 4]."""
+    """Return the camera at `eye` next to the fingers of an arm with fingertips at `tip` [4, 4]."""
     eye = eye or CameraPlacement()
     return _camera(tip @ _looking(eye.place, eye.aim, eye.up), _WRIST_FOCAL, width, height)
 

@@ -1,4 +1,4 @@
-"""Block on the simulated bench: rests, is pushed or held, falls, and settles on a face."""
+"""Block on the simulated bench: it rests, is pushed or held, falls, and settles on a face."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ _MOVED = 1e-6  # [m, or part of a unit axis] least change that counts as motion
 
 
 class Block:
-    """Cube of `edge` [m]: `pose` [4, 4] in the world, `held_by` an arm's name or "", `still` the time at rest [s]."""
+    """Cube with edges of `edge` [m].
+
+    `pose` [4, 4] is in the world, `held_by` is an arm's name or "", `still` is the time for which it has been at rest
+    [s].
+    """
 
     def __init__(self, pose: Float64, edge: float) -> None:
         self.pose = pose.copy()
@@ -43,15 +47,15 @@ class Block:
         return bool(np.abs(self.pose[2, :3]).max() > math.cos(_LEVEL))
 
     def state(self) -> BlockState:
-        """Return its pose and the arm that holds it, for rendering."""
+        """Return the block's pose and the arm that holds it, for rendering."""
         return BlockState(self.pose.copy(), self.held_by)
 
     def shift(self, way: Float64) -> None:
-        """Slide it by `way` [2] over its support."""
+        """Slide the block by the vector `way` [2] over its support."""
         self.pose[:2, 3] += way
 
     def turn(self, angle: float) -> None:
-        """Rotate it by `angle` [rad] about the vertical through its centre."""
+        """Rotate the block by `angle` [rad] about the vertical through its centre."""
         self.pose[:3, :3] = _about([0.0, 0.0, angle]) @ self.pose[:3, :3]
 
     def nearest(self, point: Float64) -> Float64:
@@ -65,23 +69,25 @@ class Block:
         return np.asarray(self.sides().T @ (point - self.pose[:2, 3]))
 
     def sides(self) -> Float64:
-        """Return the directions of its sides over the table, the columns of [2, 2]."""
+        """Return the directions of the block's sides over the table, as the columns of an array [2, 2]."""
         flattest = np.argsort(np.abs(self.pose[2, :3]))[0]
         along = self.pose[:2, flattest] / np.linalg.norm(self.pose[:2, flattest])
         return np.array([[along[0], -along[1]], [along[1], along[0]]])
 
     def attach_to(self, arm: str, tip: Float64) -> None:
-        """Attach it to an arm with fingertips at `tip` [4, 4]; `carry` moves it from now on."""
+        """Attach the block to an arm with fingertips at `tip` [4, 4]; from now on `carry` moves it."""
         self.held_by = arm
         self._falling = 0.0
         self._grip = np.linalg.inv(tip) @ self.pose
 
     def release(self) -> None:
-        """Detach it from the arm, so that it falls."""
+        """Detach the block from the arm, so that it falls."""
         self.held_by = ""
 
     def carry(self, tip: Float64, support: float) -> None:
-        """Move it with the fingertips; a support up to height `support` [m] pushes it up between the fingers."""
+        """Move the block with the fingertips at `tip`; if a support reaches `support` [m], the block is pushed up in
+        the fingers.
+        """
         self.pose = tip @ self._grip
         below = support - self.bottom
         if below > 0:
@@ -89,7 +95,7 @@ class Block:
             self._grip = np.linalg.inv(tip) @ self.pose
 
     def fall(self, support: float, seconds: float) -> None:
-        """Let it fall for `seconds` onto a support at height `support` [m], and settle there.
+        """Let the block fall for `seconds` onto a support at height `support` [m], and settle there.
 
         A block below that height is raised onto the support.
         """
@@ -105,7 +111,7 @@ class Block:
         self.pose[2, 3] += support - self.bottom
 
     def _settle(self, seconds: float) -> None:
-        """Rotate the lowest face towards the support, by the share for `seconds` or completely."""
+        """Rotate the block so that its lowest face approaches the support, as far as it turns in `seconds`."""
         face = int(np.argmax(np.abs(self.pose[2, :3])))
         up = self.pose[:3, face] * np.sign(self.pose[2, face])
         axis = np.cross(up, [0.0, 0.0, 1.0])
@@ -115,7 +121,9 @@ class Block:
         self.pose[:3, :3] = _about(axis / sine * (share * angle)) @ self.pose[:3, :3]
 
     def update_rest(self, seconds: float) -> None:
-        """Update `still` by whether it has moved since the previous call, `seconds` ago."""
+        """Update `still`: add `seconds` if the block has not moved since the previous call and is not held, else set it
+        to 0.
+        """
         moved = float(np.abs(self.pose - self._before).max()) > _MOVED
         self.still = 0.0 if moved or self.held_by else self.still + seconds
         self._before = self.pose.copy()

@@ -3,8 +3,8 @@
 The belt starts when fingertips are next to the block for the first time, so that every attempt begins from the same
 situation, however long its approach took. It then runs a motion that the seed decides and that cannot be predicted. The
 score is the share of physics steps in which fingertips are within tolerance of their place beside the block: half a
-block's edge away they point past it. A block that was pushed or picked off the belt does not ride on, and the task
-cannot be done any more.
+block's edge away they point past it. A block that was pushed or picked off the belt no longer rides, and the task
+cannot be completed then.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _ON_BELT = 1e-3  # [m] greatest height above the belt at which a block rides
 
 @dataclass(slots=True)
 class TrackingErrors:
-    """Sorted distances of the fingertips from their place beside the block [m]."""
+    """Distances of the fingertips from their place beside the block [m], one per physics step, sorted."""
 
     distances: list[float] = field(default_factory=list)
     total: float = 0.0  # [m]
@@ -51,7 +51,7 @@ class TrackingErrors:
 
     @property
     def on_target_share(self) -> float:
-        """Share of steps within the tolerance; 0 before the first."""
+        """Share of steps within the tolerance; 0 before the first step."""
         return bisect_right(self.distances, TOLERANCE_M) / max(1, len(self.distances))
 
     @property
@@ -60,7 +60,7 @@ class TrackingErrors:
         return self.total / max(1, len(self.distances))
 
     def quantile(self, part: float) -> float:
-        """Return the distance [m] that is not exceeded in the share `part` of steps; 0 before the first."""
+        """Return the distance [m] that is not exceeded in the share `part` of steps; 0 before the first step."""
         if not self.distances:
             return 0.0
         return self.distances[max(0, math.ceil(part * len(self.distances)) - 1)]
@@ -69,7 +69,7 @@ class TrackingErrors:
 class Conveyor(Tabletop):
     """Tabletop with a belt, a block on it and a plate out of the way; fingers act on the block as on any tabletop.
 
-    `escort` contains the tracking errors since the last reset.
+    `escort` has the tracking errors since the last reset.
     """
 
     step = 1 / 59  # [s]; without grasping, two steps per tick at 30 Hz are enough
@@ -91,11 +91,13 @@ class Conveyor(Tabletop):
 
     @property
     def success(self) -> bool:
-        """Whether the motion has ended and fingertips were in their place for long enough."""
+        """Whether the motion has ended and fingertips were in their place for a sufficient share of it."""
         return self.over and self.escort.on_target_share >= REQUIRED
 
     def truth(self) -> dict[str, object]:
-        """Return the ground truth for the node's observation; `chase` covers the time since the reset, in mm and s."""
+        """Return the ground truth for the node's observation; its part `chase` is about the time since the reset, in mm
+        and s.
+        """
         distance = self.distance()
         return super().truth() | {
             "milestones": {"reached": self._reached["beside"], "followed": self.success},
@@ -112,7 +114,9 @@ class Conveyor(Tabletop):
         }
 
     def distance(self) -> float:
-        """Return the distance of the nearest fingertips from their place at the block [m]; inf before any step."""
+        """Return the distance of the nearest fingertips from their place beside the block [m]; inf before the first
+        step.
+        """
         block = self._blocks[0].pose[:3, 3] - (0.0, 0.0, self.bench.block_edge / 2)
         place = block + self.belt.fingertip_offset
         tips = [hand.tip[:3, 3] for hand in self._hands.values()]
@@ -140,7 +144,7 @@ class Conveyor(Tabletop):
         self._measure()
 
     def _run(self, seconds: float) -> None:
-        """Advance the belt, together with the block if it lies on it."""
+        """Advance the belt by `seconds`, and with it a block that lies on it."""
         before, self._elapsed = self._elapsed, min(self._elapsed + seconds, self._course.duration)
         block = self._blocks[0]
         aside = abs(block.pose[1, 3] - self.belt.y)
@@ -148,10 +152,10 @@ class Conveyor(Tabletop):
             block.shift(np.array([self._course.x(self._elapsed) - self._course.x(before), 0.0]))
 
     def _note(self) -> None:
-        """Do nothing: a conveyor has no milestones of lifting and carrying."""
+        """Do nothing, because a conveyor has no milestones of lifting and carrying."""
 
     def _measure(self) -> None:
-        """Record the fingertips' distance while the belt runs; start the belt once they are beside the block."""
+        """Record the fingertips' distance if the belt runs; once they are beside the block, let the belt start."""
         distance = self.distance()
         if self.running:
             self.escort.add(distance)

@@ -25,7 +25,7 @@ _YIELD = 0.3  # [m/s] speed at which a block yields to a finger that presses fro
 
 
 def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
-    """Move a block between closing jaws; return the opening [m] at which it stops them, None if it does not.
+    """Move a block that is between closing jaws; return the opening [m] at which it stops them, None if it does not.
 
     `before` is the hand one step ago: a block is between the jaws only if they were open wide enough for it. The jaws
     shift the block and rotate it into alignment; it is attached to the arm if they hold it from above.
@@ -45,7 +45,7 @@ def squeeze(hand: Hand, before: Hand, block: Block) -> float | None:
 
 
 def push(hand: Hand, block: Block, seconds: float) -> None:
-    """Move a block out of the finger that penetrates it most, at most at the hand's speed plus _YIELD."""
+    """Move a block out of the finger that is deepest in it, at most at the hand's speed plus _YIELD."""
     deepest, way = 0.0, np.zeros(2)
     for ball in hand.balls():
         if block.bottom - FINGER_RADIUS < ball[2] < block.top + FINGER_RADIUS:
@@ -71,19 +71,21 @@ def _from_above(hand: Hand, place: Float64) -> bool:
 
 
 def _turn(hand: Hand, block: Block) -> float:
-    """Return the angle from the jaws to the nearest side of the block about the vertical, in [-pi/4, pi/4]."""
+    """Return the angle about the vertical from the jaws to the nearest side of the block, in [-pi/4, pi/4]."""
     x, y = block.offset(block.pose[:2, 3] + hand.tip[:2, 1])
     angle = -math.atan2(y, x)
     return angle - round(angle / (math.pi / 2)) * math.pi / 2
 
 
 def _width(block: Block, turn: float) -> float:
-    """Return the distance of two parallel jaws that touch a block rotated by `turn` from them [m]."""
+    """Return the distance [m] between two parallel jaws that touch a block, if it is rotated by `turn` relative to
+    them.
+    """
     return block.edge * (math.cos(turn) + math.sin(abs(turn)))
 
 
 def _straighten(hand: Hand, block: Block) -> float:
-    """Rotate the block as far as the closing jaws force it; return its width between them [m]."""
+    """Rotate the block as far as the closing jaws force it; return its width in their direction [m]."""
     turn = _turn(hand, block)
     width = _width(block, turn)
     if hand.opening >= width or abs(turn) > TURN:
@@ -95,7 +97,9 @@ def _straighten(hand: Hand, block: Block) -> float:
 
 
 def _overlap(block: Block, centre: Float64) -> tuple[float, Float64]:
-    """Return the depth of a ball at `centre` [2] in the block's outline, and the direction [2] that frees the block."""
+    """Return how deep a finger's ball at `centre` [2] is in the block, and the direction [2] that moves the
+    block out.
+    """
     nearest = block.nearest(centre)
     away = nearest - centre
     distance = float(np.hypot(*away))

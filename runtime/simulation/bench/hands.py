@@ -1,4 +1,4 @@
-"""Fingers of a simulated arm: their pose, their opening, and the limit that a held block sets to it."""
+"""Fingers of a simulated arm: their pose, their opening, and the limit that a held block sets to the opening."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ class Jaws:
         return Hand(self.name, tip, opening, way / seconds if seconds > 0 else 0.0)
 
     def stop(self, q: Float64, opening: float) -> None:
-        """Write into q [D] that the jaws are `opening` [m] apart."""
+        """Set the gripper's value in q [D] so that the jaws are `opening` [m] apart."""
         q[self._dim] = self._opening.number(opening)
 
 
 class Opening:
-    """Conversion between a gripper's joint value and the distance of its fingers [m], which are proportional.
+    """Conversion between a gripper's joint value and the proportional distance between its fingers [m].
 
     If the description does not declare the distance, it is 0 when closed and 0.1 m when open.
     """
@@ -82,7 +82,7 @@ class Opening:
         self._most = most - self._least
 
     def metres(self, number: float) -> float:
-        """Return the distance between the fingers [m] at a joint value."""
+        """Return the distance between the fingers [m] at the joint value `number`."""
         return self._least + (number - self._close) / self._way * self._most
 
     def number(self, metres: float) -> float:

@@ -20,15 +20,15 @@ _REACH = 0.42
 
 
 def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: int = 1) -> BenchLayout:
-    """Return the layout of a seed, the same for the same arguments.
+    """Return the layout that `seed` decides, the same for the same arguments.
 
     `positions` may request places of the task's block ("block": [x, y, yaw in degrees]) and of the plate ("plate": [x,
-    y]); they are then placed within NOISE_M and NOISE_RAD of them. An object without a request is placed at random, so
-    that block and plate are reachable from one side of the bench.
+    y]); the objects are then placed within NOISE_M and NOISE_RAD of them. An object without a request is placed at
+    random, but so that block and plate are reachable from one side of the bench.
 
     Raises:
         BenchError: If `positions` has another form, is outside the area or has block and plate closer than APART_M, if
-            `blocks` is below 1 or does not fit, or if the seed is negative.
+        `blocks` is below 1 or does not fit, or if the seed is negative.
     """
     block, plate = _parse_positions(positions or {})
     if blocks < 1 or seed < 0:
@@ -42,7 +42,7 @@ def draw_layout(seed: int, positions: Mapping[str, Any] | None = None, blocks: i
 
 
 def _parse_positions(positions: Mapping[str, Any]) -> tuple[list[float] | None, list[float] | None]:
-    """Return the requested block (x, y, yaw in rad) and plate (x, y)."""
+    """Return the requested places of block (x, y, yaw in rad) and plate (x, y)."""
     unknown = sorted(str(name) for name in positions if name not in ("block", "plate"))
     if unknown:
         raise BenchError(f"positions name {', '.join(unknown)}; allowed: block, plate")
@@ -79,7 +79,7 @@ def _place(name: str, given: Any, count: int) -> list[float] | None:
 def _pair(
     chance: np.random.Generator, block: list[float] | None, plate: list[float] | None
 ) -> tuple[tuple[float, float, float], tuple[float, float]]:
-    """Return block and plate, drawn until they are far enough apart and reachable from one side."""
+    """Return places of block and plate, drawn until they are far enough apart and reachable from one side."""
     for _ in range(_TRIES):
         block_x, block_y, yaw = _random_place(chance) if block is None else _random_near(chance, block)
         plate_x, plate_y, _ = _random_place(chance) if plate is None else _random_near(chance, [*plate, 0.0])

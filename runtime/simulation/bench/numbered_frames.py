@@ -1,7 +1,7 @@
 """Moving test patterns, BGR: a fixed background with the camera's name, blocks that follow the joints, a frame number.
 
-The top strip encodes the frame number as black and white cells, so that the receiver of an image can identify the frame
-even after compression. The bottom row has a red, a green and a blue patch, in this order.
+The top strip encodes the frame number as black and white cells, which the receiver of an image can read even after
+compression. The bottom row has a red, a green and a blue patch, in this order.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ class Scene:
         return pictures
 
     def _blocks(self, picture: UInt8, places: Float64, camera: int) -> None:
-        """Draw a block per group in a column of its own, moved by two joints, as wide as its gripper is open."""
+        """Draw one block per group in its own column: two joints move it, and it is as wide as the group's gripper is
+        open.
+        """
         height, width = picture.shape[:2]
         side = height // 8
         for index, group in enumerate(self._robot.groups):

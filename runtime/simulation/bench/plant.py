@@ -16,7 +16,7 @@ LAG = 0.06  # [s] time constant of each joint
 
 
 class Plant:
-    """Joints `q` float64 [D] that start at home, or at `start`; they move towards `target` [D]."""
+    """Joints `q` float64 [D] of a robot; they start at home, or at `start`, and move towards `target` [D]."""
 
     def __init__(self, robot: Robot, lag: float = LAG, start: Float64 | None = None) -> None:
         self._robot = robot
@@ -25,13 +25,13 @@ class Plant:
         self.target: Float64 = self.q.copy()
 
     def advance(self, seconds: float) -> None:
-        """Advance by `seconds`: first-order lag towards the target, limited in velocity."""
+        """Advance by `seconds`: the joints approach the target with a first-order lag, within their velocity limits."""
         wish = (self.target - self.q) * -math.expm1(-seconds / self._lag)
         reach = self._robot.velocity * seconds
         self.q = self.q + np.clip(wish, -reach, reach)
 
     def hold(self) -> None:
-        """Set the target to the present joints."""
+        """Set the target to the present joints, so that the robot stops."""
         self.target = self.q.copy()
 
 

@@ -42,7 +42,7 @@ _RIM = 0.002  # [m] below the plate's top; a block that low is beside the plate
 
 @dataclass(frozen=True, slots=True)
 class ResetRequest:
-    """Request to lay out the bench anew; `id` distinguishes new requests from repetitions."""
+    """Request for a new layout of the bench; `id` distinguishes new requests from repetitions."""
 
     id: str
     seed: int
@@ -69,7 +69,7 @@ class Tabletop:
         self._place_objects(self._reset)
 
     def reset(self, wish: ResetRequest) -> None:
-        """Lay out the bench as requested; a repetition of the last `id` changes nothing.
+        """Lay out the bench as requested; if `wish` has the id of the last reset, do nothing.
 
         Raises:
             BenchError: If the layout is not possible; nothing has changed then.
@@ -92,7 +92,9 @@ class Tabletop:
         return BenchState(tuple(block.state() for block in self._blocks), (float(x), float(y)))
 
     def truth(self) -> dict[str, object]:
-        """Return the ground truth for the node's observation; milestones are the first block's since the last reset."""
+        """Return the ground truth for the node's observation; the milestones of its first block are since the last
+        reset.
+        """
         placed = self._on_plate(0.0)
         return {
             "reset": self._reset.id,
@@ -105,7 +107,7 @@ class Tabletop:
         }
 
     def _layout(self, wish: ResetRequest) -> BenchLayout:
-        """Return the layout for a reset.
+        """Return the layout for a reset request.
 
         Raises:
             BenchError: If it is not possible; nothing has changed then.
@@ -132,7 +134,7 @@ class Tabletop:
         self._note()
 
     def _handle(self, jaws: Jaws, q: Float64, seconds: float) -> None:
-        """Apply one arm's fingers to all blocks within this step, and stop its jaws at a block between them."""
+        """Apply one arm's fingers to all blocks in this step of `seconds`; a block between its jaws stops them."""
         before = self._hands.get(jaws.name)
         hand = jaws.hand(q, before, seconds)
         stops = [
@@ -147,7 +149,7 @@ class Tabletop:
         self._hands[jaws.name] = hand
 
     def _touch(self, hand: Hand, before: Hand, block: Block, seconds: float) -> float | None:
-        """Apply one arm's fingers to a block; return the opening at which it stops the jaws [m], else None."""
+        """Apply one arm's fingers to a block; return the opening [m] at which the block stops the jaws, else None."""
         if block.held_by not in ("", hand.arm):
             return None
         if block.held_by and hand.opening > block.edge + RELEASE:
@@ -163,7 +165,7 @@ class Tabletop:
         return block.edge
 
     def _support(self, block: Block) -> float:
-        """Return the height of the support under a block's centre [m]: the table, the plate or another block."""
+        """Return the height [m] of what supports a block's centre: the table, the plate or another block."""
         centre = block.pose[:2, 3]
         on_plate = float(np.hypot(*(centre - self._plate))) < self.bench.plate_radius
         heights = [self.bench.plate_height if on_plate else 0.0]
@@ -174,7 +176,7 @@ class Tabletop:
         return max(heights)
 
     def _separate(self, block: Block, other: Block, seconds: float) -> None:
-        """Slide a block out of another block next to it."""
+        """Slide a block away from another block that it overlaps, as far as it moves in `seconds`."""
         if block.held_by or abs(block.pose[2, 3] - other.pose[2, 3]) > 0.9 * block.edge:
             return
         way = block.pose[:2, 3] - other.pose[:2, 3]
@@ -185,7 +187,7 @@ class Tabletop:
             block.shift(direction * min(depth, _APART_SPEED * seconds))
 
     def _clear_rim(self, block: Block, seconds: float) -> None:
-        """Slide a block that touches the plate's side out of its rim."""
+        """Slide a block that touches the plate from the side away from it, as far as it moves in `seconds`."""
         if block.bottom > self.bench.plate_height - _RIM:
             return
         way = block.pose[:2, 3] - self._plate

@@ -41,7 +41,7 @@ class CameraPlacement:
 
 @lru_cache(maxsize=64)  # cache: a search, for robots that do not change
 def place_wrist_camera(robot: Robot, arm: str) -> CameraPlacement:
-    """Return the nearest placement on an arm with a sufficient view, else the one with the best view.
+    """Return the nearest placement on an arm with a sufficient view; without one, the placement with the best view.
 
     The view is judged in the ready posture, or at home if there is none.
     """
@@ -85,5 +85,5 @@ class _Boxes:
 
 
 def _placed(tip: Float64, points: Float64) -> Float64:
-    """Transform points [..., 3] from the fingertips' frame to the world."""
+    """Transform points [..., 3] from the frame of the fingertips `tip` to the world."""
     return np.asarray(points @ tip[:3, :3].T + tip[:3, 3])

@@ -18,8 +18,8 @@ Bool = NDArray[np.bool_]
 class Order:
     """Separating sides of solids at their present poses; `hides` evaluates them for a viewpoint.
 
-    The box around each solid has three unit axes, the rows of `axes` [S, 3, 3], its centre [S, 3] and half sizes [S,
-    3].
+    Each solid is in a box with three unit axes, which are the rows of `axes` [S, 3, 3]; `centres` and `halves` [S, 3]
+    are the boxes' centres and half sizes.
     """
 
     def __init__(self, axes: Float32, centres: Float32, halves: Float32) -> None:
@@ -38,7 +38,7 @@ class Order:
         self._sign = offset[take[0], self._side, take[1]] > 0
 
     def hides(self, eye: Float32) -> Bool:
-        """Return bool [S, S]: whether the second solid is in front of the first, seen from `eye` [3]."""
+        """Return bool [S, S]: entry (i, j) is True if solid j can hide solid i as seen from `eye` [3]."""
         across = np.einsum("skd,sd->sk", self._axes, eye - self._centres)
         beyond = np.stack([-across > self._halves, across > self._halves], -1)  # [S, 3, 2]
         rows = np.arange(len(beyond))[:, None]
@@ -48,10 +48,10 @@ class Order:
 
 
 def painted(hides: Bool, overlap: Bool, distance: Float32) -> list[int]:
-    """Return the solids from back to front: hidden solids before those that hide them, otherwise the farther first.
+    """Return the solids from back to front: a hidden solid before those that hide it, otherwise the farther one first.
 
-    `hides` and `overlap` are [S, S]; `overlap` is whether two solids overlap in the image. A cycle is broken at its
-    farthest solid.
+    `hides` is as returned by `Order.hides`; `overlap` [S, S] is whether two solids overlap in the image. A cycle is
+    broken at its farthest solid.
     """
     # A bit set per solid: the solids that it hides, which have to be drawn before it.
     below = np.packbits((hides & overlap).T, axis=1, bitorder="little")

@@ -1,4 +1,4 @@
-"""Painter of solids into a camera's image: back to front, with smooth edges and light from one side."""
+"""Painter of solids into a camera's image, from back to front, with smooth edges and light from one side."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ class Painter:
                 self._paint_solid(picture, corners, solid, facing)
 
     def _facing(self, eye: Float32, chosen: NDArray[np.intp]) -> dict[int, tuple[float, ...]]:
-        """Return the colours (blue, green, red) of those faces of chosen solids whose outside is towards `eye`."""
+        """Return by face the colour (blue, green, red) of those faces of the chosen solids that `eye` sees from
+        outside.
+        """
         solids, normals = self._solids, self._placed.normals
         wanted = np.zeros(len(solids.solids), bool)
         wanted[chosen] = True
@@ -107,7 +109,7 @@ class Painter:
         solid: int,
         facing: Mapping[int, tuple[float, ...]],
     ) -> None:
-        """Paint a solid that extends behind the camera: only the parts of its faces that are ahead."""
+        """Paint a solid that extends behind the camera: only the parts of its faces that are in front of the camera."""
         for face in self._solids.faces_of[solid]:
             if face in facing:
                 fill_ahead(picture, camera, inside[self._solids.faces[face]], facing[face])
@@ -146,7 +148,7 @@ def ahead(inside: Float32) -> Float32:
 
 
 def _in_view(camera: PinholeCamera, inside: Float32, solids: Solids) -> NDArray[np.bool_]:
-    """Return bool [S]: solids that are not entirely behind the camera or beyond one side of its image."""
+    """Return bool [S]: False for solids that are entirely behind the camera or beyond one side of its image."""
     x, y, depth = inside.T
     across, down = x * camera.fx, y * camera.fy
     sides = (
@@ -160,12 +162,12 @@ def _in_view(camera: PinholeCamera, inside: Float32, solids: Solids) -> NDArray[
 
 
 def _pixels(camera: PinholeCamera, inside: Float32) -> Float32:
-    """Return the columns and rows [n, 2] of points in camera axes."""
+    """Return the pixels [n, 2], columns and rows, of points in camera axes."""
     depth = np.maximum(inside[:, 2:], _NEAR)
     pixels = inside[:, :2] / depth * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return np.asarray(np.clip(pixels, -_FAR_OUT, _FAR_OUT), np.float32)
 
 
 def _overlap(low: Float32, high: Float32) -> NDArray[np.bool_]:
-    """Return bool [S, S]: rectangles that intersect or touch."""
+    """Return bool [S, S]: whether two rectangles, given by their corners, intersect or touch."""
     return np.asarray(((low[:, None] <= high + 1) & (low <= high[:, None] + 1)).all(-1))

@@ -21,7 +21,7 @@ _INSIDE = (  # share of the radius, share of the height, brightness; from the ri
 
 
 class Plate:
-    """Concentric rings of the plate, each filled over the previous ones."""
+    """Plate as concentric rings, each of which is drawn over the previous ones."""
 
     def __init__(self, bench: Bench) -> None:
         radius, height = bench.plate_radius, bench.plate_height
@@ -38,7 +38,7 @@ class Plate:
         self._colours = [rim.tolist(), *((white * tone).tolist() for _, _, tone in _INSIDE)]
 
     def draw(self, picture: UInt8, camera: PinholeCamera, place: tuple[float, float]) -> None:
-        """Draw the plate with its middle at x, y of `place` [m] onto the image."""
+        """Draw the plate onto the image, with its middle at `place` (x, y) [m]."""
         eye = camera.pose[:3, 3] - (*place, 0.0)
         inside = np.asarray((self._rings - eye) @ camera.pose[:3, :3], np.float32)
         if inside[:, 2].max() < _NEAR:

@@ -66,7 +66,10 @@ class Renderer:
         return benches.cameras(self._robot, q, *self._size)
 
     def _solids_of(self, blocks: int) -> Solids:
-        """Return the robot's visual shapes and `blocks` blocks; frames of blocks follow those of the robot's parts."""
+        """Return the solids for the robot's visual shapes and for `blocks` blocks.
+
+        The frames of blocks follow the frames of the robot's parts.
+        """
         if blocks not in self._solids:
             shapes = [
                 Solid(visual.part, visual.kind, visual.size, visual.origin, visual.colour[:3])

@@ -31,7 +31,10 @@ class Shadows:
         self._under_plate: tuple[tuple[float, float], UInt8] | None = None
 
     def cast(self, solids: Solids, placed: Placed, plate: tuple[float, float]) -> UInt8:
-        """Return the map for solids and a plate: dark and sharp below low solids, light and soft below high solids."""
+        """Return the map of the light for solids and a plate.
+
+        Shadows are dark and sharp below low solids, light and soft below high solids.
+        """
         vertices = placed.vertices
         floor = np.where(
             np.hypot(*(placed.centres[:, :2] - np.array(plate)).T) < self._bench.plate_radius * 0.9,
@@ -55,7 +58,7 @@ class Shadows:
         return np.asarray(cv2.min(blurred, self._plate_map(plate)), np.uint8)
 
     def _plate_map(self, plate: tuple[float, float]) -> UInt8:
-        """Return the plate's own shadow, around it but not on it."""
+        """Return the map with only the shadow of the plate, which is around it but not on it."""
         if self._under_plate is None or self._under_plate[0] != plate:
             shade = np.full(self._shape, 255, np.uint8)
             height, radius = self._bench.plate_height, self._bench.plate_radius
@@ -73,7 +76,7 @@ class Shadows:
 
 
 def darken(picture: UInt8, camera: PinholeCamera, light: UInt8) -> None:
-    """Darken the image of a table by a map of the light on it."""
+    """Darken the table in an image by the map `light`."""
     half = (camera.width // 2, camera.height // 2)
     matrix = np.diag([0.5, 0.5, 1.0]) @ texels_to_pixels(camera, _TEXEL)
     small = cv2.warpPerspective(

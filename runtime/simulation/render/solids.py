@@ -94,7 +94,7 @@ class Solids:
         return Placed(vertices, normals, boxes[:, :3, 3], boxes[:, :3, :3].transpose(0, 2, 1), seen)
 
     def above_table(self, placed: Placed) -> Placed:
-        """Return the solids cut off at the table, z = 0; solids entirely below it are marked as not drawn."""
+        """Return the solids with everything below the table, z = 0, cut off; those entirely below it are not drawn."""
         above = np.maximum.reduceat(placed.vertices[:, 2], self.starts) > 0
         cut = placed.vertices.copy()
         np.maximum(cut[:, 2], 0, out=cut[:, 2])
@@ -105,8 +105,8 @@ class Solids:
 class Placed:
     """Solids in the world: vertices [V, 3], outward normals [F, 3], and the boxes around the solids.
 
-    A box has its centre [S, 3] and its three unit axes as the rows of [S, 3, 3]. `seen` [S] is whether a solid is
-    drawn.
+    A box has its centre [S, 3] and its three unit axes as the rows of [S, 3, 3]. `seen` [S] is False for solids that
+    are not drawn.
     """
 
     vertices: Float32
@@ -123,7 +123,7 @@ def _pairs(
 
 
 def _mesh(solid: Solid) -> tuple[Float64, Sequence[Face]]:
-    """Return the vertices [n, 3] about the solid's centre, and the faces."""
+    """Return the vertices [n, 3] of a solid relative to its centre, and its faces."""
     if solid.kind == "box":
         return _BOX * solid.size, _BOX_FACES
     if solid.kind == "cylinder":

@@ -14,7 +14,9 @@ _FLOOR, _CEILING, _WALL = -0.75, 1.9, 2.4  # [m] heights relative to the table; 
 
 
 def _room() -> list[tuple[Float32, tuple[int, int, int]]]:
-    """Return floor, ceiling and walls around the table as quads [4, 3] with their colours (blue, green, red)."""
+    """Return floor, ceiling and walls around the table as quadrilaterals [4, 3] with their colours (blue,
+    green, red).
+    """
     w, f, c, s = _WALL, _FLOOR, _CEILING, -0.05
     quads: list[tuple[list[tuple[float, float, float]], tuple[int, int, int]]] = [
         ([(-w, -w, f), (w, -w, f), (w, w, f), (-w, w, f)], (92, 88, 84)),
@@ -99,7 +101,7 @@ def texels_to_pixels(camera: PinholeCamera, texel: float) -> Float64:
 
 
 def outline_of(camera: PinholeCamera) -> Float32:
-    """Return the pixels [n, 2] around the part of the table in front of the camera; empty if there is none."""
+    """Return the outline, in pixels [n, 2], of the part of the table in front of the camera; empty if there is none."""
     inside = ahead(((CORNERS - camera.pose[:3, 3]) @ camera.pose[:3, :3]).astype(np.float32))
     if len(inside) < 3:
         return np.empty((0, 2), np.float32)
@@ -139,7 +141,7 @@ def _boards(bench: Bench, seed: int) -> UInt8:
 def _streaks(
     chance: np.random.Generator, height: int, width: int, along: int, across: float
 ) -> NDArray[np.float32]:
-    """Return noise of deviation 1, blurred over `along` texels in x and, unless 0, `across` texels in y."""
+    """Return noise with standard deviation 1, blurred over `along` texels in x and, unless 0, `across` texels in y."""
     noise = chance.standard_normal((height, width // 4)).astype(np.float32)
     smeared = cv2.GaussianBlur(noise, (0, 0), along / 16, sigmaY=across or 0.3)
     wide = cv2.resize(smeared, (width, height), interpolation=cv2.INTER_LINEAR)
@@ -147,7 +149,7 @@ def _streaks(
 
 
 def _tape(texture: UInt8, bench: Bench) -> None:
-    """Draw white angles slightly outside the corners of the work area."""
+    """Draw a white angle slightly outside each corner of the work area."""
     x_from, x_to, y_from, y_to = bench.area
     margin, arm, thick = 0.045, 0.045, 0.005
     for x, inwards_x in ((x_from - margin, 1), (x_to + margin, -1)):
@@ -160,7 +162,7 @@ def _tape(texture: UInt8, bench: Bench) -> None:
 
 
 def _roll_out(texture: UInt8, belt: Belt) -> None:
-    """Draw a belt across the table with a rail on either side, longer than the range in which blocks ride."""
+    """Draw a belt across the table with a rail on each side; it is longer than the range in which blocks ride."""
     ends = belt.x[0] - _BEYOND, belt.x[1] + _BEYOND
     for half, colour in ((belt.width / 2 + _RAIL, _RAIL_COLOUR), (belt.width / 2, belt.colour)):
         corners = np.column_stack([ends, (belt.y - half, belt.y + half)]) - (X[0], Y[0])

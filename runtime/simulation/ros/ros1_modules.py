@@ -30,7 +30,7 @@ _FIND = (  # program that prints the origins of packages
 
 @contextmanager
 def lent(python: str) -> Iterator[None]:
-    """Make rospy of the installation `python` importable within the context.
+    """Make rospy of the Python installation `python` importable within the context.
 
     Raises:
         SetupError: If that installation lacks a needed package, or cannot be run.

@@ -1,7 +1,8 @@
-"""Messages of the simulated ROS 2 robot, with a codec of its own: no code is shared with the transport under test.
+"""Messages of the simulated ROS 2 robot, with a codec of their own: no code is shared with the transport under test.
 
-Joints and poses use cyclonedds' codec. Images are serialised here, because cyclonedds takes 60 ms for each. There is no
-`from __future__ import annotations`: cyclonedds cannot resolve the annotations that it leaves.
+Joints and poses use cyclonedds' codec. Images are serialised here, because cyclonedds takes 60 ms for each. The module
+has no `from __future__ import annotations`, because cyclonedds cannot resolve the annotations that it would leave as
+text.
 """
 # mypy: disable-error-code="type-arg, misc, call-arg, untyped-decorator"
 
@@ -101,7 +102,7 @@ class CompressedImage(IdlStruct, typename="sensor_msgs::msg::dds_::CompressedIma
 
 
 def _fields(packed: bytes, kinds: str, *numbers: int) -> bytes:
-    """Append aligned four-byte numbers; the four bytes of encapsulation do not affect alignment."""
+    """Append four-byte numbers, aligned; the four bytes of the encapsulation do not count for that."""
     return packed + bytes(-len(packed) % 4) + struct.pack(f"<{kinds}", *numbers)
 
 

@@ -1,4 +1,4 @@
-"""Temporary private ROS domain: real UDP on loopback, on ports that no other process uses meanwhile."""
+"""Temporary private ROS domain: UDP on loopback, on ports that no other process uses at the same time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FIRST, _EACH = 7400, 250  # first port, ports per domain: RTPS 2.5, section 9.6
 
 @contextlib.contextmanager
 def free_domain() -> Iterator[int]:
-    """Yield an unused domain id; a bound TCP port of the domain's range marks it as in use.
+    """Yield a domain id that no other process uses; a bound TCP port in the domain's range marks it as used.
 
     Raises:
         SetupError: If all domains are in use.

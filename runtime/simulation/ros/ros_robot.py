@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class JointTopic(NamedTuple):
-    """Topic of joints: its name, the joints' dimensions in the robot's vector, and their names in messages."""
+    """Topic of joint values: its name, the joints' dimensions in the robot's vector, and their names in messages."""
 
     topic: str
     dims: list[int]
@@ -40,7 +40,7 @@ class ReceivedCommand(NamedTuple):
 
 
 def topics(robot: Robot, version: Literal[1, 2]) -> tuple[dict[str, str], dict[str, RosGroupTable]]:
-    """Return camera topics by camera key, and the topics of each group.
+    """Return the cameras' topics by camera key, and the topics of each group.
 
     They are those of the robot's description if it declares topics for this ROS version, else default names.
     """
@@ -106,7 +106,7 @@ class RosRobot(ABC):
         """Publish a sensor_msgs/CompressedImage of a JPEG."""
 
     def tick(self, seconds: float) -> None:
-        """Execute the received commands, move for `seconds`, publish."""
+        """Execute the received commands, move for `seconds`, and publish."""
         self._obey()
         silent = self._clock.now() - self._heard > self._options.deadline
         if silent and not self._holding:
@@ -173,7 +173,10 @@ class RosRobot(ABC):
 
 
 def _split(group: Group, whole: str | None, hand: str | None) -> Iterator[JointTopic]:
-    """Yield the topics of a group's joints, with the gripper separate if it has a topic of its own."""
+    """Yield the topics of a group's joints.
+
+    `whole` is the topic of the group; with a topic `hand` for its gripper, the gripper is on that topic instead.
+    """
     dims, joints = list(range(group.slice.start, group.slice.stop)), group.joints
     if hand and group.gripper is not None:
         place = group.gripper.index

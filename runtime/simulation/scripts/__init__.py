@@ -1,1 +1,1 @@
-"""Scripted policies for the simulated bench, with their detection and motion planning."""
+"""Scripted policies for the simulated bench, with the detection and motion planning that they need."""

@@ -1,9 +1,9 @@
 """Scripted policy that keeps an arm's fingertips beside the block on the belt, using only its observations.
 
-It acts as a policy that has learnt the task: it detects the block's place in the overhead image of the request and
-estimates its velocity from earlier requests; it extrapolates this motion over the chunk, but not beyond the ends of the
-belt; its rows are ahead of time by the robots' lag; and it approaches from the joints of the request within a speed
-limit. It cannot predict when the belt reverses.
+It acts as a policy that has learnt the task. It detects the block's place in the overhead image of the request, and
+estimates its velocity from earlier requests. It extrapolates this motion over the chunk, but not beyond the ends of the
+belt. Its rows are ahead of time by the robots' lag. It approaches from the joints of the request within a speed limit.
+It cannot predict when the belt reverses.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class ChaseScript(Script):
         }
 
     def begin(self) -> Answer:
-        """Return the answers of a new connection, which has not detected a block yet."""
+        """Return the function that answers the requests of a new connection, which has not detected a block yet."""
         return ChaseEpisode(self)
 
 
 class ChaseEpisode:
-    """State of one connection: the places at which the block was detected, with times."""
+    """State of one connection: the places at which the block was detected, with the times of detection."""
 
     def __init__(self, policy: ChaseScript) -> None:
         self._policy = policy
@@ -98,7 +98,9 @@ class ChaseEpisode:
             self._seen.append((now, block[0], block[1]))
 
     def _ahead(self, times: Float64) -> tuple[Float64, Float64]:
-        """Return extrapolated positions along the belt at `times` [n], and the newest position across it [n]."""
+        """Return extrapolated positions of the block along the belt at `times` [n], and its newest position across it
+        [n].
+        """
         seen = np.array(self._seen)
         newest = seen[-1]
         fitted = seen[(newest[0] - seen[:, 0] <= _WINDOW) | (np.arange(len(seen)) >= len(seen) - 2)]
@@ -141,7 +143,7 @@ class PlaceMap:
         return np.asarray(lower + up * (upper - lower))
 
     def _solved(self, robot: Robot, postures: Postures, arm: Group) -> Float64 | None:
-        """Return joints [along, across, D] of an arm on the grid; None if it does not reach one of the places."""
+        """Return joints [along, across, D] of an arm on the grid; None if it does not reach all places."""
         rest = robot.poses.get("ready", robot.poses["home"])
         dx, dy, height = self.belt.fingertip_offset
         found = []
@@ -155,7 +157,7 @@ class PlaceMap:
 
 
 def _between(nodes: Float64, values: Float64) -> tuple[np.ndarray, Float64]:
-    """Return the node at or below each value [n], and the fraction [n, 1] of the interval up to the next node."""
+    """Return for each value [n] the node at or below it, and its fraction [n, 1] of the way to the next node."""
     part = np.clip((values - nodes[0]) / (nodes[1] - nodes[0]), 0.0, len(nodes) - 1.0)
     lower = np.minimum(part.astype(int), len(nodes) - 2)
     return lower, (part - lower)[:, None]

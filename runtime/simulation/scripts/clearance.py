@@ -20,7 +20,10 @@ _OWN = MARGIN + 0.001  # [m] required between an arm's links, and between arm an
 
 
 class Clearance:
-    """Clearance of a robot with a margin to the warnings of safety; without the table, because hands go down to it."""
+    """Clearance of a robot along paths, relative to a required distance larger than that at which safety warns.
+
+    The table does not count, because hands go down to it.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._clearance = get_clearance(robot)
@@ -34,7 +37,10 @@ class Clearance:
         self._wanted = wanted[self._links]
 
     def margin_along(self, rows: Float64) -> float:
-        """Return the least clearance along a path float64 [n, D], minus the required one [m]; inf without pairs."""
+        """Return the smallest difference between clearance and required clearance along a path float64 [n, D] [m].
+
+        inf if there are no pairs of links to check.
+        """
         if not len(self._links):
             return np.inf
         looked_at = rows[:: max(1, len(rows) // _LOOKS)]

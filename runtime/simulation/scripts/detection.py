@@ -38,9 +38,9 @@ Matrix = NDArray[Any]  # images and masks, as in OpenCV's own annotations
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """Detected block (x, y, yaw) and plate (x, y) in the world [m, rad], each None unless it is fully visible.
+    """Detected block (x, y, yaw) and plate (x, y) in the world [m, rad]; each is None unless it is fully visible.
 
-    The yaw is that of a square: within 45 degrees of zero. `dark` is whether the image was black.
+    The yaw is that of a square: within 45 degrees of zero. `dark` is True if the image was black.
     """
 
     block: tuple[float, float, float] | None = None
@@ -76,7 +76,9 @@ class OverheadDetector:
         return Detection(self._block(shown, hsv), self._plate(hsv))
 
     def _block(self, shown: UInt8, hsv: Matrix) -> tuple[float, float, float] | None:
-        """Return the block's pose from its silhouette: the middle is half-way up, the smallest box has its yaw."""
+        """Return the block's pose from its silhouette: its middle is at half the block's height, its smallest box has
+        its yaw.
+        """
         colour = self._bench.block_colours[0]
         found = _largest(_mask(hsv, colour))
         if found is None:
@@ -99,7 +101,7 @@ class OverheadDetector:
         return block if _within(cv2.contourArea(hull), self._block_area(block), _BLOCK_SIZE) else None
 
     def _yaw(self, middle: tuple[float, float], angle: float, length: float) -> float:
-        """Return the world's direction of a line in the image, modulo a quarter turn [rad]."""
+        """Return the direction in the world [rad], modulo a quarter turn, of a line in the image through `middle`."""
         u, v = middle
         ahead = u + length * math.cos(angle), v + length * math.sin(angle)
         height = self._bench.block_edge / 2
@@ -113,7 +115,10 @@ class OverheadDetector:
         return _area(self._camera, self._bench.block_edge * _CORNERS @ turn + (x, y, 0.0))
 
     def _plate(self, hsv: Matrix) -> tuple[float, float] | None:
-        """Return the middle of the rim's outer edge; a solid disc of the rim's colour is part of a robot."""
+        """Return the middle of the outer edge of the plate's rim.
+
+        A solid disc of the rim's colour is no plate but part of a robot.
+        """
         mask = _mask(hsv, self._bench.plate_rim_colour)
         rim = _largest(mask)
         if rim is None or len(rim) < 5:
@@ -130,7 +135,7 @@ class OverheadDetector:
         return (x, y) if is_round and _within(cv2.contourArea(hull), expected, _PLATE_SIZE) else None
 
     def _native(self, pixels: Float64, shown: Matrix) -> Float64:
-        """Convert pixels [n, 2] of the given image to pixels of the camera."""
+        """Convert pixels [n, 2] of the image `shown` to pixels of the camera."""
         height, width = shown.shape[:2]
         return np.asarray((pixels + 0.5) * (_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height) - 0.5)
 
@@ -142,7 +147,10 @@ def _channels_last(picture: UInt8) -> UInt8:
 
 
 def _without_bars(picture: UInt8) -> UInt8:
-    """Return the image without its letterbox; if its margins are not black it was stretched, and is returned whole."""
+    """Return the image without its letterbox.
+
+    If its margins are not black, it was stretched, and is returned whole.
+    """
     height, width = picture.shape[:2]
     ratio = max(_NATIVE_WIDTH / width, _NATIVE_HEIGHT / height)
     inner_width, inner_height = max(1, int(_NATIVE_WIDTH / ratio)), max(1, int(_NATIVE_HEIGHT / ratio))
@@ -154,7 +162,7 @@ def _without_bars(picture: UInt8) -> UInt8:
 
 
 def _mask(hsv: Matrix, colour: bench.Colour) -> Matrix:
-    """Return a mask of the image, 255 for pixels of the colour in any light."""
+    """Return a mask of the image: 255 for pixels of the colour, in bright or dim light."""
     pixel = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_RGB2HSV)[0, 0]
     hue, saturation, _ = (int(part) for part in pixel)
     lowest = max(0, hue - _HUE), int(_SATURATION * saturation), _DARKEST

@@ -1,4 +1,4 @@
-"""Poses of fingertips that point down at a place, and paths between such poses."""
+"""Poses of fingertips that point down, and paths between such poses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class DownwardTip:
         return tip
 
     def interpolate(self, other: DownwardTip) -> Iterator[DownwardTip]:
-        """Yield the poses on the path to another one, without either end."""
+        """Yield the poses on the path to the pose `other`, without both ends."""
         numbers = np.array([*self.place, self.height, self.yaw, self.bearing, self.tilt])
         way = np.array([*other.place, other.height, other.yaw, other.bearing, other.tilt]) - numbers
         way[3:5] = [math.remainder(turn, 2 * math.pi) for turn in way[3:5]]

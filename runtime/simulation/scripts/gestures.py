@@ -19,7 +19,7 @@ _GRIPPER_TIME = 2.0  # [s] least time for the full range of a gripper
 
 
 class Gesture:
-    """Closed path around home, parametrised by a phase that can be computed from the joints, so no state is needed.
+    """Closed path around home, parametrised by a phase that can be computed from the joints, so that it needs no state.
 
     The first two joints of the first arm move in a circle, which gives the phase; every other arm joint follows with a
     lag of its own; grippers open and close once per round; joints outside arms do not move.
@@ -43,7 +43,9 @@ class Gesture:
         self._speed[list(robot.binary_dims)] = np.inf
 
     def joints_at(self, phase: float, q: Float64) -> Float64:
-        """Return the joints [D] on the path at a phase; joints that do not take part are those of `q`."""
+        """Return the joints [D] on the path at a phase; joints that the gesture does not move have their value
+        in `q`.
+        """
         target = self._centre + self._room * np.sin(phase + self._lags)
         for arm in self._robot.arms:
             if arm.gripper is not None and arm.gripper_dim is not None:
@@ -53,17 +55,21 @@ class Gesture:
         return np.asarray(np.clip(target, self._robot.lower, self._robot.upper))
 
     def phase_of(self, q: Float64) -> float:
-        """Return the phase of joints [D] on the path; beside the path, that of the point straight towards it."""
+        """Return the phase of joints [D]; for joints off the path, that of the path's point in their direction."""
         sine, minus_cosine = ((q - self._centre) / np.maximum(self._room, 1e-9))[self._clockwork]
         return float(np.arctan2(sine, -minus_cosine))
 
     def towards(self, phase: float, q: Float64, seconds: float) -> Float64:
-        """Return the joints [D] reached from `q` within `seconds` on the way to the path's point at `phase`."""
+        """Return the joints [D] that are reached from `q` within `seconds`, on the way to the path's point at
+        `phase`.
+        """
         reach = self._speed * seconds
         return np.asarray(q + np.clip(self.joints_at(phase, q) - q, -reach, reach))
 
     def chunk(self, q: Float64, horizon: int, rate: float) -> Float32:
-        """Return rows float32 [horizon, D] that continue from joints `q` at `rate` [Hz]; the same for the same `q`."""
+        """Return rows float32 [horizon, D] at `rate` [Hz] that continue from joints `q`; they depend only on the
+        arguments.
+        """
         phase = self.phase_of(q) + _TURN * _LEAD
         rows = np.empty((horizon, self._robot.dim))
         now = np.clip(q, self._robot.lower, self._robot.upper)

@@ -1,9 +1,9 @@
 """Scripted policy that picks up the block and puts it on the plate, using only its observations.
 
-It detects block and plate in the overhead image of the request, and its progress from the joints in it. Between the
-requests of one connection it remembers its route, its row in it and the time: a leg ends when the joints have arrived,
-a gate when the measured jaws have moved, and the row advances with the time between requests, so that a chunk continues
-the previous chunk whatever the delay.
+It detects block and plate in the overhead image of the request, and finds its progress from the joints in it. Between
+the requests of one connection it remembers its route, its row in the route and the time. A leg ends when the joints
+have arrived, a gate when the measured jaws have moved. The row advances with the time between requests, so that a chunk
+continues the previous chunk whatever the delay.
 """
 
 from __future__ import annotations
@@ -51,16 +51,17 @@ Apart = Callable[["Group", Float64, Float64], Float64]
 
 
 class ScriptError(RuntimeFault):
-    """A script cannot answer a request."""
+    """Error that a script cannot answer a request."""
 
 
 @dataclass(frozen=True, slots=True)
 class Skill:
-    """Skill of the policy: `noise` [m] is one sigma of the error of the block's place in x and in y, per attempt.
+    """Deliberate imperfection of the policy.
 
-    Noise of one block edge corresponds to one radian of noise on the block's yaw. `failure_rate` is the probability
-    that in an episode the policy drops the block on the way or always grasps short of it; `seed` decides both, episode
-    by episode.
+    `noise` [m] is the standard deviation of the error of the block's place in x and in y, drawn for each attempt; noise
+    of one block edge corresponds to one radian of noise on the block's yaw. `failure_rate` is the probability that in
+    an episode the policy drops the block on the way or always grasps short of it; `seed` decides both, episode by
+    episode.
     """
 
     noise: float = 0.0
@@ -69,7 +70,7 @@ class Skill:
 
 
 class PickPlace(Script):
-    """Pick-and-place policy for all connections; episodes are counted over all of them, so that each has its own noise.
+    """Pick-and-place policy for all connections; its episodes are numbered across them, so that each has its own noise.
 
     `apart` measures how far joints are from rows; by default it compares joints.
     """
@@ -101,7 +102,7 @@ class PickPlace(Script):
         }
 
     def begin(self) -> Answer:
-        """Return the answers of a new connection."""
+        """Return the function that answers the requests of a new connection."""
         return PickPlaceEpisode(self)
 
     def next_episode_noise(self) -> EpisodeNoise:
@@ -110,7 +111,7 @@ class PickPlace(Script):
 
 
 class EpisodeNoise:
-    """Random errors of one episode: the same for the same seed and episode number."""
+    """Random errors of one episode, which depend only on the seed and the episode's number."""
 
     def __init__(self, skill: Skill, episode: int, edge: float) -> None:
         self._chance = np.random.default_rng([skill.seed, episode])
@@ -120,7 +121,7 @@ class EpisodeNoise:
         self.slip = PlannedFailure(_SHORT * (slips and lets_go >= 0.5), bool(slips and lets_go < 0.5))
 
     def perceive(self, block: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the block's place and yaw with the error of one attempt."""
+        """Return the block's place and yaw with the error of one attempt added."""
         x, y, yaw = np.array(block) + self._chance.normal(0.0, self._noise)
         return float(x), float(y), float(yaw)
 
@@ -194,7 +195,10 @@ class PickPlaceEpisode:
         self._follow_route(None)
 
     def _is_over(self, pause: float) -> bool:
-        """Return True if a new episode begins after the pause [s]: the task was finished, or nearly so, before it."""
+        """Return True if a new episode begins after the pause [s].
+
+        That is so if the pause is long, and the task was finished, or nearly so, before it.
+        """
         leaving = self._route is None or self._route.legs[self._leg].name in _LEAVING
         return leaving and pause > _PAUSED
 
@@ -213,7 +217,7 @@ class PickPlaceEpisode:
         return self._route
 
     def _distances(self, q: Float64) -> Float64:
-        """Return the distance of joints [D] from each row of the present leg [rad]."""
+        """Return the distances [rad] of joints [D] from the rows of the present leg."""
         return self._apart(self._on().legs[self._leg].rows, q)
 
     def _apart(self, rows: Float64, q: Float64) -> Float64:
@@ -222,7 +226,7 @@ class PickPlaceEpisode:
         return np.asarray(np.max([self._policy.apart(arm, rows, q) for arm in movers], axis=0))
 
     def _advance(self, q: Float64, elapsed: float) -> None:
-        """Update leg and row from the time and the joints; a finished route is dropped."""
+        """Update leg and row from the time that has passed and the joints; a finished route is dropped."""
         row = self._row + elapsed * self._policy.rate
         while self._route is not None and self._passed(q):
             left, self._leg = self._route.legs[self._leg], self._leg + 1
@@ -235,7 +239,10 @@ class PickPlaceEpisode:
             self._row = self._agreed(row, q)
 
     def _agreed(self, row: float, q: Float64) -> float:
-        """Return the row by the clock, unless the joints show that the robot was delayed or moved."""
+        """Return the row that follows from the time, unless the joints show that the robot was delayed or moved.
+
+        Then return a row near the one that matches the joints.
+        """
         route, rate = self._on(), self._policy.rate
         leg, start = route.legs[self._leg], route.starts[self._leg]
         jaw = gripper_dim(route.arm)
@@ -267,7 +274,7 @@ class PickPlaceEpisode:
         return Opening(jaws(arm)).metres(float(q[gripper_dim(arm)]))
 
     def _ahead(self, route: Route) -> Float32:
-        """Return the next rows of the route; the last one is repeated."""
+        """Return the next rows of the route; after its end, the last row is repeated."""
         wanted = round(self._row) + np.arange(self._policy.horizon)
         return route.rows[np.minimum(wanted, len(route.rows) - 1)].astype(np.float32)
 
@@ -276,7 +283,7 @@ class PickPlaceEpisode:
 
 
 def joints_apart(robot: Robot) -> Apart:
-    """Return a function for the largest distance [rad] to each row over all joints of the URDF but grippers."""
+    """Return a function that computes the largest distance [rad] to each row over the URDF's joints except grippers."""
     moving = np.concatenate([group.joint_dims[np.array(group.urdf_joints) != ""] for group in robot.groups])
 
     def apart(arm: Group, rows: Float64, q: Float64) -> Float64:
@@ -286,9 +293,9 @@ def joints_apart(robot: Robot) -> Apart:
 
 
 def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
-    """Return the distance [n] of the arm's end effector at `q` from its pose in each row [rad].
+    """Return the distance [n] of the arm's end-effector pose at joints `q` from its pose in each row [rad].
 
-    The joints may differ. A shift of _ARM metres counts as one radian.
+    Different joints with the same pose have distance 0. A shift of _ARM metres counts as one radian.
     """
     wanted, found = arm.pose(rows), arm.pose(q)
     shift = np.linalg.norm(wanted[:, :3] - found[:3], axis=1) / _ARM
@@ -297,6 +304,6 @@ def poses_apart(arm: Group, rows: Float64, q: Float64) -> Float64:
 
 
 def _differs(sight: Detection, before: Detection) -> bool:
-    """Return True if the block or the plate is detected at another place than before."""
+    """Return True if the block or the plate was detected at another place in `before`."""
     pairs = ((sight.block, before.block), (sight.plate, before.plate))
     return any(now and then and math.dist(now[:2], then[:2]) > _MOVED for now, then in pairs)

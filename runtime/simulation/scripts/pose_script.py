@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 
 class PoseScript(Script):
-    """Script with the requests of another script, joints and images; its metadata declares the format of its rows.
+    """Script that converts the joint rows of another script to poses; its requests are those of the other script.
 
-    `rate` [Hz] is that of its rows.
+    Its metadata declares the format of its rows; `rate` [Hz] is their rate.
 
     Raises:
         SetupError: If the format does not fit the robot.
@@ -41,7 +41,7 @@ class PoseScript(Script):
         }
 
     def begin(self) -> Answer:
-        """Return the answers of a new connection of the other script, converted to poses."""
+        """Return the function that answers the requests of a new connection in poses."""
         answer = self._script.begin()
 
         def posed(q: Float64, pictures: Mapping[str, UInt8], prompt: str) -> Float32:
@@ -50,9 +50,9 @@ class PoseScript(Script):
         return posed
 
     def to_poses(self, joints: Float64, q: Float64) -> Float32:
-        """Return pose rows float32 [H, width] of joint rows [H, D].
+        """Return pose rows float32 [H, width] for joint rows [H, D].
 
-        Joints that carry a declared frame are taken from `q` [D], unless the rows contain them after the poses.
+        Joints that move a declared frame are taken from `q` [D], unless the rows contain them after the poses.
         """
         vectors = np.stack([_vectors(arm, joints) for arm in self._robot.arms], axis=1)
         at = np.tile(q, (len(joints), 1))
@@ -61,7 +61,7 @@ class PoseScript(Script):
 
 
 def pose_format(assignments: Sequence[str]) -> PoseFormat:
-    """Return the pose format that "key=value" assignments describe, with values as in a deployment.
+    """Return the pose format described by texts "key=value", with values as in a deployment.
 
     Raises:
         SetupError: If an assignment is invalid; the message names it.
@@ -94,7 +94,9 @@ def _rows(pose: PoseFormat, robot: Robot) -> PoseRows:
 
 
 def _vectors(arm: Group, joints: Float64) -> Float64:
-    """Return the end-effector vectors [H, 8] of one arm for joint rows [H, D]; the gripper is 0 if there is none."""
+    """Return the end-effector vectors [H, 8] of one arm for joint rows [H, D]; without a gripper the last
+    number is 0.
+    """
     vectors = np.zeros((len(joints), EEF_WIDTH))
     vectors[:, : EEF_WIDTH - 1] = arm.pose(joints)
     if arm.gripper_dim is not None:

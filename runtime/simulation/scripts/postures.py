@@ -1,8 +1,8 @@
 """Joints of an arm for fingertips that point down above a block or a plate.
 
-Four points of every vertical path are solved by inverse kinematics, starting from a nominal posture of the arm with its
-fingers down that is searched once. It is rotated about the first joint if that is upright, else moved from place to
-place.
+Four points of every vertical path are solved by inverse kinematics. The solver starts from a nominal posture of the arm
+with its fingers down, which is searched once. The posture is rotated about the first joint if that is upright;
+otherwise it is moved from place to place.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Postures:
     """Postures of one robot at one bench; `arms` are those that can pick objects up.
 
     Raises:
-        SetupError: If no arm can; the message names the reasons.
+        SetupError: If no arm can pick objects up; the message states the reason for each.
     """
 
     def __init__(self, robot: Robot, table: Bench) -> None:
@@ -91,11 +91,11 @@ class Postures:
         short: float,
         tilts: Tilts,
     ) -> tuple[Float64 | None, Float64 | None]:
-        """Return joints [stations, D] from above down to the block, and the same for the plate.
+        """Return joints [stations, D] on the vertical path down to the block, and on the path down to the plate.
 
-        Each is None if it is not reached. The jaws grasp the pair of sides that needs the smaller rotation, else the
-        other pair. `short` [m] is the deliberate error of the place, towards the arm; `tilts` [rad] are outwards from
-        straight down, below and above.
+        Each is None if it is not reached. The jaws grasp the pair of sides that needs the smaller rotation; if that is
+        not reached, the other pair. `short` [m] is the deliberate error of the block's place, towards the arm; `tilts`
+        [rad] are outwards from straight down, at the bottom and at the top.
         """
         base = self._shoulders[arm.name]
         reach = math.dist(base, block[:2])
@@ -114,7 +114,9 @@ class Postures:
         return first
 
     def risen(self, arm: Group, q: Float64) -> Float64:
-        """Return joints [D] with the fingertips raised straight up; `q` if they are high or cannot be raised."""
+        """Return joints [D] with the fingertips raised straight up; `q` if they are high already or cannot be
+        raised.
+        """
         tip = self.tip(arm, q)
         if tip[2, 3] >= CLEAR:
             return q
@@ -127,13 +129,13 @@ class Postures:
         return q
 
     def stowed(self, arm: Group, q: Float64) -> Float64:
-        """Return joints [D] with an arm in its rest posture, its jaws unchanged."""
+        """Return joints [D] with an arm in its rest posture and its jaws as in `q`."""
         rest = q.copy()
         rest[arm.joint_dims] = self._rest[arm.joint_dims]
         return rest
 
     def rested(self, arm: Group, q: Float64) -> Float64:
-        """Return joints [D] with an arm in its rest posture, its jaws open."""
+        """Return joints [D] with an arm in its rest posture and its jaws open."""
         return opened(arm, self.stowed(arm, q))
 
     def tip(self, arm: Group, q: Float64) -> Float64:
@@ -143,7 +145,11 @@ class Postures:
     def _down(
         self, arm: Group, q: Float64, place: Place, twist: float, heights: tuple[float, float], tilts: Tilts
     ) -> Float64 | None:
-        """Return joints [stations, D] of an arm with open jaws, other joints as in q [D]; None if it cannot reach."""
+        """Return joints [stations, D] of an arm with open jaws on a vertical path to `place`; None if it cannot reach
+        it.
+
+        All other joints are those of q [D].
+        """
         bearing = self._bearing(arm, place)
         yaw = bearing + self._nominal[arm.name].across + twist
         way = np.linspace((heights[1], tilts[1]), (heights[0], tilts[0]), _STATIONS)
@@ -153,10 +159,10 @@ class Postures:
     def _descent(
         self, arm: Group, q: Float64, nominal: Nominal, stations: Sequence[DownwardTip]
     ) -> Float64 | None:
-        """Return joints [stations, D]; None if one is not reached.
+        """Return joints [stations, D] for the stations; None if one of them is not reached.
 
-        The search begins at the nominal posture rotated about an upright shoulder; if this fails, or the shoulder is
-        not upright, it follows a path from the nominal posture.
+        The search begins at the nominal posture, rotated about an upright shoulder. If this fails, or the shoulder is
+        not upright, it follows a path from the nominal posture to the first station.
         """
         start = opened(arm, q)
         start[arm.joint_dims] = nominal.joints
@@ -171,7 +177,7 @@ class Postures:
     def _solved(
         self, arm: Group, stations: Sequence[DownwardTip], seed: Float64, before: Sequence[DownwardTip] = ()
     ) -> Float64 | None:
-        """Return joints [T, D] for the stations, solved via the poses `before`; None if a station is not reached."""
+        """Return joints [T, D] for the stations, solved after the poses `before`; None if a station is not reached."""
         index = self._robot.arms.index(arm)
         frame = self._limbs[arm.name].frame(seed)
         tip = np.eye(4) if arm.tip is None else arm.tip
@@ -187,7 +193,7 @@ class Postures:
         return result.q[len(before) :] if result.reached[len(before) :, index].all() else None
 
     def _learn(self, arm: Group) -> str:
-        """Find an arm's nominal posture; return the reason if there is none, else ""."""
+        """Find and store the nominal posture of an arm; return the reason if there is none, else ""."""
         if arm.tip is None or arm.gripper is None or arm.gripper.apart is None:
             return f"{arm.name} needs fingertips and a gripper that says how far it opens (apart)"
         wanted = self._arm_places(arm)
@@ -245,7 +251,7 @@ class Postures:
         ]
 
     def _ahead(self, arm: Group) -> list[Place]:
-        """Return the first places of searches: straight ahead of the shoulder, and the middle of the area."""
+        """Return the places where searches start: straight ahead of the shoulder, and the middle of the area."""
         x_from, x_to, y_from, y_to = self._table.area
         x, y = self._shoulders[arm.name]
         ahead = (
@@ -260,18 +266,18 @@ class Postures:
 
 
 def jaws(arm: Group) -> Gripper:
-    """Return the gripper of an arm."""
+    """Return the description of an arm's gripper."""
     assert arm.gripper is not None  # arms without a gripper are excluded in _learn
     return arm.gripper
 
 
 def opened(arm: Group, q: Float64) -> Float64:
-    """Return joints [..., D] with an arm's jaws open, but short of their limit, near which safety slows them."""
+    """Return joints [..., D] with an arm's jaws open, but not up to their limit, near which safety slows them."""
     return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).open, jaws(arm).close)
 
 
 def closed(arm: Group, q: Float64) -> Float64:
-    """Return joints [..., D] with an arm's jaws closed, but short of their limit."""
+    """Return joints [..., D] with an arm's jaws closed, but not up to their limit."""
     return q.copy() if arm.gripper is None else _with_jaws(arm, q, jaws(arm).close, jaws(arm).open)
 
 

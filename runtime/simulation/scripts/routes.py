@@ -1,7 +1,7 @@
 """Routes that pick and place a block with one arm: timed legs of joint targets, with gates for the jaws between them.
 
 Between a few postures the rows are interpolated in joint space with minimum-jerk timing (Flash and Hogan 1985), so that
-planning is cheap and done once per attempt.
+planning is cheap and is done once per attempt.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ Gate = Literal["", "close", "open"]
 class Leg:
     """Part of a route: rows float64 [n, D], one per control period; a leg with a gate ends when the jaws have moved.
 
-    `others` are the arms that move instead of the route's own, to make room for it.
+    `others` are the arms that this leg moves out of the way; it is empty if the leg moves the route's own arm.
     """
 
     name: str
@@ -73,7 +73,7 @@ class PlannedFailure:
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Motion of one arm, leg after leg; the other joints do not move, or move out of the way first.
+    """Motion of one arm in legs; the other arms do not move, or move out of the way first.
 
     `rows` [N, D] are the rows of all legs, `starts` the index of each leg's first row among them.
     """
@@ -107,8 +107,8 @@ class RoutePlanner:
     ) -> Route | None:
         """Return the route from joints q [D] with the nearest arm that reaches all of it; None if no arm does.
 
-        If it comes too near to another arm or the body, another arm is tried, then routes for which other arms make
-        room; if none is clear, the route with the most clearance is returned.
+        If the route comes too near to another arm or the body, another arm is tried, then routes for which other arms
+        move out of the way. If none is clear, the route with the largest clearance is returned.
         """
         found, most = None, -math.inf
         for route in self._routes(q, block, plate, slip):
@@ -122,7 +122,7 @@ class RoutePlanner:
     def _routes(
         self, q: Float64, block: tuple[float, float, float], plate: Place, slip: PlannedFailure
     ) -> Iterator[Route]:
-        """Yield routes of all arms, the nearest first: with the others as they are, then with the others at rest."""
+        """Yield routes of all arms, the nearest first; then routes before which the other arms move to rest."""
         nearest = sorted(self._postures.arms, key=lambda arm: self._postures.distance(arm, block))
         for makes_way in (False, True):
             for arm in nearest:
@@ -136,7 +136,7 @@ class RoutePlanner:
                         yield self._begun(arm, [*before, *self._legs(arm, start, down, over, slip)])
 
     def _clear_other_arms(self, arm: Group, q: Float64) -> list[Leg]:
-        """Return the legs that move all other arms to rest, up from the table first; [] if they are at rest already."""
+        """Return the legs that move all other arms to rest, first up from the table; [] if they are at rest already."""
         others = tuple(
             other
             for other in self._robot.arms
@@ -154,20 +154,21 @@ class RoutePlanner:
         return [replace(self._leg(*way), others=others) for way in ways]
 
     def _low(self, arm: Group, q: Float64) -> bool:
-        """Return True if the fingertips are so near to the table that they have to rise before other motion."""
+        """Return True if the fingertips are so near to the table that they have to rise before any other motion."""
         return bool(self._postures.tip(arm, q)[2, 3] < 0.75 * CLEAR)
 
     def retreat(self, q: Float64, arm: Group) -> Route:
-        """Return the route that opens the jaws, rises, and moves the arm to rest, out of the camera's view."""
+        """Return the route that opens the jaws, raises the arm, and moves it to rest, out of the camera's view."""
         high = opened(arm, self._postures.risen(arm, q))
         return self._begun(
             arm, [self._leg("back off", q, high), self._leg("retreat", high, self._postures.rested(arm, q))]
         )
 
     def _legs(self, arm: Group, q: Float64, down: Float64, over: Float64, slip: PlannedFailure) -> list[Leg]:
-        """Return the legs of a route, given the stations [stations, D] above the block, `down`, and the plate, `over`.
+        """Return the legs of a route, given joints [stations, D] from the top down to the block (`down`) and plate
+        (`over`).
 
-        Both begin at the top and have open jaws.
+        Both have open jaws.
         """
         held, lowered = (closed(arm, way) for way in (down, over))
         legs = []
@@ -206,7 +207,10 @@ class RoutePlanner:
         )
 
     def _timed(self, stations: Float64, shortest: float) -> Float64:
-        """Return rows [n, D] through stations [k, D], at rest at both ends: a polynomial with minimum-jerk timing."""
+        """Return rows [n, D] on a polynomial through stations [k, D] with minimum-jerk timing, at rest at both ends.
+
+        They last at least `shortest` [s].
+        """
         marks = np.linspace(0.0, 1.0, len(stations))
         powers = np.linalg.solve(np.vander(marks, increasing=True), stations)
         way = np.abs(np.diff(stations, axis=0)).sum(axis=0)
@@ -222,6 +226,6 @@ class RoutePlanner:
 
 
 def _jaw_speed(arm: Group) -> float:
-    """Return the jaws' speed in the gripper's joint unit per second."""
+    """Return the speed of an arm's jaws, in the unit of the gripper's joint per second."""
     opening = Opening(jaws(arm))
     return abs(opening.number(_JAW_SPEED) - opening.number(0.0))

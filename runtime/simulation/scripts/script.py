@@ -17,17 +17,17 @@ Answer = Callable[[Float64, Mapping[str, UInt8], str], Float32]
 
 
 class Script(ABC):
-    """Policy without a model; `metadata` is what the server sends about it on connection."""
+    """Policy without a model, which restarts with every connection; the server sends `metadata` on connection."""
 
     metadata: Mapping[str, object]
 
     @abstractmethod
     def begin(self) -> Answer:
-        """Return a function that answers the requests of one connection, called in their order."""
+        """Return a function that answers the requests of one connection, in the order in which they arrive."""
 
 
 class WavingScript(Script):
-    """Script of a gesture around home, which depends only on the joints."""
+    """Script whose rows follow a gesture around home; they depend only on the joints."""
 
     def __init__(
         self, robot: Robot, horizon: int, rate: float, seed: int = 0, name: str | None = None

@@ -11,7 +11,7 @@ from runtime.core.clock import ClockMap, ClockStepDetector
 
 
 class RosClock:
-    """Clock map shared by all streams of a robot, so that each stream's own delay stays visible in its age.
+    """Clock map shared by all streams of a robot, so that a stream's own delay remains part of its age.
 
     Clock steps are detected per stream, because a camera may be later than joints by more than a step. After a step,
     earlier stamps cannot be compared with later stamps, and the map starts anew.
@@ -32,7 +32,7 @@ class RosClock:
         return self._map.leaps
 
     def to_monotonic(self, stream: str, stamp: float, arrival: float) -> float:
-        """Return a stamp [s] in our clock, never later than its arrival. A detected step is counted."""
+        """Return a stamp [s] on our clock, never later than its arrival; a detected clock step is counted."""
         before = self._map.restarts + self._map.leaps
         time = self._map.map(stamp, arrival, self._steps[stream])
         if self._map.restarts + self._map.leaps > before:
@@ -58,7 +58,7 @@ class Sample(Generic[Value]):
 
 @dataclass(frozen=True, slots=True)
 class Aligned(Generic[Value]):
-    """One sample of every stream, each within the window around `time`, in the senders' clock [s]."""
+    """Frame: one sample of every stream, each within the window around `time` (in the senders' clock [s])."""
 
     time: float
     samples: Mapping[str, Sample[Value]]
@@ -68,11 +68,11 @@ class Alignment(Generic[Value]):
     """Newest messages of every stream, aligned on request. Reading removes nothing, so there may be many readers.
 
     The time of a frame is the newest that all streams have reached: the smallest of their newest stamps. Each stream
-    contributes its sample nearest to that time. If such a sample is further away than `window` [s], there is no
-    frame: a reader waits instead of receiving messages of different moments.
+    contributes its sample nearest to that time. If such a sample is further away than `window` [s], there is no frame:
+    a reader then waits and does not receive samples of different times.
 
-    A stream drops samples more than `history` [s] older than its newest, and holds at most `depths[name]` (default
-    DEPTH) of them, so that one stalled stream does not let the others grow.
+    A stream drops samples more than `history` [s] older than its newest, and keeps at most `depths[name]` (default
+    DEPTH) samples, so that one stalled stream does not let the others grow.
     """
 
     def __init__(
@@ -116,10 +116,9 @@ class Alignment(Generic[Value]):
         return min(kept[-1].stamp for kept in self._samples.values())
 
     def frame(self, after: Aligned[Value] | None = None) -> Aligned[Value] | None:
-        """Return the newest frame, or None if there is none after `after`.
+        """Return the newest frame, or None if there is none that is newer than `after`, the last frame of this reader.
 
-        A frame counts as new if its time is later than that of `after`, the reader's last frame, and at least one of
-        its samples is not in `after`.
+        A frame is newer if its time is later and at least one of its samples is not in `after`.
         """
         time = self.newest_common_time()
         if time is None or (after is not None and time <= after.time):
@@ -144,7 +143,10 @@ class Alignment(Generic[Value]):
 
 
 def _nearest(kept: deque[Sample[Value]], time: float) -> Sample[Value]:
-    """Return the sample nearest to `time`, the older of two at the same distance. Searches from the newest on."""
+    """Return the sample nearest to `time`, the older of two at the same distance.
+
+    The search starts from the newest sample.
+    """
     # Stamps increase, so after the first sample that is further away all older ones are, too.
     best = kept[-1]
     for sample in reversed(kept):

@@ -40,7 +40,7 @@ class Reader(fields.Reader):
         return raw[:-1]
 
     def header(self) -> tuple[int, str]:
-        """Return the stamp [ns] and the frame."""
+        """Decode a header: return the stamp [ns] and the frame."""
         return self.stamp(self.i32(), self.u32()), self.string()
 
 

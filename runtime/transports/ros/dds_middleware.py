@@ -38,10 +38,11 @@ _POLICIES = {
 
 
 def configuration(network: str, peers: tuple[str, ...] = ()) -> str | None:
-    """Return Cyclone's configuration for a network interface (name or address); None: $CYCLONEDDS_URI applies.
+    """Return Cyclone's configuration for a network interface (name or address).
 
-    Loopback has no multicast: participants find each other by address, at the first 30 ports of the domain. This
-    finds Fast DDS nodes, and nodes of Cyclone DDS 0.10 (Jazzy) and 11 with the same configuration.
+    None if $CYCLONEDDS_URI is to apply. Loopback has no multicast: participants find each other by address, at the
+    first 30 ports of the domain. This finds Fast DDS nodes, and nodes of Cyclone DDS 0.10 (Jazzy) and 11 with the same
+    configuration.
     """
     from xml.sax.saxutils import quoteattr  # imported here: it also imports HTTP and TLS
 
@@ -69,7 +70,7 @@ def _interface(network: str) -> str:
 
 
 class _Domains:
-    """DDS domains of this process. Each has one configuration and exists while it has users."""
+    """DDS domains that this process has joined; each has one configuration and exists while it has users."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -97,7 +98,7 @@ _domains = _Domains()  # state: the library has one of each per process, whoever
 
 
 class DdsMiddleware(Middleware):
-    """DDS participant; one thread waits for all of its readers."""
+    """DDS participant, with one thread that waits for messages of all its readers."""
 
     def __init__(self, domain: int, network: str, peers: tuple[str, ...] = ()) -> None:
         """Join the domain. Raises SetupError without the package, TransportError if the network cannot be used."""
@@ -140,7 +141,7 @@ class DdsMiddleware(Middleware):
             self._thread.start()
 
     def advertise(self, topic: Topic) -> Publish:
-        """Return the publisher of the topic. It drops a message instead of waiting for a slow reader."""
+        """Return a publisher on the topic, which drops a message rather than wait for a slow reader."""
         from cyclonedds.core import DDSException
         from cyclonedds.pub import DataWriter
 
@@ -162,9 +163,10 @@ class DdsMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Return the matches from the statuses of readers and writers, or, without a match, from the discovery data.
+        """Return by topic the number of connected peers, and why another was refused, from DDS's own status.
 
-        A refusal is reported for the rest of the middleware's life, because DDS only counts refusals.
+        If a topic has no peer, the discovery data are searched for peers with another message type. A refusal is
+        reported for the rest of the middleware's life, because DDS only counts refusals.
         """
         from cyclonedds.core import DDSException
 
@@ -203,7 +205,7 @@ class DdsMiddleware(Middleware):
             _domains.leave(self._domain)
 
     def _create_endpoint(self, kind: Any, topic: Topic, life: bool) -> Any:
-        """Create a reader or writer of the topic."""
+        """Create a reader or writer (`kind`) of the topic."""
         from cyclonedds.core import DDSException
         from cyclonedds.topic import Topic as DdsTopic
 
@@ -216,7 +218,7 @@ class DdsMiddleware(Middleware):
             raise TransportError(f"{topic.name} cannot be opened: {error}") from error
 
     def _read(self) -> None:
-        """Run the reader thread. An error with one message does not end it."""
+        """Run the reader thread; an error in one message does not end it."""
         while not self._ending.is_set():
             try:
                 self._waitset.wait(_WAKE_NS)
@@ -235,7 +237,7 @@ class DdsMiddleware(Middleware):
                 deliver(payload)
 
     def _refused(self, topic: Topic, status: Any, peers: int, publishes: bool) -> str:
-        """Return why a peer of the topic was refused, "" if none was."""
+        """Return why a peer of the topic was refused, "" if no peer was."""
         other = "" if peers else self._otherwise_typed(topic, publishes)
         if other or not status.total_count:
             return other
@@ -244,9 +246,9 @@ class DdsMiddleware(Middleware):
         )
 
     def _otherwise_typed(self, topic: Topic, publishes: bool) -> str:
-        """Return a sentence about peers with a different message type, "" if there is none.
+        """Return a sentence about a peer with another message type, "" if there is none; DDS itself does not report it.
 
-        DDS itself does not report it.
+        If `publishes`, such a peer is a subscriber, otherwise a publisher.
         """
         from cyclonedds.builtin import (
             BuiltinDataReader,
@@ -265,7 +267,7 @@ class DdsMiddleware(Middleware):
 
 
 def require() -> None:
-    """Check that the package is installed in the needed version. Raises SetupError with an instruction if not."""
+    """Raise SetupError with an instruction unless the package cyclonedds is installed in the needed version."""
     try:
         importlib.import_module("runtime.transports.ros.idl")
     except ImportError as error:

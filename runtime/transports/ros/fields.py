@@ -1,6 +1,6 @@
-"""Fields of the messages used with robots, in the order that both generations of ROS share.
+"""Fields of the messages used with robots, in the order that ROS 1 and ROS 2 share.
 
-The subclasses define the encoding of numbers and strings: `cdr` for ROS 2, `packed` for ROS 1.
+The subclasses define the encoding of numbers and strings: `cdr` for ROS 2, `ros1_serialization` for ROS 1.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SECOND = 1_000_000_000
 
 
 class Reader(ABC):
-    """Decoder of one message from front to back. Raises CodecError for anything that does not fit its bytes."""
+    """Decoder of one message from front to back. Raises CodecError if the bytes do not fit the message."""
 
     SHORTEST_TEXT: int  # [bytes] of an empty string
 
@@ -39,14 +39,14 @@ class Reader(ABC):
 
     @abstractmethod
     def _text(self, raw: bytes, start: int) -> bytes:
-        """Return the content of a string without its terminator."""
+        """Return the string in `raw`, which starts at `start`, without its terminator."""
 
     @abstractmethod
     def header(self) -> tuple[int, str]:
         """Decode std_msgs/Header: the stamp [ns] and the frame."""
 
     def advance(self, size: int, alignment: int) -> int:
-        """Advance by `size` aligned bytes and return their offset."""
+        """Skip `size` bytes after the gap that `alignment` needs, and return the offset of the first of them."""
         start = self._at + self._gap(alignment)
         if size > len(self._payload) - start:
             raise CodecError(
@@ -84,7 +84,7 @@ class Reader(ABC):
         return tuple(self.string() for _ in range(count))
 
     def doubles(self, count: int | None = None) -> Float64:
-        """Decode a sequence of float64, or with `count` an array of fixed length, which has no length prefix."""
+        """Decode a sequence of float64; with `count`, an array of that fixed length, which has no length prefix."""
         count = self.u32() if count is None else count
         if count == 0:  # an empty sequence is not aligned
             return np.zeros(0)
@@ -92,12 +92,12 @@ class Reader(ABC):
         return np.frombuffer(self._payload, self._order + "f8", count, start).astype(np.float64)
 
     def octets(self) -> UInt8:
-        """Decode a sequence of uint8 as a view."""
+        """Decode a sequence of uint8; the result is a view into the message."""
         count = self.u32()
         return np.frombuffer(self._payload, np.uint8, count, self.advance(count, 1))
 
     def stamp(self, seconds: int, nanoseconds: int) -> int:
-        """Return ROS time [ns]."""
+        """Return ROS time [ns] from its two fields. Raises CodecError for a second or more in `nanoseconds`."""
         if nanoseconds >= SECOND:
             raise CodecError(f"a stamp has {nanoseconds} nanoseconds; expected less than a second")
         return seconds * SECOND + nanoseconds

@@ -1,7 +1,7 @@
-"""The four message types for DDS, under ROS 2's names; their bytes are encoded elsewhere.
+"""The four message types under ROS 2's names, as cyclonedds needs them; their bytes are encoded elsewhere.
 
-cyclonedds needs classes to announce the type of a topic, and would encode and decode them byte by byte in Python (62
-ms per picture). Their codec is therefore replaced: an object holds the bytes of one message. The module must not be
+cyclonedds needs classes to announce the type of a topic, and would encode and decode them byte by byte in Python (62 ms
+per picture). Their codec is therefore replaced: an object holds the bytes of one message. The module must not be
 imported without the package cyclonedds, nor begin with `from __future__ import annotations`, which cyclonedds cannot
 resolve.
 """
@@ -93,9 +93,9 @@ class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
 
 
 def _opaque(kind: Any) -> Any:
-    """Replace the codec of a class: its objects hold a message's bytes as `payload`.
+    """Return the class with its codec replaced, so that its objects hold a message's bytes as `payload`.
 
-    DDS would not accept a subclass.
+    The class itself is changed, because DDS would not accept a subclass.
     """
 
     def hold(self: Any, payload: bytes) -> None:

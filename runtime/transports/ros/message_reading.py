@@ -1,4 +1,4 @@
-"""Content of messages: joints by name, pictures by encoding. Doubtful messages are refused."""
+"""Content of messages: joints by name, pictures by encoding. Implausible messages are refused."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class UnusableMessage(CodecError):
 
 
 class JointOrder:
-    """Order of a message's values: brings them into the order of `part.joints`.
+    """Order of the values in a stream's messages; `read` returns them in the order of `part.joints`.
 
-    Messages with names may contain more joints, in any order. Messages without names need exactly as many values.
-    With names = "ignore" the first values are used as they come.
+    Messages with names may contain more joints, in any order. Messages without names need exactly as many values. With
+    names = "ignore" the first values are used in their order.
     """
 
     def __init__(self, part: StreamSpec, names: Names, key: str = "transport.topics.groups") -> None:
@@ -40,7 +40,8 @@ class JointOrder:
         self._order: list[int] = []
 
     def read(self, message: JointState) -> tuple[Float64, Float64 | None, Float64 | None]:
-        """Return position, velocity and effort, float64 [joints]; the last two None if the message lacks them.
+        """Return position, velocity and effort, float64 [joints]; velocity and effort are None if the message lacks
+        them.
 
         Raises UnusableMessage if the joints do not fit or a position is not finite.
         """
@@ -87,7 +88,7 @@ class JointOrder:
 
 
 def _optional_values(numbers: Float64, message: JointState, order: list[int]) -> Float64 | None:
-    """Return velocity or effort in the given order; None if the driver leaves them empty or too short."""
+    """Return velocity or effort in the given order; None if a value is not finite or their number is wrong."""
     if len(numbers) != len(message.position):
         return None
     chosen = numbers[order]
@@ -95,7 +96,10 @@ def _optional_values(numbers: Float64, message: JointState, order: list[int]) ->
 
 
 def pose(message: PoseStamped, frame: str) -> Float32:
-    """Return x, y, z [m], quaternion w, x, y, z as float32 [7] in `frame`. Raises UnusableMessage."""
+    """Return the pose as x, y, z [m], quaternion w, x, y, z; float32 [7].
+
+    Raises UnusableMessage if it is in another frame than `frame`, not finite, or its quaternion is not of unit length.
+    """
     given = message.frame.lstrip("/")
     if frame and given and given != frame:
         raise UnusableMessage("wrong_frame", f"a pose is given in {given}; expected {frame}")
@@ -109,7 +113,7 @@ def pose(message: PoseStamped, frame: str) -> Float32:
 
 
 def check_picture(message: Image | CompressedImage) -> None:
-    """Check, without decoding, that `picture` can use the message. Raises UnusableMessage."""
+    """Check, without decoding, that the function `picture` can decode the message. Raises UnusableMessage if not."""
     if isinstance(message, Image):
         _check_raw(message)
     elif _kind_of(message) is None:
@@ -169,7 +173,10 @@ def _raw(message: Image) -> UInt8:
 
 
 def _kind_of(message: CompressedImage) -> Literal["jpeg", "png"] | None:
-    """Return the kind of picture from its first bytes; `format` differs between drivers."""
+    """Return the encoding that the picture's first bytes show; None if it is neither JPEG nor PNG, or is depth.
+
+    The field `format` differs between drivers.
+    """
     if "compressedDepth" in message.format:
         return None
     start = bytes(message.data[:8])

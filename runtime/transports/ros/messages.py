@@ -70,7 +70,7 @@ PACKAGES: dict[MessageName, str] = {
 
 
 class Wire(Protocol):
-    """Codec of messages for one generation of ROS: the functions of a codec module.
+    """Codec of the messages of ROS 1 or ROS 2: the functions of a codec module.
 
     `decode` raises CodecError. Arrays of bytes in its result are views into `payload`.
     """

@@ -29,7 +29,7 @@ class Quality(Settings):
     """Number of messages that are queued for a slow reader; absent: 1 for commands, 5 for everything else."""
 
     def merged_over(self, usual: Quality) -> Quality:
-        """Return these settings, with unset keys from `usual`."""
+        """Return these settings; keys that are not set are taken from `usual`."""
         return usual.model_copy(update=self.model_dump(exclude_none=True))
 
 
@@ -49,7 +49,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """Number of connected peers of a topic, and a sentence on why another peer was refused, or ""."""
+    """Number of connected peers of a topic; `refused` is a sentence on why a further peer was refused, or ""."""
 
     peers: int
     refused: str = ""

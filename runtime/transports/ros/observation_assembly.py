@@ -1,4 +1,4 @@
-"""Observations from a robot's messages: decoded, aligned, and put in the robot's order."""
+"""Observations from a robot's messages: decoded, aligned, with joints in the robot's order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joints:
-    """Joint values of a group, or of its gripper alone, in the robot's order; float64 [joints], None if unknown."""
+    """Joint values of a group, or of its gripper alone, float64 [joints] in the robot's order; None if not measured."""
 
     position: Float64
     velocity: Float64 | None
@@ -35,14 +35,14 @@ Value: TypeAlias = Joints | Float32 | Image | CompressedImage
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StampedValue:
-    """Value of one message, with its capture time in our clock [s]."""
+    """Decoded content of one message, with its capture time on our clock [s]."""
 
     value: Value
     captured: float
 
 
 class MessageReaders:
-    """Decoders of messages for the streams of a frame. Raise UnusableMessage with the reason."""
+    """Decoders of messages for the streams of a frame. `read` raises UnusableMessage with the reason."""
 
     def __init__(self, robot: Robot, parts: tuple[StreamSpec, ...], names: Names) -> None:
         self._orders = {part.name: JointOrder(part, names) for part in parts if part.message == "JointState"}
@@ -90,7 +90,7 @@ class Assembly:
         )
 
     def newly_frozen(self, time: float) -> list[str]:
-        """Return the cameras whose messages continue while the picture stays the same for too long; each once."""
+        """Return the cameras whose messages continue while the picture has stayed the same for too long; each once."""
         return self._freshness.newly_frozen(time) if self._detect_frozen else []
 
     def _stream(self, kind: str) -> list[StreamSpec]:
@@ -111,7 +111,7 @@ class Assembly:
     def _captured(
         self, values: Mapping[str, StampedValue], pictures: Mapping[str, UInt8]
     ) -> dict[str, float]:
-        """Return the capture time by stream; the oldest message counts for joints and for poses."""
+        """Return the capture time by stream; that of "joints" and of "eef" is the one of their oldest message."""
         times = {
             "joints": min(values[p.name].captured for p in self._stream("joints") + self._stream("gripper"))
         }
@@ -125,7 +125,10 @@ class Assembly:
         return times
 
     def _vectors(self, values: Mapping[str, Value]) -> tuple[Float32, Float32 | None, Float32 | None]:
-        """Return position, velocity, effort of the whole robot [D]; the last two only if every group reports them."""
+        """Return position, velocity and effort of the whole robot [D].
+
+        Velocity and effort are None unless every group reports them.
+        """
         positions, velocities, efforts = [], [], []
         for group in self._robot.groups:
             arm = values[f"{group.name} joints"]
@@ -162,7 +165,10 @@ class Assembly:
 
 
 def _insert_gripper(arm: Float64 | None, hand: Float64 | None, place: int | None) -> Float64 | None:
-    """Return a group's values, with the gripper inserted at its index if it has a stream of its own."""
+    """Return the values of a group; if its gripper has a stream of its own, `hand` is inserted at index `place`.
+
+    None if one of them has no values.
+    """
     return arm if arm is None or hand is None or place is None else np.insert(arm, place, hand[0])
 
 

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def require() -> None:
-    """Check that this Python can import rclpy. Raises SetupError with an instruction if not."""
+    """Raise SetupError with an instruction unless this Python can import rclpy."""
     try:
         for name in ("rclpy", *(f"{package}.msg" for package in set(PACKAGES.values()))):
             importlib.import_module(name)
@@ -91,7 +91,7 @@ class RclMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Return the peers according to the ROS graph; publishers of another message type are named."""
+        """Return by topic the number of peers in the ROS graph, and why another was refused, e.g. its message type."""
         found = {}
         for name, topic in self._subscribed.items():
             wanted = f"{PACKAGES[topic.message]}/msg/{topic.message}"
@@ -135,7 +135,10 @@ def _kind(topic: Topic) -> Any:
 
 
 def _events() -> tuple[Any, Any]:
-    """Return the classes of event callbacks for subscriptions and publishers; Humble has them in another module."""
+    """Return the classes of event callbacks for subscriptions and publishers.
+
+    In ROS 2 Humble they are in another module than in later versions.
+    """
     try:
         module = importlib.import_module("rclpy.event_handler")
     except ImportError:

@@ -29,12 +29,12 @@ class Reader(fields.Reader):
         return raw
 
     def header(self) -> tuple[int, str]:
-        """Skip the publisher's count; return the stamp [ns] and the frame."""
+        """Decode a header without the publisher's count: return the stamp [ns] and the frame."""
         self.u32()
         return self.stamp(self.u32(), self.u32()), self.string()
 
     def end(self) -> None:
-        """Check that all bytes have been read: ROS 1 has no padding. Raises CodecError."""
+        """Raise CodecError unless all bytes have been read: ROS 1 has no padding."""
         left = len(self._payload) - self._at
         if left:
             raise CodecError(f"a message of {len(self._payload)} bytes has {left} behind its last field")
@@ -50,7 +50,7 @@ class Writer(fields.Writer):
         self._counted(text.encode("utf-8"))
 
     def header(self, stamp: int, frame: str) -> None:
-        """Write a count of 0, which the publisher replaces by its own, then the stamp and the frame."""
+        """Write a header: a count of 0, which the publisher replaces by its own, the stamp and the frame."""
         self._out += struct.pack("<III", 0, *divmod(stamp, SECOND))
         self.string(frame)
 

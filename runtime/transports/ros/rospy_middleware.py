@@ -1,8 +1,8 @@
 """ROS 1 topics through rospy in a child process, which is restarted when it ends or the master is replaced.
 
-A restarted master knows no nodes, and ROS 1 nodes do not register again by themselves. A new child therefore
-registers anew; other nodes that are older than the master must be restarted, too. If no master is there yet, the
-middleware waits for it and reports that meanwhile.
+A restarted master knows no nodes, and ROS 1 nodes do not register again by themselves. A new child therefore registers
+anew; other nodes that are older than the master must be restarted, too. If there is no master yet, the middleware waits
+for it and reports that it waits.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PAUSES_S = (0.2, 0.5, 1.0, 2.0)  # pauses between attempts to start it again [s
 
 
 class TcpRosMiddleware(Middleware):
-    """Middleware with one rospy node at a time; one thread reads from it and replaces it."""
+    """Middleware with one rospy node at a time; one thread reads from the node and replaces it when it ends."""
 
     def __init__(self, site: RosEnvironment, name: str) -> None:
         """Start a node in the background as soon as the master answers. Raises SetupError without rospy."""
@@ -46,7 +46,10 @@ class TcpRosMiddleware(Middleware):
         self._open(topic, deliver)
 
     def advertise(self, topic: Topic) -> Publish:
-        """Return a publisher that drops commands while the child is absent or behind: later they would be old."""
+        """Return a publisher on the topic.
+
+        It drops commands while the child is absent or does not read, because they would be old when they are sent.
+        """
         index = self._open(topic, None)
 
         def publish(payload: bytes) -> None:
@@ -61,7 +64,9 @@ class TcpRosMiddleware(Middleware):
         return publish
 
     def matches(self) -> Mapping[str, Match]:
-        """Return the peers from the child's last report, with the reason for a missing peer if it is known."""
+        """Return by topic the number of peers that the child last reported; without a peer, also the reason if it is
+        known.
+        """
         with self._lock:
             found = {}
             for index, (topic, _) in enumerate(self._topics):
@@ -104,7 +109,7 @@ class TcpRosMiddleware(Middleware):
         return RospyProcess(self._site, f"{self._name}_{uuid.uuid4().hex[:12]}")
 
     def _run(self) -> None:
-        """Run the thread: read from one child after the other."""
+        """Run the thread: read from a child until it ends, then from the next one."""
         child = self._start_child(0.0)
         while child is not None:
             self._farewell = ""
@@ -119,7 +124,7 @@ class TcpRosMiddleware(Middleware):
             child = self._start_child(_PAUSES_S[0])
 
     def _start_child(self, pause: float) -> RospyProcess | None:
-        """Start a child that opens all topics, after `pause` [s] and as many attempts as needed; None when closing."""
+        """Return a child that opens all topics, after `pause` [s] and as many attempts as needed; None when closing."""
         later = iter(_PAUSES_S)
         while not self._ending.wait(pause):
             pause = next(later, _PAUSES_S[-1])

@@ -1,8 +1,8 @@
 """Child process for rospy, which a process can start only once and which changes its logging and signals.
 
-The child is a separate program (rospy_node), run by a Python that has rospy. Two sockets connect it: a stream of
-received messages, each after a head (kind, topic, size), and packets of commands (kind, topic, creation time), which
-are sent without waiting. Control words are JSON. When the sockets close, the child ends.
+The child is a separate program (rospy_node), run by a Python that has rospy. Two sockets connect it with its parent: a
+stream of received messages, each preceded by kind, topic and size; and packets of commands (kind, topic, creation
+time), which are sent without waiting. Control words are JSON. When the sockets close, the child ends.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class RosEnvironment:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Environment variables of this process, with those that rospy reads replaced."""
+        """Environment variables for the child: those of this process, with those that rospy reads replaced."""
         kept = {
             name: value
             for name, value in os.environ.items()
@@ -57,7 +57,7 @@ class RosEnvironment:
 
 @functools.cache  # cache: to look starts a process
 def require(python: str) -> None:
-    """Check that `python` exists and has rospy; a success is cached. Raises SetupError with an instruction if not."""
+    """Raise SetupError with an instruction unless `python` exists and has rospy; a success is cached."""
     line = [python, str(_PROGRAM), json.dumps({"check": True})]
     try:
         done = subprocess.run(
@@ -108,7 +108,7 @@ class RospyProcess:
         return self._process.pid
 
     def request(self, **word: Any) -> None:
-        """Request the child to open a topic. Does nothing if the child has ended: `read_messages` then returns."""
+        """Request the child to open a topic. Does nothing if the child has ended; `read_messages` then returns."""
         with contextlib.suppress(OSError):
             self._commands.send(bytes([WORD]) + json.dumps(word).encode())
 
@@ -151,7 +151,7 @@ class RospyProcess:
             return self._process.wait()
 
     def _await_ready(self, site: RosEnvironment) -> None:
-        """Wait for the child's first control word. Raises TransportError if it did not start or found no master."""
+        """Wait until the child reports that it runs. Raises TransportError if it did not start or found no master."""
         self._telling.settimeout(_START_S)
         try:
             _, _, payload = self._next()

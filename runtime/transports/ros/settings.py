@@ -46,7 +46,7 @@ class RosSettings(Settings):
 
     @model_validator(mode="after")
     def _command_each_once(self) -> RosSettings:
-        """Check that each target is named once."""
+        """Check that no target of commands is named twice."""
         if len(set(self.commands_to)) != len(self.commands_to):
             raise ConfigurationError(
                 f"transport.commands_to = {self.commands_to}; allowed: each at most once"
@@ -55,7 +55,7 @@ class RosSettings(Settings):
 
     @property
     def acceptance_limits(self) -> AcceptanceLimits:
-        """Limits within which this deployment accepts messages."""
+        """Limits within which messages are accepted, according to these settings."""
         return AcceptanceLimits(
             self.max_skew_s,
             self.stalled_after_s,
@@ -73,7 +73,7 @@ class RosSettings(Settings):
     def streams(
         self, robot: Robot, version: Literal[1, 2]
     ) -> tuple[tuple[StreamSpec, ...], tuple[CommandTopic, ...]]:
-        """Return the subscribed streams and the command topics, those of the simulation first."""
+        """Return the subscribed streams, and the command topics with those of the simulation first."""
         plan = TopicPlan(robot, version, self.topics, self.disabled_cameras)
         parts = plan.streams(self.eef)
         chosen: list[Target] = [target for target in ("simulation", "robot") if target in self.commands_to]

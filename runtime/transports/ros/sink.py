@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class RosSink(Sink):
-    """Publisher of every command on all its topics, those of the simulation first, without waiting for a subscriber.
+    """Publisher of each command on all its topics, which waits for no subscriber; topics of the simulation come first.
 
     The `stamp` of a message is the time of the command, in ROS time, which is this machine's wall clock.
     """
@@ -55,7 +55,7 @@ class RosSink(Sink):
     def send(self, command: RobotCommand) -> None:
         """Publish one absolute target.
 
-        Raises TransportError for a wrong width, numbers that are not finite, or no poses.
+        Raises TransportError for a wrong width, numbers that are not finite, or missing poses.
         """
         if self._middleware is None:
             raise TransportError("the command topics are not advertised; connect before sending")
@@ -76,12 +76,12 @@ class RosSink(Sink):
             publish(payload)
 
     def missing_subscribers(self) -> dict[str, str]:
-        """Map command topics that have no subscriber, or a refused one, to the reason, "" if unknown."""
+        """Return the reason, "" if unknown, by command topic that has no subscriber or has refused one."""
         matches = {} if self._middleware is None else self._middleware.matches()
         return {topic: match.refused for topic, match in matches.items() if not match.peers or match.refused}
 
     def close(self) -> None:
-        """Withdraw the topics."""
+        """Close the publishers of all topics."""
         self._publish = []
         if self._middleware is not None:
             self._middleware.close()

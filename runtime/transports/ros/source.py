@@ -1,4 +1,4 @@
-"""Source of observations from a robot's topics: aligned in time, checked, with silent topics reported."""
+"""Source of observations from a robot's topics: aligned in time and checked; silent topics are reported."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ class AcceptanceLimits:
 
 
 class RosSource(Source):
-    """Source of the newest frame of aligned messages; it waits while streams are too far apart.
+    """Source of the newest frame of aligned messages; there is no frame while streams are too far apart.
 
     Messages are checked on the middleware's thread when they arrive, and faults are counted by name. Reading removes
-    nothing: this source is one reader of `alignment`, with a cursor of its own. Each reason why no frame arrives is
-    reported once as an event.
+    nothing from `alignment`; this source has a cursor of its own in it. Each reason why no frame arrives is reported
+    once as an event.
     """
 
     _cursor: Aligned[StampedValue] | None  # last delivered frame
@@ -102,7 +102,7 @@ class RosSource(Source):
         self._forget()
 
     def connect(self) -> None:
-        """Subscribe to all topics. Publishers that start later are found by themselves."""
+        """Subscribe to all topics. Publishers that start later are connected, too."""
         self.close()
         self._forget()
         self._began = self._framed_at = self._clock.now()
@@ -141,7 +141,7 @@ class RosSource(Source):
             self._middleware = None
 
     def faults(self) -> dict[str, int]:
-        """Return refused messages by reason, `stalled_<stream>`, `frozen_<camera>` and jumps of the senders' clock."""
+        """Return the number of refused messages by reason, `stalled_<stream>`, `frozen_<camera>`, and clock jumps."""
         with self._changed:
             self._notice_stalls()
             counts = dict(self._faults)
@@ -149,17 +149,20 @@ class RosSource(Source):
         return counts | {name: count for name, count in jumps.items() if count}
 
     def describe_fault(self, fault: str) -> str:
-        """Return the newest sentence about a fault."""
+        """Return a sentence about the latest occurrence of a fault."""
         with self._changed:
             return self._sentences.get(fault, "")
 
     def pop_events(self) -> list[Event]:
-        """Return why no frame arrives: silent streams with their age and peers, or streams too far apart in time."""
+        """Return events on why no frame arrives: streams are silent (with age and peers), or too far apart in time."""
         told, self._news = self._news, []
         return told
 
     def stalled(self) -> dict[str, float]:
-        """Return streams without a usable message for too long: age of the newest, or of the connection [s]."""
+        """Return by stream without a usable message for too long the age of its newest message [s].
+
+        Without any message, the age is the time since `connect`.
+        """
         now, began = self._clock.now(), self._began
         ages = {part.name: now - self._heard_at.get(part.name, began + _GRACE_S) for part in self._parts}
         return {
@@ -208,7 +211,7 @@ class RosSource(Source):
         return take
 
     def _store_message(self, part: StreamSpec, message: Message, arrived: float) -> None:
-        """Store one message; any error is counted and does not end the thread."""
+        """Decode and store one message; any error in it is counted and does not end the thread."""
         try:
             value = self._readers.read(part, message)
             stamp = self._stamp(message, arrived)
@@ -257,7 +260,7 @@ class RosSource(Source):
         self._stalled = set(now)
 
     def _report_no_frame(self) -> None:
-        """Report why no frame arrives, once per reason; nothing is reported while streams are merely delayed."""
+        """Report why no frame arrives, once per reason; streams that are only briefly delayed are not reported."""
         with self._changed:
             stalled = self.stalled()
             apart = (
@@ -298,7 +301,7 @@ class RosSource(Source):
         return {self._reason(name) for name in names}
 
     def _reason(self, name: str) -> str:
-        """Return the key under which a cause is reported once: a stream's silence, or the fault of its messages."""
+        """Return the key under which a stream's silence is reported once; it includes the fault of refused messages."""
         return f"{name}: {self._refusals.get(name, ('', ''))[0]}"
 
     def _silence(self, name: str, age: float, match: Match) -> str:
@@ -328,7 +331,7 @@ class RosSource(Source):
 def subscriptions(
     parts: tuple[StreamSpec, ...], quality: Callable[[str], Quality]
 ) -> tuple[Subscription, ...]:
-    """Group the streams into one subscription per topic: several groups may share one, e.g. /joint_states.
+    """Return one subscription per topic, with all streams in its messages: groups may share one, e.g. /joint_states.
 
     Raises ConfigurationError if the streams of one topic need different message types.
     """

@@ -1,4 +1,4 @@
-"""Topics of a deployment: those of the robot's description, unless the deployment names others."""
+"""Topics of a deployment: those in the robot's description, unless the deployment names others."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Topics(Settings):
 class StreamSpec:
     """One stream of a frame: its kind, its group or camera key, and its topic.
 
-    `joints` are the names of the wanted values in the message, in the group's order.
+    `joints` are the names in the message of the values to read, in the group's order.
     """
 
     kind: Literal["joints", "gripper", "eef", "camera"]
@@ -70,7 +70,7 @@ class StreamSpec:
 
 @dataclass(frozen=True, slots=True)
 class CommandTopic:
-    """Command topic: the dimensions of the robot's vector that are published there, under these joint names.
+    """Topic for commands, with the dimensions `dims` of the robot's vector that it carries and their joint names.
 
     For a pose, `arm` is the arm's index among the robot's arms, and `frame` is the frame of the pose.
     """
@@ -97,7 +97,7 @@ class TopicPlan:
             self._check_joints(group)
 
     def streams(self, eef: bool) -> tuple[StreamSpec, ...]:
-        """Return all streams of a frame, with poses if `eef`."""
+        """Return all streams of a frame; if `eef`, with those of measured poses."""
         made = [self._camera(camera) for camera in self.cameras]
         for group in self._robot.groups:
             made += self._state(group)
@@ -107,7 +107,10 @@ class TopicPlan:
         return tuple(made)
 
     def command_topics(self, targets: Sequence[Target], eef: bool) -> tuple[CommandTopic, ...]:
-        """Return the command topics in the order of the targets, with poses if `eef`; one message per topic."""
+        """Return the command topics, which carry poses if `eef`, in the order of the targets.
+
+        Targets or groups with the same topic share one message.
+        """
         merged: dict[str, CommandTopic] = {}
         for target in targets:
             for group in self._robot.groups:
@@ -155,9 +158,10 @@ class TopicPlan:
     def _joint_commands(
         self, group: Group, names: tuple[str, ...], dims: tuple[int, ...], posed: bool
     ) -> Iterator[CommandTopic]:
-        """Yield the command topics of joints, with a separate gripper topic if there is one.
+        """Yield the command topics for the joints of a group: one for all, or one for the arm and one for the gripper.
 
-        If the arm is commanded by poses (`posed`), a gripper topic is enough.
+        If the arm is commanded by poses (`posed`), a gripper topic is enough. Raises: ConfigurationError if a joint has
+        no topic.
         """
         apart = self._topic(group, "gripper_command")
         index = None if group.gripper is None else group.gripper.index
@@ -183,7 +187,7 @@ class TopicPlan:
             )
 
     def _topic(self, group: Group, field: str) -> str:
-        """Return the topic, "" if there is none."""
+        """Return the group's topic in the setting `field`, "" if it has none."""
         given = getattr(self._given.groups.get(group.name), field, None)
         if given is None and self._own is not None:
             given = getattr(self._own.groups.get(group.name), field, None)
@@ -200,7 +204,10 @@ class TopicPlan:
 
 
 def _merged(before: CommandTopic | None, outlet: CommandTopic) -> CommandTopic:
-    """Merge two command topics into one message: groups may share a topic if their joint names differ."""
+    """Return a command topic with the joints of both, because groups may share a topic if their joint names differ.
+
+    Raises: ConfigurationError if they cannot share it.
+    """
     if before is None:
         return outlet
     joints = before.joints + outlet.joints

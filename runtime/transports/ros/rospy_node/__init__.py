@@ -1,1 +1,1 @@
-"""Program for another Python, run by its path and never imported."""
+"""Program that another Python runs by its path; it is never imported."""

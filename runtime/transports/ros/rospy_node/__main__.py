@@ -48,9 +48,10 @@ class _Bounded(xmlrpc.client.Transport):
 
 
 def call_xmlrpc(address: str, method: str, *arguments: Any, default: Any = None) -> Any:
-    """Call a method of the master or a node; return `default`, if given, when the call reports failure.
+    """Call a method of the master or a node and return its result.
 
-    Raises NoXmlRpcAnswer.
+    If the call reports failure, return `default`, or raise NoXmlRpcAnswer without a `default`. Raises NoXmlRpcAnswer if
+    there is no answer.
     """
     try:
         with xmlrpc.client.ServerProxy(address, transport=_Bounded()) as proxy:
@@ -74,7 +75,7 @@ class Parent:
         self._lock = threading.Lock()
 
     def message(self, index: int, payload: bytes) -> None:
-        """Send a message; waits while the parent is behind, so that nothing accumulates here."""
+        """Send a message; block while the parent is slow, so that no messages accumulate here."""
         self._send(HEAD.pack(MESSAGE, index, len(payload)), payload)
 
     def send_word(self, **fields: Any) -> None:
@@ -107,7 +108,7 @@ class WarningForwarder(logging.Handler):
 
 
 class Topics:
-    """Subscribed and advertised topics, by the parent's indices."""
+    """Subscribed and advertised topics, numbered as by the parent."""
 
     def __init__(self, parent: Parent) -> None:
         self._parent = parent
@@ -134,7 +135,7 @@ class Topics:
         self._counts[index] = 0
 
     def publish(self, index: int, payload: bytes) -> None:
-        """Publish a message, with the count in its header that rospy would write."""
+        """Publish a message with the sequence number in its header that rospy would write."""
         self._counts[index] = (self._counts[index] + 1) % (1 << 32)
         _, made, publisher = self.open[index]
         message = made()
@@ -145,7 +146,7 @@ class Topics:
         return index in self._counts
 
     def peers(self, index: int) -> int:
-        """Return the number of connected peers, without refused and still connecting peers."""
+        """Return the number of connected peers; refused peers and those that are still connecting do not count."""
         opened = self.open[index][2]
         if opened is None:
             return 0
@@ -154,7 +155,7 @@ class Topics:
 
 
 def raw(kind: str) -> Any:
-    """Create a rospy class for messages that stay bytes, with the type and checksum of `kind`."""
+    """Return a rospy message class whose messages stay encoded, with the type and checksum of `kind`."""
     import importlib
 
     import rospy
@@ -212,7 +213,7 @@ class PeerMonitor:
             os._exit(0)
 
     def _explain(self) -> None:
-        """Record for each topic without a peer why the nodes known to the master are not connected."""
+        """Store by topic without a peer why the nodes that the master lists for it are not connected."""
         lonely = [index for index in list(self._topics.open) if not self._topics.peers(index)]
         self._refused = {}
         if not lonely or self._trouble:
@@ -230,7 +231,9 @@ class PeerMonitor:
                     self._refused[index] = self._absence(index, others[0], spoken)
 
     def _absence(self, index: int, node: str, spoken: bool) -> str:
-        """Return why a node that the master lists for the topic is not connected."""
+        """Return why `node`, which the master lists for the topic, is not connected; `spoken`: this process publishes
+        it.
+        """
         name, made, _ = self._topics.open[index]
         verb = "subscribes to" if spoken else "publishes"
         try:
@@ -311,7 +314,7 @@ def start_node(options: dict[str, Any], parent: Parent) -> None:
 
 
 def shut_down() -> None:
-    """Deregister from the master, and end even if it does not answer."""
+    """Deregister from the master and end the process, even if the master does not answer."""
     import rospy
 
     ending = threading.Thread(target=rospy.signal_shutdown, args=("the parent has ended",), daemon=True)
@@ -321,7 +324,7 @@ def shut_down() -> None:
 
 
 def main() -> None:
-    """Run for the parent, or with the option "check" only test the imports."""
+    """Run as a child of the parent process; with the option "check", only test the imports."""
     for kind in ("sensor_msgs/JointState", "geometry_msgs/PoseStamped"):
         raw(kind)
     options = json.loads(sys.argv[1])
