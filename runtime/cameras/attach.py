@@ -22,11 +22,11 @@ def check(cameras: Mapping[str, Any], robot: Robot) -> None:
 
     Raises ConfigurationError.
     """
-    known = [camera.key for camera in robot.cameras]
+    keys = [camera.key for camera in robot.cameras]
     for key in cameras:
-        if key not in known:
+        if key not in keys:
             raise ConfigurationError(
-                f"cameras.{key}: {robot.name} has no such camera; allowed: {', '.join(known) or 'none'}"
+                f"cameras.{key}: {robot.name} has no such camera; allowed: {', '.join(keys) or 'none'}"
             )
         _address(key, cameras[key])
 
@@ -39,8 +39,8 @@ def attach_cameras(source: Source, cameras: Mapping[str, Any], clock: Clock) -> 
     if not cameras:
         return source
     virtual = isinstance(clock, VirtualClock)
-    made = [_camera(key, settings, clock, virtual) for key, settings in cameras.items()]
-    return SourceWithCameras(source, made, clock)
+    opened = [_camera(key, settings, clock, virtual) for key, settings in cameras.items()]
+    return SourceWithCameras(source, opened, clock)
 
 
 def _camera(key: str, settings: CameraSettings, clock: Clock, virtual: bool) -> Camera:

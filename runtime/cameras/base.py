@@ -143,7 +143,7 @@ def describe_camera_problems(
     """
     chosen = cameras if keys is None else [key for key in keys if key in cameras]
     return [
-        NOT_LIVE(camera=key, source=told["source"], condition=told["condition"], why=told["why"])
+        NOT_LIVE(camera=key, source=health["source"], condition=health["condition"], why=health["why"])
         for key in chosen
-        if (told := cameras[key])["condition"] != CameraCondition.LIVE
+        if (health := cameras[key])["condition"] != CameraCondition.LIVE
     ]

@@ -51,11 +51,11 @@ class FilePlayer:
         """
         if self._feed is None:
             self._rewind(now)
-        shown = None
+        frame = None
         while not self.over and now + _EARLY_S >= self.due:
-            shown = CapturedImage(self._shape(self._next.picture), min(self.due, now), now)
+            frame = CapturedImage(self._shape(self._next.picture), min(self.due, now), now)
             self._advance(now)
-        return shown
+        return frame
 
     def close(self) -> None:
         """Close the file."""
@@ -178,14 +178,14 @@ class FileCamera(Camera):
         A file that breaks while it plays remains lost until a run begins or ends; otherwise it would restart by itself.
         """
         with self._lock:
-            asked, self._asked = self._asked, None
+            requested, self._asked = self._asked, None
             broken = self._health.condition is CameraCondition.LOST
-        if broken and asked is None:
+        if broken and requested is None:
             return
         try:
             now = self._clock.now()
-            if asked is not None:
-                asked(now)
+            if requested is not None:
+                requested(now)
             shot = self._player.frame_at(now)
         except CameraError as error:
             self._fail(str(error))
@@ -202,13 +202,13 @@ class FileCamera(Camera):
         elif shot is not None:
             self._set_condition(CameraCondition.LIVE)
 
-    def _fail(self, why: str) -> None:
+    def _fail(self, reason: str) -> None:
         self._player.close()
-        self._set_condition(CameraCondition.LOST if self._newest else CameraCondition.OPENING, why)
+        self._set_condition(CameraCondition.LOST if self._newest else CameraCondition.OPENING, reason)
 
-    def _set_condition(self, condition: CameraCondition, why: str = "") -> None:
+    def _set_condition(self, condition: CameraCondition, reason: str = "") -> None:
         with self._lock:
             before = self._health
-            if (condition, why) != (before.condition, before.why):
+            if (condition, reason) != (before.condition, before.why):
                 losses = before.losses + (condition is CameraCondition.LOST)
-                self._health = CameraHealth(condition, self._clock.now(), why, losses, failed=bool(why))
+                self._health = CameraHealth(condition, self._clock.now(), reason, losses, failed=bool(reason))

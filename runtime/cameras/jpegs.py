@@ -56,8 +56,8 @@ class Jpegs:
     @property
     def stated(self) -> str:
         """Content type of the first part, "" if it has none."""
-        found = _TYPE.search(self._head)
-        return "" if found is None else found[1].decode("latin-1").strip()
+        match = _TYPE.search(self._head)
+        return "" if match is None else match[1].decode("latin-1").strip()
 
     def _whole(self) -> bytes | None:
         """Return the next picture; None until its end has arrived."""

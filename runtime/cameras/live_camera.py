@@ -101,8 +101,8 @@ class LiveCamera(Camera):
             and newest
             and self._clock.now() - newest.arrived > allowed
         ):
-            why = f"no picture for over {allowed:g} s, and reading it does not return"
-            return CameraHealth(CameraCondition.LOST, newest.arrived, why, health.losses + 1, failed=True)
+            reason = f"no picture for over {allowed:g} s, and reading it does not return"
+            return CameraHealth(CameraCondition.LOST, newest.arrived, reason, health.losses + 1, failed=True)
         return health
 
     def faults(self) -> dict[str, int]:
@@ -158,11 +158,11 @@ class LiveCamera(Camera):
             if self._health.condition is not CameraCondition.LIVE:
                 self._health = CameraHealth(CameraCondition.LIVE, shot.arrived, losses=self._health.losses)
 
-    def _set_lost(self, why: str) -> None:
+    def _set_lost(self, reason: str) -> None:
         now = self._clock.now()
         self._back_off.record_failure(now)
         with self._lock:
             before, lost = self._health, CameraCondition.LOST if self._newest else CameraCondition.OPENING
             since = before.since if before.condition is lost else now
             losses = before.losses + (before.condition is CameraCondition.LIVE)
-            self._health = CameraHealth(lost, since, why, losses, failed=True)
+            self._health = CameraHealth(lost, since, reason, losses, failed=True)

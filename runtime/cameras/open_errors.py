@@ -85,8 +85,8 @@ def _device(error: Exception, address: Address) -> str:
     """Return one clause about a local device that cannot be opened."""
     number = getattr(error, "errno", None)
     if isinstance(error, FileNotFoundError):
-        others = ", ".join(sorted(map(str, Path("/dev").glob("video*"))))
-        return f"there is no such device; this machine has {others or 'no /dev/video*'}"
+        devices = ", ".join(sorted(map(str, Path("/dev").glob("video*"))))
+        return f"there is no such device; this machine has {devices or 'no /dev/video*'}"
     if isinstance(error, PermissionError):
         return "this user may not open it: is it in the group video?"
     if number == errno.EBUSY:
@@ -94,8 +94,8 @@ def _device(error: Exception, address: Address) -> str:
     if number in (errno.ENOTTY, errno.ENODEV, errno.ENXIO):
         return "it is no camera"
     if number == errno.EINVAL:
-        asked = ", ".join(f"{key} = {value}" for key, value in address.options.items())
-        return f"it cannot do what was requested ({asked or 'nothing in particular'})"
+        requested = ", ".join(f"{key} = {value}" for key, value in address.options.items())
+        return f"it cannot do what was requested ({requested or 'nothing in particular'})"
     return f"it cannot be read: {getattr(error, 'strerror', '') or type(error).__name__}"
 
 
@@ -107,10 +107,10 @@ def _no_video(error: Exception, address: Address) -> str:
     if parts.scheme in ("rtsp", "rtsps"):
         return "the server there is not an RTSP server with a video"
     if parts.scheme in ("http", "https"):
-        given = _content_type(address.shown)
-        if given.startswith("multipart/"):
+        content_type = _content_type(address.shown)
+        if content_type.startswith("multipart/"):
             return "its stream ends before the first picture"
-        return f"no MJPEG stream: it answers with {given or 'something else'}, not multipart/x-mixed-replace"
+        return f"no MJPEG stream: it answers with {content_type or 'something else'}, not multipart/x-mixed-replace"
     return f"not a video: {getattr(error, 'strerror', '') or type(error).__name__}"
 
 

@@ -84,9 +84,9 @@ class VideoStream:
             ) from None
         videos = self._container.streams.video
         if not videos:
-            others = "".join(f", but {kind}" for kind in sorted({s.type for s in self._container.streams}))
+            kinds = "".join(f", but {kind}" for kind in sorted({s.type for s in self._container.streams}))
             self._container.close()
-            raise CameraError(f"it has no video{others}")
+            raise CameraError(f"it has no video{kinds}")
         try:
             bound(self._container)
         except TooLargeError as error:

@@ -74,16 +74,16 @@ class CollectionSettings(Settings):
 
     def primary_camera_of(self, cameras: tuple[str, ...]) -> str:
         """Return the key of the camera that represents an episode; "" without cameras."""
-        kept = self.cameras or list(cameras)
-        return self.primary_camera or (kept[0] if kept else "")
+        recorded = self.cameras or list(cameras)
+        return self.primary_camera or (recorded[0] if recorded else "")
 
     def manifest_entry(self, cameras: tuple[str, ...]) -> dict[str, Any]:
         """Return these settings as a manifest has them; `cameras` are the station's."""
-        kept = [key for key in cameras if self.cameras is None or key in self.cameras]
+        recorded = [key for key in cameras if self.cameras is None or key in self.cameras]
         return {
             **self.model_dump(mode="json", exclude={"leader", "max_age_s"}),
             "leader": "" if self.leader is None else self.leader.kind,
-            "cameras": kept,
+            "cameras": recorded,
             "primary_camera": self.primary_camera_of(cameras),
         }
 
@@ -97,8 +97,8 @@ def check(settings: CollectionSettings | None, cameras: tuple[str, ...]) -> None
         raise ConfigurationError(
             f"collection.cameras: {', '.join(unknown)} are no cameras of this station; allowed: {', '.join(cameras)}"
         )
-    kept = settings.cameras or list(cameras)
-    if settings.primary_camera is not None and settings.primary_camera not in kept:
+    recorded = settings.cameras or list(cameras)
+    if settings.primary_camera is not None and settings.primary_camera not in recorded:
         raise ConfigurationError(
-            f"collection.primary_camera = {settings.primary_camera!r}; allowed: {', '.join(kept)}"
+            f"collection.primary_camera = {settings.primary_camera!r}; allowed: {', '.join(recorded)}"
         )

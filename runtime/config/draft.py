@@ -49,8 +49,8 @@ class Entry:
         try:
             return int(typed) if self.type == "whole" else float(typed)
         except ValueError:
-            what = "a whole number" if self.type == "whole" else "a number"
-            raise ConfigurationError(f"{self.key} = {typed!r:.80}; allowed: {what}") from None
+            expected = "a whole number" if self.type == "whole" else "a number"
+            raise ConfigurationError(f"{self.key} = {typed!r:.80}; allowed: {expected}") from None
 
 
 def kinds(part: str) -> dict[str, str]:
@@ -66,20 +66,20 @@ def entries(part: str, kind: str) -> tuple[Entry, ...]:
 
     Raises ConfigurationError, which lists the known kinds.
     """
-    known = variants(PACKAGES[part])
-    if kind not in known:
-        raise ConfigurationError(f"{part}.kind = {kind!r:.40}; allowed: {', '.join(known)}")
-    return tuple(_entries(known[kind].Config))
+    kinds = variants(PACKAGES[part])
+    if kind not in kinds:
+        raise ConfigurationError(f"{part}.kind = {kind!r:.40}; allowed: {', '.join(kinds)}")
+    return tuple(_entries(kinds[kind].Config))
 
 
 def table(part: str, kind: str, typed: Mapping[str, str]) -> dict[str, Any]:
     """Return the table of a part with the values in `typed`, without keys that are empty or equal to their default."""
-    found: dict[str, Any] = {"kind": kind}
+    values: dict[str, Any] = {"kind": kind}
     for entry in entries(part, kind):
-        given = typed.get(entry.key, "").strip()
-        if given and given != entry.default:
-            found[entry.key] = entry.value(given)
-    return found
+        text = typed.get(entry.key, "").strip()
+        if text and text != entry.default:
+            values[entry.key] = entry.value(text)
+    return values
 
 
 def text_of(tree: Mapping[str, Any], comments: Sequence[str]) -> str:

@@ -142,8 +142,8 @@ def meaning(model: type[BaseModel], name: str, field: FieldInfo) -> str:
     contains.
     """
     for owner in model.__mro__:
-        if name in inspect.get_annotations(owner) and (said := _key_docstrings(owner).get(name)):
-            return " ".join(said.split())
+        if name in inspect.get_annotations(owner) and (text := _key_docstrings(owner).get(name)):
+            return " ".join(text.split())
     models = [model for _, model in _models(name, field.annotation)]
     return first_line(models[0]) if len(models) == 1 else "One of the kinds below." if models else ""
 
@@ -157,13 +157,13 @@ def _key_docstrings(model: type) -> dict[str, str]:
     (table,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(table, ast.ClassDef)
     return {
-        key.target.id: said.value.value
-        for key, said in itertools.pairwise(table.body)
+        key.target.id: docstring.value.value
+        for key, docstring in itertools.pairwise(table.body)
         if isinstance(key, ast.AnnAssign)
         and isinstance(key.target, ast.Name)
-        and isinstance(said, ast.Expr)
-        and isinstance(said.value, ast.Constant)
-        and isinstance(said.value.value, str)
+        and isinstance(docstring, ast.Expr)
+        and isinstance(docstring.value, ast.Constant)
+        and isinstance(docstring.value.value, str)
     }
 
 

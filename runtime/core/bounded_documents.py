@@ -42,8 +42,8 @@ def parse_toml(text: str, what: str, largest: int = MAX_BYTES) -> dict[str, Any]
     """
     _require_small(text, what, largest)
     _require_flat(text, what, _TOML)
-    found: dict[str, Any] = _parsed(tomllib.loads, text, what, "TOML")
-    return found
+    document: dict[str, Any] = _parsed(tomllib.loads, text, what, "TOML")
+    return document
 
 
 def load_toml(path: Path, what: str) -> dict[str, Any]:
@@ -53,11 +53,11 @@ def load_toml(path: Path, what: str) -> dict[str, Any]:
         UnreadableDocument: it is no regular file, or as in `parse_toml`; `what` is its name in the message.
         OSError: the file cannot be read.
     """
-    found = path.stat()
-    if not stat.S_ISREG(found.st_mode):
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
         raise UnreadableDocument(f"{what}: is no file")
-    if found.st_size > MAX_BYTES:
-        raise UnreadableDocument(f"{what}: {found.st_size} bytes; allowed: at most {MAX_BYTES}")
+    if status.st_size > MAX_BYTES:
+        raise UnreadableDocument(f"{what}: {status.st_size} bytes; allowed: at most {MAX_BYTES}")
     try:
         return parse_toml(path.read_text("utf-8"), what)
     except UnicodeDecodeError as error:

@@ -59,9 +59,9 @@ def restart_without_web_secrets() -> None:
 
     Otherwise they could be read in /proc during its whole life, and every child would inherit them.
     """
-    kept = without_web_secrets(os.environ)
-    if len(kept) < len(os.environ):
-        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], kept)
+    environment = without_web_secrets(os.environ)
+    if len(environment) < len(os.environ):
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)
 
 
 def read_secret(key: str, name: str) -> str:

@@ -45,7 +45,7 @@ def _git(root: Path, *arguments: str) -> str | None:
     """
     plain = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             # The runtime may run as another user (root, for its scheduling class) than the owner of the
             # checkout.
             ("git", "-c", f"safe.directory={root}", "-C", str(root), *arguments),
@@ -57,4 +57,4 @@ def _git(root: Path, *arguments: str) -> str | None:
         )
     except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
         return None
-    return done.stdout.rstrip("\n")
+    return completed.stdout.rstrip("\n")

@@ -29,12 +29,12 @@ def find_host_references(table: BaseModel, prefix: str = "") -> Iterator[tuple[s
         if isinstance(value, BaseModel):
             yield from find_host_references(value, f"{prefix}{key}.")
         elif isinstance(value, str):
-            found = [
+            references = [
                 mark
                 for mark in (*field.metadata, *_marks(field.annotation))
                 if isinstance(mark, HostReference)
             ]
-            yield from ((prefix + key, mark, value) for mark in found)
+            yield from ((prefix + key, mark, value) for mark in references)
 
 
 def _marks(annotation: Any) -> Iterator[Any]:

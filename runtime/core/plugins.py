@@ -75,8 +75,8 @@ class KindUnion:
     @classmethod
     def config(cls, kind: str) -> type[BaseModel]:
         """Return the model of the tables of kind `kind`."""
-        found: type[BaseModel] = variants(cls.package)[kind].Config
-        return found
+        config: type[BaseModel] = variants(cls.package)[kind].Config
+        return config
 
     @classmethod
     def configs(cls) -> tuple[type[BaseModel], ...]:
@@ -101,9 +101,9 @@ class KindUnion:
             raise PydanticKnownError("model_attributes_type")
         if cls.package in (info.context or {}).get("unread", ()):
             return UnreadSection.model_validate(table)
-        kind, known = table.get("kind"), variants(cls.package)
-        if not isinstance(kind, str) or kind not in known:
-            tags = ", ".join(map(repr, known))
+        kind, kinds = table.get("kind"), variants(cls.package)
+        if not isinstance(kind, str) or kind not in kinds:
+            tags = ", ".join(map(repr, kinds))
             context = {"discriminator": "'kind'", "tag": str(kind), "expected_tags": tags}
             raise PydanticKnownError("union_tag_invalid", context)
         return cls.config(kind).model_validate(table)

@@ -56,14 +56,14 @@ class PoseFormat(Settings):
         return self
 
     def __str__(self) -> str:
-        words: list[str] = [self.orientation]
-        words += [self.euler_order] if self.orientation == "euler" else []
-        words += [f"of {self.sixd}"] if self.orientation == "6d" else []
-        words += ["in degrees"] if self.degrees else []
-        words += [] if self.gripper else ["without gripper"]
-        words += [f"in {self.frame}"] if self.frame else []
-        words += [f"with {', '.join(self.groups)}"] if self.groups else []
-        return " ".join(words)
+        parts: list[str] = [self.orientation]
+        parts += [self.euler_order] if self.orientation == "euler" else []
+        parts += [f"of {self.sixd}"] if self.orientation == "6d" else []
+        parts += ["in degrees"] if self.degrees else []
+        parts += [] if self.gripper else ["without gripper"]
+        parts += [f"in {self.frame}"] if self.frame else []
+        parts += [f"with {', '.join(self.groups)}"] if self.groups else []
+        return " ".join(parts)
 
 
 CANONICAL = PoseFormat()
@@ -71,8 +71,8 @@ CANONICAL = PoseFormat()
 
 def reject_pose_format(pose: PoseFormat, key: str) -> None:
     """Raise ConfigurationError if a pose format is declared for the space "joint", which has no poses."""
-    given = pose.model_dump(exclude_defaults=True)
-    if given:
+    changed = pose.model_dump(exclude_defaults=True)
+    if changed:
         raise ConfigurationError(
-            f'{key} = {given}, but the space it is for is "joint"; allowed: no format, or the space "eef"'
+            f'{key} = {changed}, but the space it is for is "joint"; allowed: no format, or the space "eef"'
         )

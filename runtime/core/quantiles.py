@@ -15,9 +15,9 @@ def quantiles(figures: Float64, fractions: Sequence[float]) -> list[float]:
     It is many times faster.
     """
     ordered = np.sort(figures)
-    found, last = [], len(ordered) - 1
+    values, last = [], len(ordered) - 1
     for fraction in fractions:
         below = int(fraction * last)
         low, high = float(ordered[below]), float(ordered[min(below + 1, last)])
-        found.append(low + (fraction * last - below) * (high - low))
-    return found
+        values.append(low + (fraction * last - below) * (high - low))
+    return values

@@ -126,12 +126,12 @@ def _fifo(priority: int, below: int = 0) -> str:
     The priority is `below` less than that of a process that requests `priority` itself.
     """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    for wanted in (priority - below, min(priority, limit) - below):
+    for candidate in (priority - below, min(priority, limit) - below):
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted))
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(candidate))
         except OSError:  # not permitted, or an invalid priority: try the next best
             continue
-        return f"FIFO {wanted}"
+        return f"FIFO {candidate}"
     return ""
 
 

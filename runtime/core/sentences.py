@@ -34,10 +34,12 @@ class Sentence(str):
     depth: int  # 1 if no argument is a sentence
 
     def __new__(cls, text: str, id: str, arguments: Mapping[str, Argument]) -> Sentence:
-        made = super().__new__(cls, text)
-        made.id, made.arguments = id, arguments
-        made.depth = 1 + max((of.depth for of in arguments.values() if isinstance(of, Sentence)), default=0)
-        return made
+        sentence = super().__new__(cls, text)
+        sentence.id, sentence.arguments = id, arguments
+        sentence.depth = 1 + max(
+            (of.depth for of in arguments.values() if isinstance(of, Sentence)), default=0
+        )
+        return sentence
 
     def __str__(self) -> str:
         return self  # so that str() of an exception is the original Sentence
@@ -73,8 +75,8 @@ class Pattern:
             raise TypeError(
                 f"sentence {self.id}: arguments {sorted(arguments)}, expected {sorted(self.names)}"
             )
-        told = {name: _argument(value) for name, value in arguments.items()}
-        return Sentence(self.english.format(**arguments), self.id, told)
+        texts = {name: _argument(value) for name, value in arguments.items()}
+        return Sentence(self.english.format(**arguments), self.id, texts)
 
 
 def fixed(id: str, english: str) -> Sentence:
@@ -185,8 +187,8 @@ def from_wire(text: str, id: object, arguments: object, depth: int = 0) -> str:
 def checked(said: object) -> dict[str, dict[str, Any]]:
     """Return ids and arguments by path, as another process sent them in `said`, without invalid entries."""
     said = said if isinstance(said, Mapping) else {}
-    found = {path: _checked(one) for path, one in said.items() if isinstance(one, Mapping)}
-    return {str(path): one for path, one in found.items() if one}
+    sentences = {path: _checked(entry) for path, entry in said.items() if isinstance(entry, Mapping)}
+    return {str(path): entry for path, entry in sentences.items() if entry}
 
 
 def checked_row(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -253,7 +255,7 @@ _JOINED = {
 
 def series(texts: Sequence[str], mark: Literal[";", ","] = ";") -> str:
     """Join texts to one sentence with `mark` between them; "" if there are none."""
-    made, *others = reversed(texts or [""])
-    for text in others:
-        made = _JOINED[mark](first=text, rest=made)
-    return made
+    joined, *earlier = reversed(texts or [""])
+    for text in earlier:
+        joined = _JOINED[mark](first=text, rest=joined)
+    return joined

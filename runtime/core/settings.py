@@ -57,16 +57,16 @@ def _sentence(
         allowed = _allowed(key[:-1], tree, root)
         near = difflib.get_close_matches(key[-1], allowed, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
-        given = "" if _SECRET.search(key[-1]) else f" = {error['input']!r:.200}"
+        value = "" if _SECRET.search(key[-1]) else f" = {error['input']!r:.200}"
         if (instead := getattr(root, "GONE", {}).get(name)) is not None:
-            return f"{where}: {name}{given}: {instead}"
-        return f"{where}: {name}{given}: unknown key{hint}; allowed here: {', '.join(allowed)}"
+            return f"{where}: {name}{value}: {instead}"
+        return f"{where}: {name}{value}: unknown key{hint}; allowed here: {', '.join(allowed)}"
     if kind == "missing":
         return f"{where}: {name} is missing and has no default"
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         where = origin.get((*key, "kind"), where)
-        given = f"= {error['input']['kind']!r:.200}" if "kind" in error["input"] else "is missing"
-        return f"{where}: {name}.kind {given}: must be one of {error['ctx']['expected_tags']}"
+        value = f"= {error['input']['kind']!r:.200}" if "kind" in error["input"] else "is missing"
+        return f"{where}: {name}.kind {value}: must be one of {error['ctx']['expected_tags']}"
     if kind == "secret":
         return f"{where}: {name}: {error['msg']}"
     if kind in ("model_type", "model_attributes_type", "dict_type"):
@@ -105,8 +105,8 @@ def _tables(key: Key, tree: Mapping[str, Any], root: type[BaseModel]) -> list[ty
         annotations = [
             chosen
             for annotation in annotations
-            for found in _under(name, annotation)
-            for chosen in _chosen(found, at)
+            for table in _under(name, annotation)
+            for chosen in _chosen(table, at)
         ]
     return _models(annotations)
 
@@ -118,7 +118,7 @@ def _under(name: str, annotation: Any) -> list[Any]:
         return [field.annotation] if field else []
     if get_origin(annotation) in (dict, list):
         return [get_args(annotation)[-1]]
-    return [found for part in get_args(annotation) for found in _under(name, part)]
+    return [model for part in get_args(annotation) for model in _under(name, part)]
 
 
 def _chosen(annotation: Any, table: Any) -> list[Any]:
@@ -135,14 +135,14 @@ def _chosen(annotation: Any, table: Any) -> list[Any]:
         )
     if get_origin(annotation) in (dict, list) or not get_args(annotation):
         return [annotation]
-    return [found for part in get_args(annotation) for found in _chosen(part, table)]
+    return [model for part in get_args(annotation) for model in _chosen(part, table)]
 
 
 def _models(annotations: Sequence[Any]) -> list[type[BaseModel]]:
-    found: list[type[BaseModel]] = []
+    models: list[type[BaseModel]] = []
     for annotation in annotations:
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            found.append(annotation)
+            models.append(annotation)
         else:
-            found.extend(_models(get_args(annotation)))
-    return found
+            models.extend(_models(get_args(annotation)))
+    return models

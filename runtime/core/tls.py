@@ -86,13 +86,13 @@ class _TurnTakingSocket(ssl.SSLSocket):
                 try:
                     return step()
                 except ssl.SSLWantReadError as found:
-                    wanted, refusal = select.POLLIN, found
+                    events, refusal = select.POLLIN, found
                 except ssl.SSLWantWriteError as found:
-                    wanted, refusal = select.POLLOUT, found
+                    events, refusal = select.POLLOUT, found
             if self._patience == 0.0:
                 raise refusal
             left = None if deadline is None else max(0.0, deadline - time.monotonic())
             poller = select.poll()
-            poller.register(self, wanted)
+            poller.register(self, events)
             if not poller.poll(None if left is None else left * 1e3) and left is not None:
                 raise TimeoutError("the TLS connection gave nothing, or took nothing, in time")

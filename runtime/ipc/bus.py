@@ -362,12 +362,12 @@ class Publisher(Listener):
         begun = []
         with suppress(zmq.Again):
             while readable(self.socket):
-                told = self.socket.recv(zmq.NOBLOCK)
-                topic = told[1:].decode("utf-8", "replace")
-                if told[:1] == b"\x01":
+                message = self.socket.recv(zmq.NOBLOCK)
+                topic = message[1:].decode("utf-8", "replace")
+                if message[:1] == b"\x01":
                     self.topics.add(topic)
                     begun.append(topic)
-                elif told[:1] == b"\x00":
+                elif message[:1] == b"\x00":
                     self.topics.discard(topic)
         return begun
 

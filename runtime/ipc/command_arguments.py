@@ -20,11 +20,11 @@ LARGEST = 64 * 1024  # characters of JSON that a command may add to a manifest
 _HIGHEST_SEED = 2**53 - 1  # largest integer of a browser's number
 
 
-def _small(given: dict[str, JsonValue]) -> dict[str, JsonValue]:
-    size = len(json.dumps(given))
+def _small(value: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    size = len(json.dumps(value))
     if size > LARGEST:
         raise ValueError(f"must be at most {LARGEST} characters of JSON, and is {size}")
-    return given
+    return value
 
 
 Map = Annotated[dict[str, JsonValue], AfterValidator(_small)]
@@ -84,8 +84,8 @@ class SetUpRequest(Settings):
     @property
     def changes(self) -> dict[str, Any]:
         """Tables that override the deployment's."""
-        wanted = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
-        return {key: value for key, value in wanted.items() if value is not None}
+        changes = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
+        return {key: value for key, value in changes.items() if value is not None}
 
 
 class PreflightRequest(Settings):
@@ -105,8 +105,8 @@ class PreflightRequest(Settings):
     @property
     def changes(self) -> dict[str, Any]:
         """Tables that override the deployment's."""
-        wanted = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
-        return {key: value for key, value in wanted.items() if value is not None}
+        changes = {"policy": self.policy, "strategy": self.strategy, "task": self.task}
+        return {key: value for key, value in changes.items() if value is not None}
 
     @property
     def about(self) -> str:

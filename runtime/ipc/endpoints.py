@@ -50,9 +50,9 @@ def _folders(station_dir: Path) -> Iterator[Path]:
     A starting station uses the first; a running one uses a later one if the first has become unusable.
     """
     name = hashlib.sha256(os.fsencode(station_dir.resolve())).hexdigest()[:16]
-    given = os.environ.get("XDG_RUNTIME_DIR", "")
-    if given and not _missing(Path(given)):
-        yield Path(given) / _IN_SESSION / name
+    runtime_dir = os.environ.get("XDG_RUNTIME_DIR", "")
+    if runtime_dir and not _missing(Path(runtime_dir)):
+        yield Path(runtime_dir) / _IN_SESSION / name
     yield Path.home() / ".cache" / "eva-web-run" / name
     yield station_dir / "sockets"
 
@@ -91,21 +91,21 @@ def _ensure_folder(folder: Path) -> Path:
 def _require_owned(folder: Path, forbidden: int) -> Path:
     """Return `folder` if it belongs to this account without the permissions `forbidden`; else raise TransportError."""
     try:
-        found = folder.lstat()
+        status = folder.lstat()
     except OSError as error:
         raise TransportError(
             f"{folder} is to hold the sockets of stations, and cannot be looked at: {error.strerror}"
         ) from None
-    if not stat.S_ISDIR(found.st_mode):
+    if not stat.S_ISDIR(status.st_mode):
         raise TransportError(f"{folder} is to hold the sockets of stations: it must be a folder, and no link")
-    if found.st_uid != os.geteuid():
+    if status.st_uid != os.geteuid():
         raise TransportError(
-            f"{folder} is to hold the sockets of stations, and belongs to {account_name(found.st_uid)}: who has it can "
-            f"command them; allowed: a folder of {account_name(os.geteuid())}, in XDG_RUNTIME_DIR or at home"
+            f"{folder} is to hold the sockets of stations, and belongs to {account_name(status.st_uid)}: "
+            f"who has it can command them; allowed: a folder of {account_name(os.geteuid())}, in XDG_RUNTIME_DIR or at home"
         )
-    if found.st_mode & forbidden:
+    if status.st_mode & forbidden:
         raise TransportError(
-            f"{folder} is to hold the sockets of stations, and has the mode {stat.S_IMODE(found.st_mode):04o}: "
+            f"{folder} is to hold the sockets of stations, and has the mode {stat.S_IMODE(status.st_mode):04o}: "
             "others could command them; allowed: 0700"
         )
     return folder
@@ -151,10 +151,10 @@ def file_identity(path: Path) -> tuple[int, int]:
     """
     try:
         _require_owned(path.parent, _OTHERS)
-        found = path.lstat()
+        status = path.lstat()
     except (TransportError, OSError):
         return 0, 0
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 def connection_problem(endpoint: str) -> str:
@@ -262,11 +262,11 @@ class Endpoints:
             return self._content(process)
         except (OSError, ValueError, RecursionError) as error:
             station = self._folder.parent
-            known = ", ".join(sorted(p.parent.name for p in station.parent.glob("*/endpoints"))) or "none"
+            stations = ", ".join(sorted(p.parent.name for p in station.parent.glob("*/endpoints"))) or "none"
             raise TransportError(
                 f"station {station.name!r} is not running here ({path}: {error.__class__.__name__}); "
                 f"start it with python -m runtime DEPLOYMENT, or name another data folder (looked in "
-                f"{station.parent}, running or once run: {known})"
+                f"{station.parent}, running or once run: {stations})"
             ) from None
 
     def served(self, process: str) -> bool:
@@ -280,10 +280,10 @@ class Endpoints:
         return True
 
     def _content(self, process: str) -> dict[str, Any]:
-        found = json.loads(self._file(process).read_text("utf-8"))
-        if not isinstance(found, dict):
-            raise ValueError(f"{self._file(process)} holds a {type(found).__name__}; allowed: an object")
-        return found
+        content = json.loads(self._file(process).read_text("utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError(f"{self._file(process)} holds a {type(content).__name__}; allowed: an object")
+        return content
 
     def is_listening(self, name: str) -> bool:
         """Return True if a process listens at a socket `name`, whatever the files contain.

@@ -57,35 +57,35 @@ def send_urgent(
         TransportError: the station has no such process or socket.
     """
     deadline = time.monotonic() + timeout
-    client, place, heard, why = None, "", False, ""
+    client, place, received, reason = None, "", False, ""
     try:
         while True:
             try:
-                there = _current_endpoint(endpoints, where, place)
+                current = _current_endpoint(endpoints, where, place)
             except TransportError:
                 if time.monotonic() >= deadline or not endpoints.is_listening(where[1]):
                     raise
                 time.sleep(_AGAIN_S)  # its process rewrites the file within two LOOK_S periods
                 continue
-            if client is None or there != place:
+            if client is None or current != place:
                 if client is not None:
                     client.close()
-                client, place = CommandClient(context, there, key, endpoints.owner), there
+                client, place = CommandClient(context, current, key, endpoints.owner), current
                 client.send(command)
-            why = connection_problem(place)
-            heard = heard or not why
+            reason = connection_problem(place)
+            received = received or not reason
             answer = client.receive_answer(command, min(LOOK_S, max(0.0, deadline - time.monotonic())))
             if answer is not None:
                 return answer
-            why = client.strangers or why
+            reason = client.strangers or reason
             if time.monotonic() >= deadline:
                 break
     finally:
         if client is not None:
             client.close()
-    if not heard:
-        raise NotSent(_NOT_SENT(kind=command.kind, why=why))
-    raise NoAnswer(command.kind, timeout, why)
+    if not received:
+        raise NotSent(_NOT_SENT(kind=command.kind, why=reason))
+    raise NoAnswer(command.kind, timeout, reason)
 
 
 def _current_endpoint(endpoints: Endpoints, where: tuple[str, str], before: str) -> str:

@@ -36,8 +36,8 @@ def sanitize_text(text: str) -> str:
 
 def reason_of(command: Command) -> str:
     """Return the reason of a press, DEFAULT_REASON if it is missing or no text."""
-    why = command.args.get("why")
-    return why if isinstance(why, str) and why else DEFAULT_REASON
+    reason = command.args.get("why")
+    return reason if isinstance(reason, str) and reason else DEFAULT_REASON
 
 
 # --- the bus: msgpack ----------------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ def parse_packed_press(payload: bytes) -> Command | None:
     """Return the press in a message of the bus, from all readable fields; None if the message is no press."""
     if b"estop" not in payload or _PACKED.search(payload) is None:
         return None
-    found: dict[str, bytes] = {}
+    fields: dict[str, bytes] = {}
     kinds, wrong = [], []
     try:
         for key, value in _pairs(payload):
@@ -63,39 +63,39 @@ def parse_packed_press(payload: bytes) -> Command | None:
                 kinds.append(_text(value))
                 if kinds[-1] is None:
                     wrong.append("kind is no text")
-            found[key] = value
+            fields[key] = value
     except _UNREADABLE as error:
         wrong.append(f"unreadable: {error or type(error).__name__}")
     if kinds and NAME not in kinds and not wrong:
         return None
-    return _press(found, wrong)
+    return _press(fields, wrong)
 
 
-def _press(found: Mapping[str, bytes], wrong: list[str]) -> Command:
-    texts = {key: _text(found[key]) for key in _TEXTS if key in found}
+def _press(fields: Mapping[str, bytes], wrong: list[str]) -> Command:
+    texts = {key: _text(fields[key]) for key in _TEXTS if key in fields}
     wrong += [f"{key} is no text" for key, text in texts.items() if text is None]
     given = texts.pop("uuid", None) or ""
     if len(given) > _LONGEST_UUID:
         wrong.append(f"uuid has {len(given)} characters")
     uuid = given if 0 < len(given) <= _LONGEST_UUID else str(uuid4())
-    why = _why(found.get("args"), wrong)
-    said = f" (message: {'; '.join(wrong)})" if wrong else ""
+    reason = _why(fields.get("args"), wrong)
+    faults = f" (message: {'; '.join(wrong)})" if wrong else ""
     user, holder, role = (sanitize_text(texts.get(key) or "") for key in ("user", "holder", "role"))
-    return Command(uuid, NAME, {"why": sanitize_text(why) + said[:LONGEST]}, user, holder, role=role)
+    return Command(uuid, NAME, {"why": sanitize_text(reason) + faults[:LONGEST]}, user, holder, role=role)
 
 
 def _why(args: bytes | None, wrong: list[str]) -> str:
     if args is None:
         return DEFAULT_REASON
     try:
-        given = [value for key, value in _pairs(args, ("why",)) if key == "why"]
+        values = [value for key, value in _pairs(args, ("why",)) if key == "why"]
     except _UNREADABLE:
         wrong.append("args is no map")
         return DEFAULT_REASON
-    why = _text(given[-1]) if given else DEFAULT_REASON
-    if why is None:
+    reason = _text(values[-1]) if values else DEFAULT_REASON
+    if reason is None:
         wrong.append("why is no text")
-    return why or DEFAULT_REASON
+    return reason or DEFAULT_REASON
 
 
 def _pairs(packed: bytes, wanted: frozenset[str] | tuple[str, ...] = _READ) -> Iterator[tuple[str, bytes]]:
@@ -154,13 +154,13 @@ def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
         parts = (text[:_WINDOW], text[-_WINDOW:])
         return _fields(parts) if any(_loosely(part, keys) for part in parts) else None
     try:
-        found, end = _JSON.raw_decode(text)
+        message, end = _JSON.raw_decode(text)
     except (ValueError, RecursionError):
-        found, end = None, 0
-    if isinstance(found, _Table):
-        named = [value for key, value in found if key in keys]
+        message, end = None, 0
+    if isinstance(message, _Table):
+        named = [value for key, value in message if key in keys]
         if any(isinstance(value, str) and _WORD.fullmatch(value) for value in named):
-            return {key: _plain(value) for key, value in found}
+            return {key: _plain(value) for key, value in message}
         if named and not text[end:].strip():
             return None
     return {} if _loosely(text, keys) else None
@@ -169,8 +169,8 @@ def parse_json_press(said: str | bytes, *keys: str) -> dict[str, Any] | None:
 def _fields(parts: Sequence[str]) -> dict[str, Any]:
     """Return uuid and reason of a long press, as far as they are in `parts`, its beginning and its end."""
     pattern = r'"%s"\s{0,9}:\s{0,9}"([^"\\]{1,240})'
-    found = ((key, re.search(pattern % key, part)) for part in reversed(parts) for key in ("uuid", "why"))
-    return {key: match[1] for key, match in found if match}
+    matches = ((key, re.search(pattern % key, part)) for part in reversed(parts) for key in ("uuid", "why"))
+    return {key: match[1] for key, match in matches if match}
 
 
 def _loosely(text: str, keys: Sequence[str]) -> bool:
@@ -183,8 +183,8 @@ def json_reason(said: Mapping[str, Any], default: str = DEFAULT_REASON) -> str:
     """Return the reason of a press in JSON, from its top level or its arguments; `default` if it has none."""
     args = [said.get(key) for key in ("args", "arguments")]
     for table in (said, *(one for one in args if isinstance(one, dict))):
-        if isinstance(why := table.get("why"), str) and why:
-            return sanitize_text(why)
+        if isinstance(reason := table.get("why"), str) and reason:
+            return sanitize_text(reason)
     return default
 
 

@@ -34,10 +34,10 @@ def _press_in(call: IncomingMessage) -> Command | None:
 
     If the content has no kind, the press is also sought in the following frames, and across both.
     """
-    press, rest = parse_packed_press(call.payload), call.signature
-    if press is not None or not rest or kind_of(call.payload):
+    press, signature = parse_packed_press(call.payload), call.signature
+    if press is not None or not signature or kind_of(call.payload):
         return press
-    return parse_packed_press(rest if kind_of(rest) else call.payload + rest)
+    return parse_packed_press(signature if kind_of(signature) else call.payload + signature)
 
 
 class FairQueue:
@@ -61,7 +61,7 @@ class FairQueue:
     def take_turn(self) -> tuple[list[QueuedCommand], list[QueuedCommand]]:
         """Return all urgent commands that have arrived, and this turn's share of the other commands."""
         self.refused = None
-        urgent = [asked for call in self._received() if (asked := self._take_if_urgent(call)) is not None]
+        urgent = [command for call in self._received() if (command := self._take_if_urgent(call)) is not None]
         return urgent, self._take_share()
 
     def _received(self) -> list[IncomingMessage]:
@@ -99,7 +99,7 @@ class FairQueue:
         return len(self._waiting.get(call.address[0], ())) < MAX_WAITING_PER_CONNECTION
 
     def _take_share(self) -> list[QueuedCommand]:
-        found: list[QueuedCommand] = []
+        commands: list[QueuedCommand] = []
         for _ in range(self._share):  # unreadable messages count too
             if not self._waiting:
                 break
@@ -109,5 +109,5 @@ class FairQueue:
             if calls:
                 self._waiting[connection] = calls  # behind all others
             if (command := self._server.decode(call)) is not None:
-                found.append((call, command))
-        return found
+                commands.append((call, command))
+        return commands

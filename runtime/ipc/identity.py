@@ -80,24 +80,24 @@ class Key:
             return False
 
     def _read(self) -> bytes:
-        found = os.stat(self.path, follow_symlinks=False)
-        if (found.st_ino, found.st_mtime_ns) == self._seen:
+        status = os.stat(self.path, follow_symlinks=False)
+        if (status.st_ino, status.st_mtime_ns) == self._seen:
             return self._secret
-        if not stat.S_ISREG(found.st_mode) or found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        if not stat.S_ISREG(status.st_mode) or status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise ConfigurationError(
-                f"the key {self.path} has the mode {stat.S_IMODE(found.st_mode):04o}: a reader can sign commands "
+                f"the key {self.path} has the mode {stat.S_IMODE(status.st_mode):04o}: a reader can sign commands "
                 "as any user; allowed: a file with 0600; remove it, and another is made"
             )
-        if found.st_uid not in (os.geteuid(), _ROOT):
+        if status.st_uid not in (os.geteuid(), _ROOT):
             raise ConfigurationError(
-                f"the key {self.path} belongs to {account_name(found.st_uid)}; allowed: {account_name(os.geteuid())}"
+                f"the key {self.path} belongs to {account_name(status.st_uid)}; allowed: {account_name(os.geteuid())}"
             )
         secret = self.path.read_bytes()
         if len(secret) != _KEY_BYTES:
             raise ConfigurationError(
                 f"the key {self.path} has {len(secret)} bytes; allowed: {_KEY_BYTES}; remove it, and another is made"
             )
-        self._secret, self._seen = secret, (found.st_ino, found.st_mtime_ns)
+        self._secret, self._seen = secret, (status.st_ino, status.st_mtime_ns)
         return secret
 
     def _make(self) -> bytes:

@@ -462,13 +462,13 @@ def decode(payload: bytes) -> Message:
     if not isinstance(content, dict) or not isinstance(name, str) or name not in _TYPES:
         raise CodecError(f"message type {name!r} is unknown; known: {', '.join(_TYPES)}")
     kind = _TYPES[name]
-    known = {field_: content[field_] for field_ in _FIELDS[kind] if field_ in content}
-    for field_, value in known.items():
+    fields = {field_: content[field_] for field_ in _FIELDS[kind] if field_ in content}
+    for field_, value in fields.items():
         if not _EXPECTED[kind][field_].admits(value):
             expected = _EXPECTED[kind][field_]
             raise CodecError(f"message {name}: {field_} = {value!r:.80}; expected {expected}")
     try:
-        message: Message = kind(**known)
+        message: Message = kind(**fields)
     except (TypeError, ValueError) as error:
         raise CodecError(f"message {name}: {error}") from None
     return message

@@ -40,9 +40,9 @@ class SlotPictures(Mapping[str, UInt8]):
 
 def as_message(observation: Observation, numbers: Mapping[str, int]) -> Observed:
     """Return the message for media about an observation whose pictures are in the slots `numbers`."""
-    told = {name: getattr(observation, name) for name in _SAME}
-    told["captured"] = dict(observation.captured)
-    return Observed(**told, pictures={camera: numbers[camera] for camera in observation.pictures})
+    fields = {name: getattr(observation, name) for name in _SAME}
+    fields["captured"] = dict(observation.captured)
+    return Observed(**fields, pictures={camera: numbers[camera] for camera in observation.pictures})
 
 
 def as_observation(message: Observed, shared: SharedState) -> Observation:

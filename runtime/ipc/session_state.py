@@ -111,10 +111,10 @@ def complete_state_meaning(said: Mapping[str, Any]) -> dict[str, Any]:
     Missing entries are derived from its "state"; invalid "sentences" are removed. An unknown state is neutral: nothing
     is in progress, and it counts as idle only if the station itself reports that.
     """
-    word, told = str(said["state"]), said.get("state_is") or {}
+    word, meaning = str(said["state"]), said.get("state_is") or {}
     row = SessionState.meaning_of(word)
     unknown = {} if row else {"idle": False}
     row = row or StateMeaning(word.replace("_", " "), "neutral")
-    row = replace(row, **{field.name: told[field.name] for field in fields(row) if field.name in told})
-    known = {"sentences": checked(said["sentences"])} if "sentences" in said else {}
-    return {**said, "state_is": {**row.to_dict(), **unknown, **told}, **known}
+    row = replace(row, **{field.name: meaning[field.name] for field in fields(row) if field.name in meaning})
+    sentences = {"sentences": checked(said["sentences"])} if "sentences" in said else {}
+    return {**said, "state_is": {**row.to_dict(), **unknown, **meaning}, **sentences}

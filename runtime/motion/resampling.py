@@ -41,9 +41,9 @@ def resample(
     lower = np.floor(position + 1e-9).astype(np.int64)
     before, after = rows[lower], rows[np.minimum(lower + 1, len(rows) - 1)]
     part = np.clip(position - lower, 0.0, 1.0)
-    made = before + part[:, None] * (after - before)
-    made[:, list(held)] = before[:, list(held)]
+    resampled = before + part[:, None] * (after - before)
+    resampled[:, list(held)] = before[:, list(held)]
     for first in quaternions:
         turned = slice(first, first + 4)
-        made[:, turned] = slerp(before[:, turned], after[:, turned], part)
-    return made, lower
+        resampled[:, turned] = slerp(before[:, turned], after[:, turned], part)
+    return resampled, lower

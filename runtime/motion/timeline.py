@@ -123,8 +123,8 @@ class Timeline:
             return rows, makers
         rows = rows.copy()
         for index in range(min(len(rows), max(0, self.fade.first + len(self.fade.rows) - step))):
-            shown = self.fade.blend(step + index, Planned(rows[index], makers[index]))
-            rows[index], makers[index] = shown.action, shown.contributions
+            blended = self.fade.blend(step + index, Planned(rows[index], makers[index]))
+            rows[index], makers[index] = blended.action, blended.contributions
         return rows, makers
 
     def replace(

@@ -48,8 +48,8 @@ class Brake(Motion):
 
     def at(self, elapsed: float) -> Float64:
         t = np.minimum(elapsed, self._stop)
-        way = self._velocity * t - 0.5 * np.sign(self._velocity) * self._deceleration * t * t
-        position = np.clip(self._q + way, self._lower, self._upper)
+        distance = self._velocity * t - 0.5 * np.sign(self._velocity) * self._deceleration * t * t
+        position = np.clip(self._q + distance, self._lower, self._upper)
         if self._speeds:
             stop = np.maximum(self._stop[self._speeds], 1e-9)
             position[self._speeds] = self._q[self._speeds] * np.maximum(0.0, 1.0 - elapsed / stop)

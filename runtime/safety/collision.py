@@ -70,15 +70,15 @@ class Collisions:
         The path is checked with the grippers of its first row and with those of its last row, because grippers may move
         at any time.
         """
-        found = [hit for end in self._ends(way) if (hit := self._hit(self._gripping(way, end))) is not None]
-        return min(found, key=lambda hit: hit[1], default=None)
+        hits = [hit for end in self._ends(way) if (hit := self._hit(self._gripping(way, end))) is not None]
+        return min(hits, key=lambda hit: hit[1], default=None)
 
-    def _ends(self, way: Float64) -> Sequence[Float64]:
-        same = np.array_equal(way[0, self._grippers], way[-1, self._grippers])
-        return (way[0],) if same else (way[0], way[-1])
+    def _ends(self, path: Float64) -> Sequence[Float64]:
+        same = np.array_equal(path[0, self._grippers], path[-1, self._grippers])
+        return (path[0],) if same else (path[0], path[-1])
 
-    def _hit(self, way: Float64) -> tuple[Collision, int] | None:
-        apart = self._clearance.distances(way)  # [T, K]
+    def _hit(self, path: Float64) -> tuple[Collision, int] | None:
+        apart = self._clearance.distances(path)  # [T, K]
         farthest = np.maximum.accumulate(apart, axis=0)
         wrong = (apart < self._least) & (apart < farthest - _NEARER)
         if not wrong.any():
@@ -100,5 +100,5 @@ class Collisions:
         if not among.any():
             return None
         index = int(np.where(among, apart, np.inf).argmin())
-        one, other = self._clearance.pairs[index]
-        return Collision(one, other, float(apart[index]))
+        first, second = self._clearance.pairs[index]
+        return Collision(first, second, float(apart[index]))

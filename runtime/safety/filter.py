@@ -187,8 +187,8 @@ class SafetyFilter:
     def _collides(self, action: Float64, state: RobotState, path: Path) -> str:
         if self._collisions is None or (path == "policy" and self._settings.collision != "refuse"):
             return ""
-        found = self._collisions.closer_pair(action, state.previous)
-        return "" if found is None else str(found)
+        pair = self._collisions.closer_pair(action, state.previous)
+        return "" if pair is None else str(pair)
 
     def _warned(self, verdict: SafetyVerdict, path: Path) -> SafetyVerdict:
         """Return `verdict`; if collisions are only warned of, with the pair of links that the action brings near each
@@ -272,11 +272,11 @@ class SafetyFilter:
             stops = np.where(now > 0, most[0], -most[1])
             braking = np.minimum(np.maximum(stops, now - hard), now + hard)
             fastest, slowest = np.where(crossed, braking, fastest), np.where(crossed, braking, slowest)
-        wanted = (action - state.previous) / dt
+        requested = (action - state.previous) / dt
         velocity = np.minimum(
-            np.maximum(self._catch_up_velocity(wanted, action, state, path), slowest), fastest
+            np.maximum(self._catch_up_velocity(requested, action, state, path), slowest), fastest
         )
-        changed = np.abs(velocity - wanted) * dt > _TOLERANCE
+        changed = np.abs(velocity - requested) * dt > _TOLERANCE
         if self._switching:
             changed &= ~self._limits.binary
         reachable = np.where(changed, state.previous + velocity * dt, action) if changed.any() else action
@@ -285,7 +285,9 @@ class SafetyFilter:
             reachable = np.where(self._limits.binary, within, reachable)
         return reachable
 
-    def _catch_up_velocity(self, wanted: Float64, action: Float64, state: RobotState, path: Path) -> Float64:
+    def _catch_up_velocity(
+        self, requested: Float64, action: Float64, state: RobotState, path: Path
+    ) -> Float64:
         """Return `wanted` velocities, reduced where the command is behind its target so that it does not overshoot.
 
         After a jump of the target, the command must not arrive with all the speed gathered on the way: its speed
@@ -294,12 +296,12 @@ class SafetyFilter:
         aim = state.previous if state.previous_target is None else state.previous_target
         behind = aim - state.previous
         if not (np.abs(behind) > _TOLERANCE).any():
-            return wanted
+            return requested
         dt = state.elapsed
         own = (action - aim) / dt
         speed = _stopping_speed(np.abs(behind), self._rate[path], dt)
-        bounded = own + np.minimum(np.maximum(wanted - own, -speed), speed)
-        return np.where(np.abs(behind) > _TOLERANCE, bounded, wanted)
+        bounded = own + np.minimum(np.maximum(requested - own, -speed), speed)
+        return np.where(np.abs(behind) > _TOLERANCE, bounded, requested)
 
     def _changes(self, action: Float64, reachable: Float64) -> tuple[str, ...]:
         if reachable is action:

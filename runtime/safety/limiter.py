@@ -49,13 +49,13 @@ class CommandLimiter:
 
         `stop` is True for the commands of the e-stop.
         """
-        wanted = np.where(np.isfinite(action), action, previous)
+        requested = np.where(np.isfinite(action), action, previous)
         low, high = self._velocities(velocity, elapsed, stop)
-        moved = previous + np.clip((wanted - previous) / elapsed, low, high) * elapsed
+        moved = previous + np.clip((requested - previous) / elapsed, low, high) * elapsed
         free = self._limits.binary
         if stop:
-            free = free | (self._speeds & (np.abs(wanted) <= np.abs(previous)))
-        moved = np.where(free, wanted, moved)
+            free = free | (self._speeds & (np.abs(requested) <= np.abs(previous)))
+        moved = np.where(free, requested, moved)
         lower, upper = self._limits.lower, self._limits.upper
         sent = np.clip(moved, np.minimum(lower, previous), np.maximum(upper, previous))
         changed = ~(np.abs(sent - action) <= _TOLERANCE * self._reach)

@@ -176,20 +176,22 @@ def join(
     elif joining and planned is not None:
         _fade(timeline, free_step, *timeline.executed_rows(free_step), JOIN_WINDOW, dims)
     merge.apply(timeline, placed)
-    made = timeline.executed_rows(free_step)[1]
-    shares = _contributions(free_step, made, placed.merged.chunk_id) if merge.uses_rtc else None
-    return replace(placed.merged, overlap=sum(len(makers) > 1 for makers in made), contributions=shares)
+    contributions = timeline.executed_rows(free_step)[1]
+    shares = _contributions(free_step, contributions, placed.merged.chunk_id) if merge.uses_rtc else None
+    return replace(
+        placed.merged, overlap=sum(len(makers) > 1 for makers in contributions), contributions=shares
+    )
 
 
-def _contributions(first: int, made: Sequence[Contributions], chunk_id: int) -> Float64 | None:
+def _contributions(first: int, contributions: Sequence[Contributions], chunk_id: int) -> Float64 | None:
     alone = ((chunk_id, 1.0),)
-    told = [
+    entries = [
         (step, maker, weight)
-        for step, makers in enumerate(made, first)
+        for step, makers in enumerate(contributions, first)
         if makers != alone
         for maker, weight in makers
     ]
-    return np.array(told, np.float64).reshape(-1, 3) if len(told) <= _MOST_SHARES else None
+    return np.array(entries, np.float64).reshape(-1, 3) if len(entries) <= _MOST_SHARES else None
 
 
 def _fade(
@@ -206,5 +208,5 @@ def _fade(
     rows are held targets.
     """
     last = np.minimum(np.arange(count), len(rows) - 1)
-    made = [*makers[:count], *single_contribution(HELD, max(0, count - len(makers)))]
-    timeline.begin_fade(Fade(step, rows[last], tuple(made), fade_weights(count), dims))
+    contributions = [*makers[:count], *single_contribution(HELD, max(0, count - len(makers)))]
+    timeline.begin_fade(Fade(step, rows[last], tuple(contributions), fade_weights(count), dims))

@@ -51,9 +51,9 @@ class EnsembleMerge(Merge):
         begin = step
         for end in sorted({chunk.end for chunk in laid}):
             covering = [chunk for chunk in laid if chunk.end >= end]
-            mean, made = self._average(covering, slice(begin - step, end - step))
+            mean, contributions = self._average(covering, slice(begin - step, end - step))
             rows.append(mean)
-            makers.extend([made] * (end - begin))
+            makers.extend([contributions] * (end - begin))
             begin = end
         timeline.replace(step, np.concatenate(rows), makers, laid)
 

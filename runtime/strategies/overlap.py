@@ -43,10 +43,10 @@ class OverlapMerge(Merge):
     def apply(self, timeline: Timeline, placed: Placement) -> None:
         old, makers = timeline.plan(placed.first)
         rows, weights = overlap_blend(old, placed.rows, self._window, self._dims, self._shape)
-        made = single_contribution(placed.merged.chunk_id, len(rows))
+        contributions = single_contribution(placed.merged.chunk_id, len(rows))
         for index, weight in enumerate(weights.tolist()):
-            made[index] = mix_contributions(makers[index], made[index], weight)
-        timeline.replace(placed.first, rows, made)
+            contributions[index] = mix_contributions(makers[index], contributions[index], weight)
+        timeline.replace(placed.first, rows, contributions)
 
 
 def query(config: Config) -> Query:

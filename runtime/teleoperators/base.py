@@ -86,9 +86,9 @@ class Leader(ABC):
             self._newest, self._refused = LeaderPose(joints, arrived), ""
             self._arrivals.append(arrived)
 
-    def _refuse(self, why: str) -> None:
+    def _refuse(self, reason: str) -> None:
         with self._lock:
-            self._refused = why
+            self._refused = reason
 
 
 def joints_from_state(state: Mapping[str, object], robot: Robot) -> Float64:
@@ -96,21 +96,21 @@ def joints_from_state(state: Mapping[str, object], robot: Robot) -> Float64:
 
     Raises CodecError if they do not fit the robot.
     """
-    known = [group.name for group in robot.groups]
-    unknown = [str(name) for name in state if name not in known]
+    names = [group.name for group in robot.groups]
+    unknown = [str(name) for name in state if name not in names]
     if unknown or not state:
         raise CodecError(
-            f"the leader's groups are {', '.join(map(str, state)) or 'none'}; {robot.name} has {', '.join(known)}"
+            f"the leader's groups are {', '.join(map(str, state)) or 'none'}; {robot.name} has {', '.join(names)}"
         )
     parts = []
     for group in robot.groups:
-        given = state.get(group.name)
-        part = np.full(group.dof, np.nan) if given is None else np.asarray(given, np.float64)
+        group_state = state.get(group.name)
+        part = np.full(group.dof, np.nan) if group_state is None else np.asarray(group_state, np.float64)
         if part.shape != (group.dof,):
             raise CodecError(
                 f"the leader's {group.name} has the shape {list(part.shape)}; expected [{group.dof}]"
             )
-        if given is not None and not np.isfinite(part).all():
+        if group_state is not None and not np.isfinite(part).all():
             raise CodecError(f"the leader's {group.name} is {part.tolist()}; expected finite numbers")
         parts.append(part)
     return np.concatenate(parts)

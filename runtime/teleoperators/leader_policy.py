@@ -86,8 +86,8 @@ class LeaderPolicy(Policy):
 
     def leader_problem(self) -> str:
         """Return why the leader cannot be followed now, "" if it can."""
-        newest, why = self.leader.latest_pose, self.leader.problem
-        because = _BECAUSE(why=why) if why else ""
+        newest, problem = self.leader.latest_pose, self.leader.problem
+        because = _BECAUSE(why=problem) if problem else ""
         if newest is None:
             return _SAID_NOTHING(who=self.leader.name, because=because)
         age = self._clock.now() - newest.arrived
@@ -126,9 +126,9 @@ class LeaderPolicy(Policy):
         return np.where(off <= self._steady_error, commanded, qpos)
 
     def _pose(self) -> LeaderPose:
-        newest, why = self.leader.latest_pose, self.leader_problem()
-        if newest is None or why:
-            raise PolicyLostError(why)
+        newest, problem = self.leader.latest_pose, self.leader_problem()
+        if newest is None or problem:
+            raise PolicyLostError(problem)
         return newest
 
     def _follow(self, pose: LeaderPose) -> Float64:

@@ -88,8 +88,8 @@ class RosLeader(Leader):
         self._forget()
         self._begin()
         self._middleware = self._open()
-        for heard in subscriptions(tuple(self._parts.values()), lambda _: self._quality):
-            self._middleware.subscribe(heard.topic, self._make_callback(heard))
+        for stream in subscriptions(tuple(self._parts.values()), lambda _: self._quality):
+            self._middleware.subscribe(stream.topic, self._make_callback(stream))
 
     def close(self) -> None:
         if self._middleware is not None:
@@ -101,8 +101,8 @@ class RosLeader(Leader):
         """Reason why a message could not be used, else a sentence on each topic without new messages; "" if all have
         some.
         """
-        if said := super().problem:
-            return said
+        if problem := super().problem:
+            return problem
         waiting = [part.topic for group, part in self._parts.items() if group not in self._fresh]
         if self._middleware is None or not waiting:
             return ""
@@ -116,8 +116,8 @@ class RosLeader(Leader):
         self._stamps: dict[str, int] = {}  # stamp of the newest message by topic
         self._fresh: dict[str, tuple[Float64, float]] = {}  # by group: joints and their arrival time
 
-    def _make_callback(self, heard: Subscription) -> Callable[[bytes], None]:
-        topic = heard.topic.name
+    def _make_callback(self, stream: Subscription) -> Callable[[bytes], None]:
+        topic = stream.topic.name
 
         def take(payload: bytes) -> None:
             arrived = self._clock.now()
@@ -127,13 +127,13 @@ class RosLeader(Leader):
                 if message.stamp and message.stamp == self._stamps.get(topic):
                     return
                 self._stamps[topic] = message.stamp
-                said = {
-                    part.source_key: self._orders[part.source_key].read(message)[0] for part in heard.parts
+                state = {
+                    part.source_key: self._orders[part.source_key].read(message)[0] for part in stream.parts
                 }
             except CodecError as error:
                 self._refuse(f"{topic}: {error}")
                 return
-            for group, position in said.items():
+            for group, position in state.items():
                 self._add_reading(group, position, arrived)
 
         return take
