@@ -101,7 +101,8 @@ def _require_owned(folder: Path, forbidden: int) -> Path:
     if status.st_uid != os.geteuid():
         raise TransportError(
             f"{folder} is to hold the sockets of stations, and belongs to {account_name(status.st_uid)}: "
-            f"who has it can command them; allowed: a folder of {account_name(os.geteuid())}, in XDG_RUNTIME_DIR or at home"
+            f"who has it can command them; allowed: a folder of {account_name(os.geteuid())}, in XDG_RUNTIME_DIR "
+            "or at home"
         )
     if status.st_mode & forbidden:
         raise TransportError(
