@@ -47,7 +47,11 @@ _ORDER = Case(
 
 @dataclass(frozen=True, slots=True)
 class PlanRow:
-    """Plan with its progress: planned trials, trials that count, attempts, and the period of the attempts."""
+    """Plan with its progress.
+
+    `foreseen` are the planned trials, `counted` those that count, `attempts` all attempts; `since` and `until` are the
+    period of the attempts.
+    """
 
     plan: Plan
     foreseen: int
@@ -142,7 +146,13 @@ def plan_get(*, name: str, version: int | None = None) -> Plan:
 
 
 def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
-    """Return running plans, then ended ones, then drafts, newest first."""
+    """Return running plans, then ended ones, then drafts, newest first.
+
+    If given, `state` is the only state, and `words` are part of title or name.
+
+    Raises:
+        EvaError: If there is no such state.
+    """
     rows = Plan.objects.select_related("owner").defer("document", "key").order_by(_ORDER, "-frozen_at", "-pk")
     if state and state not in PlanState.values:
         raise EvaError(_STATE_ALLOWED(state=state, values=", ".join(PlanState.values)))

@@ -114,7 +114,10 @@ def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[st
 
 @dataclass(frozen=True, slots=True)
 class TimeHorizon:
-    """Horizon of times to success [s], 0 without any duration, and the time limits of scenes [s]."""
+    """Horizon of times to success, `until` [s], and time limits of scenes, `limits` [s].
+
+    The horizon is 0 if no trial has a known duration.
+    """
 
     until: float
     limits: Mapping[str, float]

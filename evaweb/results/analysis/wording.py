@@ -17,7 +17,7 @@ def rate_words(found: Proportion) -> str:
 
 
 def format_interval(interval: Interval, factor: float = 100) -> str:
-    """Return both ends in percent."""
+    """Return both ends as signed numbers, multiplied by `factor`; by default in percent."""
     return f"{_signed(factor * interval.low)}, {_signed(factor * interval.high)}"
 
 

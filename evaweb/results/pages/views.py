@@ -183,7 +183,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render the citation; that of a revealed plan is at its permanent address."""
+    """Render the citation of a plan; redirect to the permanent address of its result if it is revealed."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -293,7 +293,7 @@ def _plan_page(
 def _sealed_page(
     request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse | None:
-    """Return the page shown if results are sealed for this user or do not exist yet, else None."""
+    """Return the page that replaces the results if they are sealed for this user or do not exist yet; else None."""
     why = sealed_reason(found, request.user, visibility_for_request(request)) if has_results(found) else ""
     if has_results(found) and not why:
         return None

@@ -76,7 +76,10 @@ class CitedRow:
 
 @dataclass(frozen=True)
 class Citation:
-    """Result of a plan: `kept` is the record of its reveal, or the current one; `digest` is "" without a reveal."""
+    """Result of a plan for citing.
+
+    `kept` is the record of its reveal, or of the current state without a reveal; `digest` is "" without a reveal.
+    """
 
     plan: Plan
     found: Design
@@ -92,7 +95,7 @@ class Citation:
 
     @property
     def commitment(self) -> str:
-        """Commitment of the reveal; reveals that did not record it use the plan's, as do key and account."""
+        """Commitment of the reveal; if the reveal did not record it, that of the plan."""
         return str(self.kept.get("commitment") or self.plan.commitment)
 
     @property
@@ -190,7 +193,7 @@ class Citation:
 
     @cached_property
     def known(self) -> list[tuple[str, Proportion]]:
-        """Rows of the figure."""
+        """Name and success of each checkpoint with a recorded success: the rows of the figure."""
         return [(row.checkpoint, row.success) for row in self.rows if row.success is not None]
 
     @property
@@ -304,7 +307,7 @@ def citation(plan: Plan) -> Citation:
 
 
 def _declared(document: Mapping[str, Any]) -> str:
-    """Return what runs with an abnormal end count as, for those ends that the plan decides in advance."""
+    """Return the plan's rules on runs with an abnormal end as text: what each kind of end counts as."""
     counts = {"failure": "a failure", "repeated": "no trial, and is repeated"}
     said = document.get("counts_as", {})
     return "".join(f"; {ENDS[name]} makes {counts[said[name]]}" for name in ENDS if said.get(name) in counts)

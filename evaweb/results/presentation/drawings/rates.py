@@ -38,7 +38,7 @@ def draw_intervals(
 ) -> Drawing:
     """Draw one row per (name, x of n, address): mark at the rate, band over its 95 % interval, and the numbers.
 
-    `order` is the series of each name; names without one share the first series.
+    `order` maps names to the index of their series; names that it lacks are drawn as series 0.
     """
     step = 36
     height = step * len(rows) + 44

@@ -110,7 +110,7 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
 
 
 def counted(found: Proportion) -> tuple[object, ...]:
-    """Return the cells of the columns PROPORTION."""
+    """Return the cells for a proportion in the columns PROPORTION."""
     interval = found.interval
     return (found.successes, found.n, found.rate, interval and interval.low, interval and interval.high)
 
@@ -141,13 +141,13 @@ def path(points: Sequence[tuple[float, float]]) -> str:
 
 
 def link(address: str, title: str, content: str) -> str:
-    """Return the content as a link to the trials behind it; without an address only with its title."""
+    """Return the content with a tooltip, as a link to `address`; "" makes it no link."""
     inner = element("title", escape(title)) + content
     return element("a", inner, href=address) if address else element("g", inner)
 
 
 def series(i: int | None) -> str:
-    """Return the class of the i-th series; None for no checkpoint."""
+    """Return the style class of series `i`; None stands for a shape that belongs to no checkpoint."""
     return "series-none" if i is None else f"series-{i % SERIES + 1}"
 
 

@@ -53,7 +53,10 @@ def calibration(pairs: Sequence[tuple[float, bool]]) -> dict[str, Any] | None:
 
 
 def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
-    """Return the agreement on (score, judge, probability); the last two are None if the judge gave no verdict."""
+    """Return a judge's agreement with the scores on one milestone, and the Brier score of its probabilities.
+
+    `said` has for each trial the score, the judge's verdict and its probability; both are None if it gave no verdict.
+    """
     pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
     found = calibration([(p, scored) for scored, _, p in said if p is not None])
     return {

@@ -110,7 +110,10 @@ def newcombe(x1: int, n1: int, x2: int, n2: int) -> Ends:
 
 
 def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
-    """Return statistic and two-sided probability; which tables are as extreme is decided in integers."""
+    """Return statistic and two-sided p-value of Barnard's test.
+
+    Whether a table is as extreme as the observed one is decided in integers.
+    """
     total = n1 + n2
 
     def square(a: int, b: int) -> tuple[int, int]:
