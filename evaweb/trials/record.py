@@ -36,7 +36,7 @@ _Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 @dataclass(frozen=True, slots=True)
 class Column(RowPath):
-    """Declaration of one column: `path` is the query path from a trial, "" for the field's own name.
+    """Declaration of one column; `path` is its query path from a trial, or "" if that is the field's own name.
 
     While a trial's checkpoint is hidden from a user, a column is hidden too, unless it is `always_visible` or has a
     `masked_value`.
@@ -63,7 +63,10 @@ class Column(RowPath):
 
 
 class TrialRecord(Line):
-    """Record of a trial, with columns in display order; columns that are not written are None or "" when read."""
+    """Record of a trial, with columns in display order.
+
+    Columns that are never written to files are None or "" in a record read from one.
+    """
 
     id: Annotated[
         Annotated[int, Field(gt=0, lt=2**53)] | None, Column("pk", always_visible=True, type=int)
@@ -181,7 +184,10 @@ HINTS: Mapping[str, Any] = {
 
 
 def api_columns(where: Literal["list", "detail"]) -> dict[str, Any]:
-    """Return the columns with types of a trial in a list, or those that only a single trial's response adds."""
+    """Return the REST columns with their types.
+
+    "list" are those in lists of trials, "detail" those that only the response for a single trial adds.
+    """
     return {name: HINTS[name] for name, column in COLUMNS.items() if column.api == where}
 
 

@@ -298,7 +298,10 @@ def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
 
 
 def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
-    """Recompute only the cells with trials that have changed since."""
+    """Return the summaries with the changes since `before`.
+
+    Only the cells with trials that have changed are recomputed.
+    """
     since = before.newest - _LATE if before and before.newest else None
     rows = Trial.objects.order_by("-changed_at", "-pk")
     named = rows.values_list("pk", "changed_at", "scene_id", "checkpoint_id")
@@ -317,7 +320,10 @@ def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
 
 
 def _same(before: Collection[_Row], seen: Collection[_Row]) -> bool:
-    """Return False if a known trial is gone or replaced: the database was lost or its clock set back."""
+    """Return True if all trials in `before` are still in `seen`, with the same scene and checkpoint.
+
+    Otherwise the database was lost or its clock was set back.
+    """
     return {(pk, scene, checkpoint) for pk, _, scene, checkpoint in before} <= {
         (pk, scene, checkpoint) for pk, _, scene, checkpoint in seen
     }

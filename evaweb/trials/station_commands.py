@@ -106,9 +106,9 @@ def trial_command(
 def checkpoint_command(
     *, user: User, checkpoint: Checkpoint, kind: str, args: Mapping[str, Any] | None = None, **given: Any
 ) -> Command:
-    """Set a station up for a checkpoint without a trial; `given` as in `issue_command`.
+    """Set a station up for a checkpoint without a trial; the other arguments are those of `issue_command`.
 
-    Raises: EvaError for other commands.
+    Raises: EvaError if `kind` is not "setup".
     """
     require_role(user, Role.OPERATOR)
     if kind != "setup":

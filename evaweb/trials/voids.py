@@ -125,9 +125,9 @@ def open_void_requests(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
 
 
 def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
-    """Restore trials whose void request was not answered in time, or all with `now`; call within a transaction.
+    """Restore trials whose void request was not answered in time, or with `now` all with an open request.
 
-    Those with an open repetition wait for its end.
+    Trials with an unfinished repetition wait for its end. Call within a transaction.
     """
     asked = open_void_requests(trials)
     if not now:
