@@ -324,7 +324,7 @@ def _require_no_holder(station: Station) -> None:
 
 
 def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
-    """Check that the keys of BY_HAND have their defaults.
+    """Check that the keys in BY_HAND, which only a person with access to the machine may set, have their defaults.
 
     Raises:
         EvaError: If one has another value.
@@ -366,7 +366,9 @@ def _taken(name: str) -> Conflict:
 def _put(
     path: Path, tree: Mapping[str, Any], *about: str, place: Callable[[Path, Path], object] = os.replace
 ) -> None:
-    """Write the file, and `place` it if the runtime can load it.
+    """Write `tree` as a deployment file to `path`, if the runtime can load it.
+
+    `about` are lines of the comment at its head. `place` moves the checked draft to `path`.
 
     Raises:
         EvaError: If it cannot be loaded.

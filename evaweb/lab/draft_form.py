@@ -42,7 +42,7 @@ class Part:
 
     @property
     def asked(self) -> list[Typed]:
-        """Keys that are addresses."""
+        """Keys whose values are addresses."""
         return [one for one in self.keys if one.entry.address]
 
     @property
@@ -53,7 +53,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class DraftForm:
-    """Complete form."""
+    """Form of a draft: name, robot, task, and the tables of the deployment."""
 
     name: str
     robot: str

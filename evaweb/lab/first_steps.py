@@ -33,7 +33,7 @@ class Progress(StrEnum):
 
     @property
     def tone(self) -> str:
-        """Tone of its chip."""
+        """Tone of the progress chip, by its name in the style sheets."""
         return {"done": "ok", "now": "active"}.get(self.value, "neutral")
 
 
@@ -53,10 +53,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Walk:
-    """Steps of one station; without a station the first step is the current one.
+    """First steps of one station, or of a lab without a station, where the first step is the current one.
 
-    `snapshot` is the station's state, {} if it does not answer; `standing` is the status of its deployment `kept` in
-    the lab.
+    `snapshot` is the station's state, {} if it does not answer; `kept` is its deployment file, and `standing` the
+    status
+    of that deployment in the lab.
     """
 
     station: Station | None

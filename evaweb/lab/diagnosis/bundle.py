@@ -1,6 +1,4 @@
-"""Writer of a bundle: all parts through the scrubber, the ends of logs, and a summary of what is included and
-omitted.
-"""
+"""Writer of a bundle: all parts without secrets, the ends of logs, and a summary of its contents and omissions."""
 
 from __future__ import annotations
 
