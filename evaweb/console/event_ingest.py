@@ -162,8 +162,9 @@ def _advance(station: Station, boot: str, number: int) -> None:
 
 
 def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
-    """Pass one event to the services; a failure is logged and must not block later events. Database errors
-    are raised.
+    """Pass one event to the services.
+
+    A failure of a service is logged, so that it does not block later events; database errors are raised.
     """
     unbegun = event["data"].get("unbegun") or {}
     try:

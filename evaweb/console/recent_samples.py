@@ -35,7 +35,7 @@ class RecentSamples:
 
     Arrays float32 [K, D]: `measured`; `raw`, the newest chunk; `planned`, the merged plan; `executed`, sent to the
     robot or, in simulation, to the simulated robot. Missing values are NaN. Columns per sample: `step`, the leading
-    `chunk` (-1: none, 0: hold target), the number of `chunks` that contributed, whether safety `limited` it, and
+    `chunk` (-1: no chunk, 0: hold target), the number of `chunks` that contributed, whether safety `limited` it, and
     whether the executing robot was `simulated`. Consecutive parts overlap.
     """
 

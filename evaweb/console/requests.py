@@ -41,7 +41,7 @@ class BadRequest(EvaError):
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """Request to send these streams."""
+    """Request of a page to be sent these streams from now on."""
 
     streams: tuple[str, ...]
 
@@ -53,7 +53,7 @@ class Credit:
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """Heartbeat of the page that holds the lease of this epoch, visible or hidden."""
+    """Heartbeat of the page that holds the lease of this epoch; `hidden` tells whether its browser tab is hidden."""
 
     epoch: int
     hidden: bool = False

@@ -119,7 +119,10 @@ def job_act(request: HttpRequest, what: str) -> HttpResponse:
 
 
 def row_of(job: Job, sight: Visibility, having: Served) -> Row:
-    """Return a job as displayed; one that may reveal a hidden checkpoint shows only that it exists."""
+    """Return a job as displayed; if it may reveal a hidden checkpoint, the row shows only that it exists.
+
+    `having` are the queues that the running workers serve.
+    """
     title, lacks, said, cover = (
         KINDS.get(job.kind, job.kind),
         having.lacks(job),
