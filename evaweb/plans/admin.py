@@ -76,7 +76,7 @@ class PlanForm(forms.ModelForm):
 
 
 class Conditions(forms.ModelMultipleChoiceField):
-    """Choice of initial conditions of several scenes, labelled by scene and position."""
+    """Form field to choose positions of several scenes, each labelled by scene and position."""
 
     def label_from_instance(self, obj: Any) -> str:
         """Return scene and position."""
@@ -154,7 +154,10 @@ class PlanAdmin(admin.ModelAdmin):
         return super().formfield_for_manytomany(db_field, request, **kwargs)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
-        """Return the frozen fields; for a draft of a later version the name, shared by all versions."""
+        """Return the read-only fields: those of a frozen plan; of a draft of a later version only the name.
+
+        All versions share the name.
+        """
         if obj is None:
             return ()
         frozen = tuple("conditions" if name == "positions" else name for name in _FROZEN)

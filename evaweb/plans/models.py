@@ -276,7 +276,7 @@ class Plan(models.Model):
 
     @property
     def sealed(self) -> bool:
-        """Whether the checkpoints of its trials are still secret."""
+        """Whether the checkpoints of the plan's trials are still secret."""
         return self.blind and self.state in (PlanState.FROZEN, PlanState.CLOSED)
 
 

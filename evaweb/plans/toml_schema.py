@@ -1,4 +1,6 @@
-"""Format of a TOML file with scenes, checkpoints, plans and references; see `exchange` for import and export."""
+"""Format of a TOML file with scenes, checkpoints, plans and references; `toml_exchange` imports and exports such
+files.
+"""
 
 from __future__ import annotations
 
