@@ -11,9 +11,10 @@ from runtime.recording.reader import Episode, open_episode
 
 
 def bench_course(folder: Path) -> list[dict[str, Any]]:
-    """Return the positions of the objects, [{row, blocks, plate}] at each row where they changed, without outcomes.
+    """Return the positions of the objects, [{row, blocks, plate}] at each row where they changed.
 
-    [] for a recording without simulated bench. Raises: RecordingError, which names the absent or damaged file.
+    Outcomes are left out. [] for a recording without simulated bench. Raises: RecordingError, which names the absent or
+    damaged file.
     """
     course: list[dict[str, Any]] = []
     for row, said in truth_changes(open_episode(folder).rows):

@@ -52,7 +52,7 @@ def chunk_arrays(episode: Episode, times_of: Callable[[Array], Array]) -> Stream
 
 
 def _strategies(heads: Any) -> tuple[list[str], Array]:
-    """Return the kinds of strategies, and the index of each chunk's."""
+    """Return the distinct kinds of strategies, and for each chunk the index of its kind (-1: unknown)."""
     kinds = [kind or "" for kind in heads.column("strategy").to_pylist()]
     names = sorted(set(kinds) - {""})
     return names, np.array([names.index(kind) if kind else UNKNOWN for kind in kinds], np.int32)

@@ -12,7 +12,7 @@ from evaweb.stations.models import Station
 
 
 def filters(sight: Visibility) -> list[Filter]:
-    """Return the filters; none is for checkpoints, whose names are found by the word search."""
+    """Return the filters. There is no filter for checkpoints: the word search finds their names."""
     stations = [(station.name, str(station)) for station in Station.objects.all()]
     return [
         Filter("words", "Words", kind=SEARCH, hint="task, scene, checkpoint, operator, code"),

@@ -156,9 +156,9 @@ def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
 
 
 def outcome_change(row: Episode, seal: str | None) -> str:
-    """Return how the outcome of a closed episode has changed, to follow its name; "" if unchanged.
+    """Return how the outcome of a closed episode has changed, as words that follow its name; "" if unchanged.
 
-    `seal` is that of the present outcome: None if there is none, "" if it has no seal.
+    `seal` is that of the present outcome: None if there is no outcome, "" if it has no seal.
     """
     if seal is None:
         return f"is absent, though the recording was closed as {row.status}"
@@ -284,7 +284,10 @@ def _station_of(recorded: RecordedEpisode) -> Station:
 def get_or_create_station(
     *, name: str, robot: str, simulated: bool, source: str, active: bool = True
 ) -> Station:
-    """Return the station of that name; create it with the given values, known from `source`."""
+    """Return the station of that name; create it with the given values if it does not exist.
+
+    `source` names where these values are from, for the log.
+    """
     station, made = Station.objects.get_or_create(
         name=name, defaults={"robot": robot, "simulated": simulated, "title": name, "active": active}
     )

@@ -80,7 +80,7 @@ def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
 
 
 def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
-    """Return the result as damaged if a closed recording lost its outcome, or has another one."""
+    """Return the result of a verification; damaged if a closed recording has no outcome any more, or another one."""
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
     why = outcome_change(row, None if verdict.state == "open" else verdict.seal)
@@ -98,7 +98,7 @@ def _verify_folder(folder: Path) -> IntegrityCheck:
 
 
 def unverified() -> tuple[int, int]:
-    """Return the numbers of damaged recordings, and of closed ones overdue for verification by a day."""
+    """Return the number of damaged recordings, and of closed ones whose verification is overdue by more than a day."""
     late = timezone.now() - LATE_AFTER
     never = Q(verified_at=None, created_at__lt=late - OLD_AFTER)
     closed = Episode.objects.filter(status__in=CLOSED, away_since=None)
