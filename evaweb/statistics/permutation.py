@@ -20,7 +20,7 @@ _MOST = 10_000_000  # greatest product of sums and differences
 
 @dataclass(frozen=True, slots=True)
 class SignFlipTest:
-    """Mean difference of `pairs`, and the two-sided probability of one as far from 0 by chance."""
+    """Mean difference of `pairs`, and the two-sided probability that chance gives a mean at least as far from 0."""
 
     pairs: int
     value: float

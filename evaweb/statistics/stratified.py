@@ -127,7 +127,10 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
 
 
 def _fillings(tables: Sequence[dict[int, int]], left: int) -> Iterator[int]:
-    """Yield the number of combinations of each filling in which the first arm's successes add up to `left`."""
+    """Yield a number of combinations for each choice of successes by stratum.
+
+    They are successes of the first arm, and their sum is `left`.
+    """
     first, *rest = tables
     if not rest:
         if left in first:
