@@ -82,7 +82,7 @@ _LONG_AGO = 0.0  # expiry on the runtime's clock: the command must not be carrie
 
 
 class NotSent(EvaError):
-    """The command was not sent, because its row could not be written."""
+    """Error if a command was not sent, because its row could not be written."""
 
     status = 503
 
@@ -199,9 +199,9 @@ def record_stop(
 def resolve_unknown_outcome(*, row: Command) -> Command:
     """Determine the outcome of a command whose answer was lost; leave the row unchanged if it is still unknown.
 
-    The command is sent again, already expired. A runtime that knows its uuid repeats the first answer. One that does
-    not refuses it as too late and remembers the refusal, so it can never be carried out any more. Stopping commands
-    never expire, and are therefore not sent again.
+    The command is sent again, already expired. If the runtime knows its uuid, it repeats the first answer. If not, it
+    refuses the command as too late and remembers the refusal, so that the command can never be carried out any more.
+    Stopping commands never expire, and are therefore not sent again.
     """
     age = timezone.now() - row.issued_at
     if row.kind in STOPPING or row.status not in _UNANSWERED or age < timedelta(seconds=_patience_s()):
@@ -422,5 +422,5 @@ def _message(
 
 
 def _patience_s() -> float:
-    """Return the time after which no caller waits for an answer any more [s]."""
+    """Return the time [s] after which no caller waits for an answer any more."""
     return settings.EVA_COMMAND_TIMEOUT_S + 1.0

@@ -57,7 +57,7 @@ _CLOCK_KNOWN_S = 60.0  # validity of a measured clock offset
 
 
 class NoAnswer(StationGone):
-    """The request may have arrived and may have been carried out: its outcome is unknown."""
+    """Error if a request may have arrived and may have been carried out: its outcome is unknown."""
 
     status = 504
 

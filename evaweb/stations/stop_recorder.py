@@ -1,7 +1,8 @@
 """Recorder of stops on their way to disk and database: a stop waits for neither.
 
-A thread hands each row on: first into a file of `unwritten`, then into the database. Repeated presses are written once
-a second with a count; until then each has a line in the process journal, which survives a kill.
+A thread passes each row on: first to a file (see unwritten_commands), then to the database. Repeated presses are
+written
+once a second with a count; until then each has a line in the process journal, which survives a kill.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ _Journal = Callable[[Sequence[Command]], object]
 
 
 class StopRecorder:
-    """Queue of rows that a thread passes to `keep`, which may wait for the disk.
+    """Queue of rows, which a thread passes to `keep`; that function may wait for the disk.
 
-    `journal` is called with the rows that have to wait, and with none when all have been passed on.
+    `journal` is called with the rows that have to wait, and with an empty sequence when all have been passed on.
     """
 
     def __init__(
