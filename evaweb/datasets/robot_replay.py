@@ -163,7 +163,9 @@ def replay_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Set a station up to play an episode, given by uuid or DATASET:INDEX; `given` as in `issue_command`.
+    """Set a station up to play an episode, given by uuid or DATASET:INDEX.
+
+    The further arguments are those of `issue_command`.
 
     Raises: EvaError for other commands; Conflict if the station's robot is not the episode's.
     """
