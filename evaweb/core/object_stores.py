@@ -40,7 +40,7 @@ _CHANGED = Pattern(
 
 
 class StoreError(EvaError):
-    """An object store is missing, full or refuses a request; the message names store and request."""
+    """Error if an object store is missing, full or refuses a request; the message names store and request."""
 
     status = 503
 
