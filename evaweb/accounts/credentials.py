@@ -59,11 +59,11 @@ _NO_TURN = Pattern("credentials.no_turn", "login lookup: not served within {seco
 
 
 class Unverifiable(Exception):
-    """The database did not report the user of a credential."""
+    """Error if the database did not report the user of a credential."""
 
 
 class LookupOverload(Exception):
-    """The database responds, but too many lookups from this address are queued."""
+    """Error if the database responds, but too many lookups from this address are queued."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +278,11 @@ class CredentialCache:
             self._asked.pop(key, None)
 
     def _query(self, kind: str, secret: str) -> Login | None:
-        """Look up a credential; kinds "of any age" try the valid credential first, then the expired one."""
+        """Look up a credential and return its login.
+
+        If `kind` is one that also accepts expired credentials, the valid credential is tried first, then the expired
+        one.
+        """
         try:
             with short_lock_wait():
                 for one in (*(now for now, ever in EXPIRED_ALLOWED.items() if ever == kind), kind):

@@ -27,7 +27,7 @@ _NICE = 10
 
 
 class HashingOverload(EvaError):
-    """Too many passwords are being checked."""
+    """Error if too many passwords are being checked."""
 
     status = 503
     retry_after_s = 5
