@@ -68,7 +68,10 @@ def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list
 
 
 def still_judges(judges: Judges) -> Judges:
-    """Register a function of higher layers that returns whether a user still has to judge an episode blind."""
+    """Register a function that returns whether a user still has to judge an episode blind; return the function.
+
+    Apps of higher layers use it as a decorator.
+    """
     _judges.append(judges)
     return judges
 

@@ -163,7 +163,7 @@ def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
 
 @dataclass(frozen=True, slots=True)
 class Tagged:
-    """Tags actually added and removed, without those that were so already."""
+    """Tags that were actually added and removed."""
 
     added: tuple[str, ...]
     removed: tuple[str, ...]
