@@ -36,7 +36,7 @@ _LONGEST_STOP = 4096  # [characters] limit of a stop or halt from a page that fl
 
 
 class BadRequest(EvaError):
-    """Invalid message of a page; the text names what was given and what is allowed."""
+    """Error for an invalid message of a page; the text names the given and the allowed values."""
 
 
 @dataclass(frozen=True, slots=True)

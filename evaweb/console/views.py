@@ -81,7 +81,10 @@ def debug(request: HttpRequest, name: str) -> HttpResponse:
 
 
 def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
-    """Return the station's offer to replay the episode in ?replay=, or the reason why it cannot; {} without ?replay=."""
+    """Return the station's offer to replay the episode in ?replay=, or the reason why it cannot.
+
+    {} without ?replay=.
+    """
     source = request.GET.get("replay", "")
     if not source:
         return {}

@@ -29,7 +29,7 @@ Roles = tuple[int | None, int | None]
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """Draft after an edit: its values now, and the fields that were not written because another user had changed them."""
+    """Draft after an edit: its values now, and the fields not written because another user had changed them."""
 
     now: Values
     conflicts: tuple[str, ...]
