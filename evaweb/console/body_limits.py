@@ -46,8 +46,7 @@ class BodyBound:
 
     With status 0 a longer body is dropped and the request continues. A body longer than `sure` is accepted only if the
     first session of `keys` that has a user is an administrator's. With `may_press`, the first `largest` bytes of a
-    longer
-    body decide whether it is an e-stop press; if it is, the rest of the body is dropped.
+    longer body decide whether it is an e-stop press; if it is, the rest of the body is dropped.
     """
 
     largest: int

@@ -99,8 +99,7 @@ class StationConsumer(AsyncWebsocketConsumer):
         """Dispatch a message to its handler.
 
         Unlike Channels' own method it does not close old database connections first: their thread may be waiting for
-        the
-        database.
+        the database.
         """
         if message["type"] == "websocket.receive":
             await self.websocket_receive(message)
@@ -353,7 +352,10 @@ def _admitted(name: str, sessions: list[str]) -> _Admitted:
 
 
 def _decode_binary(message: bytes) -> str:
-    """Return the text of a binary message: our pages send none, but it may be an e-stop press."""
+    """Return the text of a binary message.
+
+    Our pages send no binary messages, but one from another client may be an e-stop press.
+    """
     return message.decode(json.detect_encoding(message), "replace")
 
 

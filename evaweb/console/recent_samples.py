@@ -45,7 +45,7 @@ class RecentSamples:
     def add_sample(
         self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
     ) -> EncodedPart:
-        """Return the stream after adding the sample of time `now`."""
+        """Add the sample measured at `now`, and return the part of the stream with it."""
         sample = _sample(vectors, words, now)
         if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
             self._samples.clear()  # another robot

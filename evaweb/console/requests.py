@@ -158,7 +158,7 @@ def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
 
 
 def _uuid(said: Mapping[str, Any]) -> UUID:
-    """Return the page's own id, by which it recognises the answer, or a new one."""
+    """Return the uuid in the request, by which the page recognises the answer; a new uuid if it has no valid one."""
     try:
         return UUID(str(said.get("uuid")))
     except ValueError:

@@ -38,11 +38,10 @@ class EvalPanel:
 
     `trial` is the unfinished trial, with the `milestones` of its scene; `failures` are the possible failure levels, and
     `set_up` is whether the station was last set up for that trial. Without a trial, `scene`, `position` and
-    `checkpoint`
-    are the initial choice, which follows from `last`, the newest finished trial. `plans` are the plans open here,
-    `plan`
-    is the selected one, `handout` the trial's allocation, and `cameras` this user's camera check while it is valid.
-    `views` are the reference images by camera: those of the trial's position or, without a trial, of the camera.
+    `checkpoint` are the initial choice, which follows from `last`, the newest finished trial. `plans` are the plans
+    open here, `plan` is the selected one, `handout` the trial's allocation, and `cameras` this user's camera check
+    while it is valid. `views` are the reference images by camera: those of the trial's position or, without a trial, of
+    the camera.
     """
 
     station: Station

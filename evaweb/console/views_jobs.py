@@ -62,12 +62,12 @@ class Row:
 
     @property
     def may_cancel(self) -> bool:
-        """True if it has not ended and was not cancelled."""
+        """True if the job has not ended and was not cancelled."""
         return self.job.cancelled_by_id is None and self.job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
 
     @property
     def may_repeat(self) -> bool:
-        """True if it has failed."""
+        """True if the job has failed."""
         return self.job.status == JobStatus.FAILED
 
     @property

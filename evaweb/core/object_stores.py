@@ -242,7 +242,7 @@ def the_store() -> Store | None:
 
 
 def required_store() -> Store:
-    """Return the lab's store. Raises: StoreError if none is configured any more."""
+    """Return the lab's store. Raises: StoreError if no store is configured any more."""
     store = the_store()
     if store is None:
         raise StoreError(_NO_STORE)

@@ -68,7 +68,7 @@ class PlayedEpisode:
 
     @property
     def result(self) -> str:
-        """Label by its operator, "" if there is none."""
+        """Label that its operator gave the episode, "" if there is none."""
         return result_of(self.told)
 
     @property

@@ -34,8 +34,8 @@ def sync_memberships() -> list[str]:
     """Update the rows of episodes with the dataset that contains them, or with no dataset.
 
     If several datasets contain an episode, one to which it was published is preferred to copies; then a scored one;
-    then
-    the one recorded so far. Unreadable datasets are returned as messages, and rows that refer to them are unchanged.
+    then the one recorded so far. Unreadable datasets are returned as messages, and rows that refer to them are
+    unchanged.
     """
     places: dict[UUID, list[Membership]] = defaultdict(list)
     problems, unread = [], set()
@@ -94,7 +94,7 @@ def _name(folder: Path) -> str:
 
 
 def _places(folder: Path) -> list[tuple[UUID, Membership]]:
-    """Return the lab's episodes in a dataset; foreign ones have no uuid."""
+    """Return the lab's episodes in a dataset; episodes without a uuid, which come from elsewhere, are left out."""
     told = folder / EVA_EPISODES
     if not (folder / INFO).exists():
         return []

@@ -45,8 +45,7 @@ def requested_range(header: str | None, size: int) -> Span | None:
     """Return the single range that `header` requests.
 
     None without a range, for several ranges or a malformed header: then the whole file is the answer, which section
-    14.2
-    permits. Raises: Unsatisfiable.
+    14.2 permits. Raises: Unsatisfiable.
     """
     match = _RANGE.fullmatch(header or "")
     if not match or match[1] == match[2] == "" or max(len(match[1]), len(match[2])) > _DIGITS:

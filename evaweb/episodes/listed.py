@@ -26,7 +26,10 @@ def filters(sight: Visibility) -> list[Filter]:
 
 
 def columns(sight: Visibility) -> list[Column]:
-    """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
+    """Return the columns of the list of episodes.
+
+    Sorting by checkpoint is offered only if no checkpoint is hidden, because the order would reveal it.
+    """
     checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.hides_nothing else ()
     return [
         Column("picture", "Picture", quiet=True),

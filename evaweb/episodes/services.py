@@ -226,7 +226,7 @@ def close_unheard_episodes() -> int:
 
 
 def mark_missing() -> int:
-    """Mark every row without a folder as missing; return the total number of missing ones."""
+    """Mark every row without a folder as missing; return the number of all missing episodes."""
     fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
     known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
     # A recording on another computer is there until it is closed, and then in transfer.

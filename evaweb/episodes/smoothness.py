@@ -38,8 +38,7 @@ class Smoothness:
     """Smoothness of a run: mean over its arms weighted by path length.
 
     It is None if unknown, and `why` is the reason. `arms` has the arms that moved: name -> {"measured", "commanded":
-    SPARC
-    or None, "measured_m", "commanded_m": path length [m]}.
+    SPARC or None, "measured_m", "commanded_m": path length [m]}.
     """
 
     measured: float | None

@@ -53,7 +53,7 @@ class FoundItem:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Items of one kind, best first; `more` if there are others."""
+    """Items of one kind, best first; `more` is True if there are further items."""
 
     name: str
     items: tuple[FoundItem, ...]
@@ -100,7 +100,10 @@ def _ranked(query: str, candidates: Iterable[Candidate]) -> list[FoundItem]:
 
 
 def _narrowed(rows: QuerySet[Any], query: str, *fields: str) -> QuerySet[Any]:
-    """Return the rows with the longest words of the query in some of the fields, prefix matches first."""
+    """Return the first rows that contain the longest words of the query in their `fields`.
+
+    Exact matches come first, then rows that begin with the query.
+    """
     for word in sorted(words_of(query), key=len, reverse=True)[:_COMPARED]:
         rows = rows.filter(_any_of(fields, "icontains", word))
     nearness = Case(
@@ -202,7 +205,10 @@ def _without(query: str, kind: str) -> str:
 
 
 def _trials(query: str) -> list[FoundItem]:
-    """Return the trials by number, then by code, each exact matches first, then prefixes."""
+    """Return the trials whose number begins with the query, then those whose code begins with it.
+
+    In both groups exact matches come first.
+    """
     asked = _without(query, "trial").removeprefix("#")
     rows = Trial.objects.select_related("scene", "position", "station", "handout")
     found: dict[int, Trial] = {}

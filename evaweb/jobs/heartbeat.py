@@ -24,8 +24,8 @@ class Lapse:
 class Heartbeat:
     """Context manager that calls `beat` every `period_s` [s] until the block ends or `beat` returns False.
 
-    It has its own database connection. A failed beat is logged and the next one tried; the job continues until its
-    `lapse`, and is reclaimed by others if no beat arrives for too long.
+    It has its own database connection. If a beat fails, that is logged and the next one is tried. The job continues
+    until its `lapse`; if no beat arrives for too long, other workers reclaim it.
     """
 
     def __init__(self, beat: Callable[[], bool], period_s: float, lapse: Lapse | None = None) -> None:

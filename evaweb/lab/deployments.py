@@ -74,7 +74,7 @@ class StoredDeployment:
 
     @property
     def chosen(self) -> bool:
-        """True if the file was created as a simulated station: the lab starts no others.
+        """True if the file was created as a simulated station; the lab starts no other deployments.
 
         The mark is in the comments at the head of the file, where input from pages never goes.
         """
@@ -169,7 +169,9 @@ def write_draft(
 
 
 def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
-    """Rename the deployment's cameras by what they show; `shown` maps each name to the camera whose image it shows.
+    """Rename the deployment's cameras so that each name fits the image.
+
+    `shown` maps each name to the camera whose image it shows.
 
     Raises:
         EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.

@@ -47,7 +47,7 @@ class Part:
 
     @property
     def further(self) -> list[Typed]:
-        """All other keys."""
+        """Keys whose values are not addresses."""
         return [one for one in self.keys if not one.entry.address]
 
 

@@ -56,8 +56,7 @@ class Walk:
     """First steps of one station, or of a lab without a station, where the first step is the current one.
 
     `snapshot` is the station's state, {} if it does not answer; `kept` is its deployment file, and `standing` the
-    status
-    of that deployment in the lab.
+    status of that deployment in the lab.
     """
 
     station: Station | None

@@ -140,8 +140,7 @@ def record_references(*, user: User, station: Station, position: Position | None
     """Make the current images the references of a position or, if `position` is None, of the cameras themselves.
 
     Older references stay in the record. Regions keep their place in the picture. Raises: Conflict if a running plan
-    uses
-    one of the references as a gate.
+    uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
     found = image_store.current_images(station, cameras_of(station))

@@ -45,8 +45,7 @@ def end_of(kept: str | None, status: str, reason: str, recording: str | None) ->
     """Return the cause that ended a run: one of `ENDINGS`, or "".
 
     It is the stored value `kept`. For trials that predate this value (`kept` is None), it is derived from status,
-    reason
-    and the status of the recording (None without a recording).
+    reason and the status of the recording (None without a recording).
     """
     if kept is not None:
         return kept

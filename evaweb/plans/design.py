@@ -268,7 +268,7 @@ def stored_blocks(plan: Plan) -> list[Block] | None:
 
 
 def blocks_of_record(kept: Mapping[str, Any]) -> list[Block]:
-    """Return the blocks of a `reveal_record`, including old ones that stored pairs."""
+    """Return the blocks of a `reveal_record`; an old record, which stored pairs, is converted to blocks."""
     if "blocks" not in kept:
         return in_blocks([(one, other) for one, other in kept["pairs"]])
     return [tuple((arm, value) for arm, value in block) for block in kept["blocks"]]
@@ -289,7 +289,10 @@ def blocks_that_count(plan: Plan) -> list[Block]:
 
 
 def findings_of(plan: Plan) -> Findings | None:
-    """Return the findings of the frozen design, at the reveal if there was one, else now; None without a comparison."""
+    """Return the findings of the frozen design from the blocks that count; None without a comparison.
+
+    Those are the blocks of the reveal if there was one, else the current ones.
+    """
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return None

@@ -106,8 +106,7 @@ def triggers_suspended(apps: Any, editor: Any) -> None:
     """Drop all triggers during a migration on SQLite.
 
     SQLite cannot rebuild a table that is named in a trigger of another table. The triggers are installed again after
-    the
-    migration.
+    the migration.
     """
     if editor.connection.vendor != "sqlite":
         return

@@ -164,7 +164,7 @@ def resolve_path(row: Any, path: str) -> Any:
 
 
 def to_json_value(value: Any) -> Any:
-    """Return a time, enumeration or UUID as JSON value; others unchanged."""
+    """Return a time, enumeration or UUID as a JSON value; any other value is returned unchanged."""
     if isinstance(value, datetime):
         return value.isoformat()
     if isinstance(value, Enum):

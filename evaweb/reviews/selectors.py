@@ -57,7 +57,7 @@ def report_get(*, uuid: UUID) -> Mapping[str, Any]:
 def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list[Review], list[Segment], int]:
     """Return the reviews and segments that this user may see, and the number of hidden ones.
 
-    Opinions of others are hidden from users who may still have to judge its trial.
+    Opinions of others are hidden from users who may still have to judge the episode's trial.
     """
     reviews, segments = list(reviews_of(episode=episode)), list(segments_of(episode=episode))
     if not sight.hides_episode(episode) and not any(judges(user, episode) for judges in _judges):

@@ -47,7 +47,10 @@ class LoginMiddleware(LoginRequiredMiddleware):
 
 
 class RefusalMiddleware(MiddlewareMixin):
-    """Error responses: a page with the message for a browser that navigates, JSON (`errors.refusal`) otherwise."""
+    """Middleware that gives every error response a message.
+
+    A browser that navigates gets a page, any other client JSON (`errors.refusal`).
+    """
 
     def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
         # REST parses its body itself, checked by evaweb.api.request_validation.
@@ -60,7 +63,9 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Replace an error response without a message, or in HTML to a program, by the common form."""
+        """Return the response; an error response without a message, or in HTML to a program, is replaced by the common
+        form.
+        """
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")
         if status < 400 or spoken or not (_of_programs(request) or status == 405):
@@ -128,7 +133,10 @@ def bad_request(request: HttpRequest, exception: Exception) -> HttpResponse:
 
 
 def server_error(request: HttpRequest) -> HttpResponse:
-    """Respond to an exception: storage faults with a message, others as an internal error (Django's handler500)."""
+    """Respond to an exception (Django's handler500).
+
+    Storage faults have a message; any other exception is reported as an internal error.
+    """
     fault = sys.exc_info()[1]
     refused = storage_error_response(fault)
     if refused is not None:

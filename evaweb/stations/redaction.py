@@ -133,7 +133,7 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
 def redact_events(
     rows: Iterable[Mapping[str, Any]], sight: Visibility, last: int = 0
 ) -> list[dict[str, Any]]:
-    """Return the events that reveal no policy, without the times and the number of the others.
+    """Return the events that reveal no policy, without the times and the number of the hidden ones.
 
     Events are renumbered by their times [us], increasing from `last`: gaps would reveal how many are hidden.
     """

@@ -62,10 +62,8 @@ class RequestCoalescer(Generic[T]):
         """Start `work` or join a pending request with the same `key`; return the future of the answer.
 
         A call with the same `identity` as the pending request shares its answer. A call with another identity causes
-        one
-        further request, sent after this call, and gets its answer; with `shared` it gets the pending request's answer,
-        and
-        the further request is sent regardless.
+        one further request, sent after this call, and gets its answer; with `shared` it gets the pending request's
+        answer, and the further request is sent regardless.
         Raises: TooManyRequests.
         """
         place, flight = (station, key), _PendingRequest(identity, work)

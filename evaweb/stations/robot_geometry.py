@@ -127,7 +127,7 @@ def groups_of(joint_names: Iterable[str]) -> tuple[str, ...]:
 
 
 def describe_robot(robot: str) -> dict[str, Any]:
-    """Return the facts of a robot; if its description is unreadable, empty ones with `error`.
+    """Return the facts of a robot; if its description is unreadable, they are empty, and `error` is the reason.
 
     The page must open nevertheless, because it has the stop buttons.
     """

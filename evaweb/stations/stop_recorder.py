@@ -1,8 +1,7 @@
 """Recorder of stops on their way to disk and database: a stop waits for neither.
 
 A thread passes each row on: first to a file (see unwritten_commands), then to the database. Repeated presses are
-written
-once a second with a count; until then each has a line in the process journal, which survives a kill.
+written once a second with a count; until then each has a line in the process journal, which survives a kill.
 """
 
 from __future__ import annotations
@@ -66,7 +65,9 @@ class StopRecorder:
             self._run_soon()
 
     def _drop_one(self) -> None:
-        """Drop the oldest failed stop, as for an unknown station; if there is none, the oldest."""
+        """Drop the oldest stop that failed, for example for an unknown station; if no stop failed, drop the oldest
+        one.
+        """
         failed = (key for key, (row, _) in self._waiting.items() if row.status == CommandStatus.FAILED)
         key = next(failed, None)
         lost = self._waiting.pop(key or next(iter(self._waiting)))

@@ -471,7 +471,7 @@ def _region(look: StoppingTable, margin: float | None) -> NDArray[np.bool_]:
 
 
 def _degrees(n: int, m: int, margin: float | None) -> NDArray[np.float64]:
-    """Return `extremeness_of` all tables of a look: float64 [n + 1, m + 1]."""
+    """Return the extremeness (see `extremeness_of`) of every table of a look: float64 [n + 1, m + 1]."""
     import numpy as np
 
     a: NDArray[np.float64] = np.arange(n + 1.0)[:, None]

@@ -95,8 +95,7 @@ class Outlook:
     """Comparison of all designs; each tuple is in the order of RULES.
 
     `needs`: design that reaches the wanted power; `chances`: power and number of pairs with the given pairs; `powers`:
-    one
-    tuple of powers per gain.
+    one tuple of powers per gain.
     """
 
     needs: tuple[DesignPower | None, ...]

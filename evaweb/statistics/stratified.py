@@ -35,7 +35,7 @@ class StratumTable:
 
     @property
     def ways(self) -> dict[int, int]:
-        """Number of combinations for each number of the first arm's successes that these margins allow."""
+        """Number of combinations by the first arm's number of successes, for each number that the margins allow."""
         successes = self.x1 + self.x2
         lowest, highest = max(0, successes - self.n2), min(self.n1, successes)
         return {

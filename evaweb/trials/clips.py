@@ -30,7 +30,7 @@ class Clip:
 
     @property
     def description(self) -> str:
-        """Description of the part."""
+        """Description of the part of the video."""
         return f"after “{self.after}”" if self.after else f"the last {self.end - self.begin:.0f} s"
 
 

@@ -44,8 +44,7 @@ def trial_failure(
     a `reason`, the old and new terms are recorded as the reason. An identical request adds nothing.
 
     Raises: Conflict if the trial has no score that counts, or if `score`, the uuid of the score that the user saw, is
-    not
-    that score.
+    not that score.
     """
     require_role(user, Role.OPERATOR)
     with transaction.atomic():

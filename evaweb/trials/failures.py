@@ -103,8 +103,7 @@ def check_failure(
     """Raise EvaError if a score must not have these `words` (by field).
 
     `said` are the words of the previous score, which may stay. A phase must be one of the lab's. A cause must be one
-    too
-    if it is given with a phase, or if the scene requires both from human raters; a cause alone may be any text, as
+    too if it is given with a phase, or if the scene requires both from human raters; a cause alone may be any text, as
     programs send it.
     """
     for field in FIELDS if success else ():

@@ -82,7 +82,7 @@ def score_outcome(
 ) -> ScoredOutcome:
     """Return the outcome of one trial from `ticks`: milestone id -> reached, for each of the scene's milestones.
 
-    A trial is a success if all required milestones are reached. If none is required, `success` must be given.
+    A trial is a success if all required milestones are reached. If no milestone is required, `success` must be given.
 
     Args:
         times: Milestone id -> time of reaching it [s after the start of the run], if known. A milestone reached

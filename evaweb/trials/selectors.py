@@ -64,7 +64,10 @@ def scene_get(*, name: str | int) -> Scene:
 
 
 def checkpoint_get(*, name: str | int, sight: Visibility = FULL_VISIBILITY) -> Checkpoint:
-    """Return the checkpoint of that name or id. Raises: NotFound, also for a hidden one; lists the visible ones."""
+    """Return the checkpoint of that name or id.
+
+    Raises: NotFound if it does not exist or is hidden from the user; the message lists the visible checkpoints.
+    """
     return _by_name(_checkpoints(sight), "checkpoint", name)
 
 
@@ -191,7 +194,7 @@ class TrialFilters:
 
 
 def trial_list(filters: TrialFilters | None = None, sight: Visibility = FULL_VISIBILITY) -> QuerySet[Trial]:
-    """Return the matching trials, newest first, with the rows that name them."""
+    """Return the matching trials, newest first, with the related rows that lists of trials name."""
     rows = Trial.objects.select_related(*_NAMED, "verdict__rater").order_by("-prepared_at", "-pk")
     return (filters or TrialFilters()).apply(rows, sight)
 

@@ -153,12 +153,15 @@ def register_settled(told: Callable[[Trial, Any], None]) -> None:
 
 
 def declare_failing(rule: Callable[[Trial], str]) -> None:
-    """Register a rule that returns why a trial is a failure whatever was reached, "" if it is not."""
+    """Register a rule that returns the reason for which a trial is a failure by itself, "" if it is not.
+
+    Such a trial is a failure whatever milestones were reached.
+    """
     _failing.append(rule)
 
 
 def failing(trial: Trial) -> str:
-    """Return why the trial is a failure whatever was reached; "" if its milestones decide."""
+    """Return the reason for which the trial is a failure by itself; "" if its milestones decide."""
     return next((why for rule in _failing if (why := rule(trial))), "")
 
 

@@ -79,7 +79,7 @@ def trial_command(
     uuid: UUID | str | None = None,
     args: Mapping[str, Any] | None = None,
 ) -> Command:
-    """Send a command for a trial; `setup` and `run` get their arguments from the trial, others use `args`.
+    """Send a command for a trial; `setup` and `run` get their arguments from the trial, other commands from `args`.
 
     Never call it within a transaction. After an accepted run the trial is running and its episode has a row.
     Raises: Conflict if the trial is not prepared, or the station was last set up for something else.

@@ -211,7 +211,10 @@ def _record_truth(station: Station, event: Mapping[str, Any]) -> Trial | None:
 
 
 def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
-    """Apply the closing of a recording: it has the exact duration; an incomplete one interrupts the trial."""
+    """Apply the closing of a recording to its trial, and return the trial.
+
+    The trial gets the exact duration of the recording; an incomplete recording interrupts it.
+    """
     data = event.get("data") or {}
     trial = _lock_latest(station=station, episode_id=_uuid(data.get("uuid")))
     if trial is None or data.get("waits"):  # waits for disk space: the event is repeated when it is closed

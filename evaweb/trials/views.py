@@ -212,7 +212,10 @@ def _filters(sight: Visibility) -> list[Filter]:
 
 
 def _columns(sight: Visibility) -> list[Column]:
-    """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
+    """Return the columns of the list of trials.
+
+    Sorting by checkpoint is offered only if no checkpoint is hidden, because the order would reveal it.
+    """
     return [
         Column("trial", "Trial", ("pk",), down=True),
         Column("prepared", "Prepared", ("prepared_at",), down=True),

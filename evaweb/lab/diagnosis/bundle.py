@@ -113,7 +113,7 @@ def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Na
 
 
 def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield names and ends of logs; none for blind readers, because logs name checkpoints and servers."""
+    """Yield names and ends of logs; no logs for blind readers, because logs name checkpoints and servers."""
     if not sight.hides_nothing:
         return
     room = LONGEST_LOGS

@@ -104,15 +104,16 @@ def analyse(
         outcomes: Trials that count.
         interruptions: Interrupted runs; they only count for the rate of interventions.
         alpha: Error probability of all comparisons together.
-        planned: Verdicts by planned comparison, in its direction; in unplanned ones the better checkpoint is first.
-        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there are
-            no pairs.
+        planned: Verdicts by planned comparison, in its direction; in unplanned ones the better checkpoint is
+            first.
+        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there
+            are no pairs.
         limits: Time limits [s] of the scenes that have one. The smallest is the horizon of times to success;
             without any, the longest run.
         checkpoints: All checkpoints of the evaluation in the order of their colours, whichever were selected.
         whole: Whether these are all trials of a plan, with blocks numbered from 0. Evidence then ends before the
-            first incomplete block, as in the plan's design: otherwise the choice of the next trial could influence
-            it.
+            first incomplete block, as in the plan's design: otherwise the choice of the next trial could
+            influence it.
         recipes: Recipe of each checkpoint that is one of its training runs.
     """
     by_design = planned or {}

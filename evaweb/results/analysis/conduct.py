@@ -212,10 +212,10 @@ def _accepted(looks: Iterable[BenchImage]) -> dict[int, tuple[float | None, str]
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Return the trials that count by operator or station and checkpoint.
+    """Return the trials that count by checkpoint, for each operator or each station; `name` selects which.
 
-    `uneven` is the largest number of trials by which one of them differs from its proportional share of a checkpoint's
-    trials. Dropped checkpoints and random order alone do not increase it.
+    `uneven` is the largest number of trials by which an operator or station differs from its proportional share of a
+    checkpoint's trials. Dropped checkpoints and random order alone do not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -342,7 +342,7 @@ def _amendments(plan: Plan) -> list[dict[str, Any]]:
 def _edits(plan: Plan) -> list[dict[str, Any]]:
     """Return changes of the plan's scenes and checkpoints between freezing and reveal, including reverted ones.
 
-    Source is the log of the administration and the scene editor.
+    The source is the log of the administration and the scene editor.
     """
     if plan.frozen_at is None:
         return []

@@ -46,7 +46,8 @@ class Statistic:
             determine it.
         key: Name in JSON, also used by REST and reports; "" if another declaration writes the value.
         form: Function from the value to its JSON.
-        write: Used instead of `key` and `form`: function from the whole arm or comparison to a part of its JSON object.
+        write: Used instead of `key` and `form`: function from the whole arm or comparison to a part of its JSON
+            object.
         answers: Function from comparison, value and context to the answers.
         rank: Order of the answers; within one rank they are in the order of declarations.
         none_too: Whether `answers` is also called with the value None.

@@ -10,7 +10,10 @@ from evaweb.statistics.sequential import Evidence
 
 
 def rate_words(found: Proportion) -> str:
-    """Return for example "46/50, 92 % [81, 97]"; a percentage is never shown without n and interval."""
+    """Return the rate as text, for example "46/50, 92 % [81, 97]".
+
+    A percentage is never shown without n and interval.
+    """
     if found.rate is None or found.interval is None:
         return "no trial"
     return f"{found.successes}/{found.n}, {100 * found.rate:.0f} % [{format_interval(found.interval)}]"
@@ -22,12 +25,12 @@ def format_interval(interval: Interval, factor: float = 100) -> str:
 
 
 def format_points(found: Difference) -> str:
-    """Return for example "36 points [19, 51]"."""
+    """Return a difference as text, for example "36 points [19, 51]"."""
     return f"{_signed(100 * found.value)} points [{format_interval(found.interval)}]"
 
 
 def signed_points(share: float) -> str:
-    """Return for example "+36 points"."""
+    """Return a share as text, for example "+36 points"."""
     return f"{100 * share:+.0f} points".replace("-", "−")
 
 
@@ -67,7 +70,7 @@ def evidence_text(found: Evidence) -> str:
 
 
 def anytime_text(found: Interval | None, pairs: int) -> str:
-    """Return for example "[−3, 55] points, of 40 pairs"."""
+    """Return a confidence sequence as text, for example "[−3, 55] points, of 40 pairs"."""
     return (
         f"[{format_interval(found)}] points, of {pairs} pairs"
         if found

@@ -171,8 +171,8 @@ def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[s
     """Return for each comparison its number of blocks, the block of its end, its winner, and p of a fixed number's
     test.
 
-    If checkpoints are dropped, comparisons are decided block by block: the first to end in the schedule's order
-    decides which checkpoints remain.
+    If checkpoints are dropped, comparisons are decided block by block: the first to end in the schedule's order decides
+    which checkpoints remain.
     """
     names, arms = comparisons_of(plan), arms_of(plan)
     sides = [(arms.index(first), arms.index(second)) for first, second in names]

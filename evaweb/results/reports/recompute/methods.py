@@ -181,7 +181,7 @@ def better(x1: int, n1: int, x2: int, n2: int) -> float:
 
 
 def mcnemar(first_only: int, second_only: int) -> float:
-    """Return the two-sided probability of a split of the discordant pairs as uneven as this."""
+    """Return the two-sided probability that chance splits the discordant pairs at least as unevenly."""
     n = first_only + second_only
     if n == 0:
         return 1.0
