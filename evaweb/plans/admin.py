@@ -84,7 +84,7 @@ class Conditions(forms.ModelMultipleChoiceField):
 
 
 class EventInline(ReadOnly, admin.TabularInline):
-    """Events of a plan."""
+    """Table of a plan's events on its admin page."""
 
     model = PlanEvent
     extra = 0
@@ -113,7 +113,7 @@ class FileForm(forms.Form):
 
 @admin.register(Plan)
 class PlanAdmin(admin.ModelAdmin):
-    """Plans: a question, and the trials that answer it."""
+    """Admin page of plans."""
 
     form = PlanForm
     list_display = ("title", "name", "version", "state", "owner", "blind", "trials", "frozen_at")

@@ -63,8 +63,9 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Return the response; an error response without a message, or in HTML to a program, is replaced by the common
-        form.
+        """Return the response, or the common form of an error response instead.
+
+        That replaces an error response without a message, and one in HTML to a program.
         """
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")

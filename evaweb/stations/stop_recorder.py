@@ -65,9 +65,7 @@ class StopRecorder:
             self._run_soon()
 
     def _drop_one(self) -> None:
-        """Drop the oldest stop that failed, for example for an unknown station; if no stop failed, drop the oldest
-        one.
-        """
+        """Drop the oldest failed stop, for example of an unknown station; if no stop failed, the oldest of all."""
         failed = (key for key, (row, _) in self._waiting.items() if row.status == CommandStatus.FAILED)
         key = next(failed, None)
         lost = self._waiting.pop(key or next(iter(self._waiting)))

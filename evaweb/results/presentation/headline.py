@@ -177,7 +177,7 @@ def _ranks(found: Design, arms: Sequence[str], said: Findings) -> bool:
 
 
 def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """Return the sentence on the best of three or more checkpoints, or on those that no other was found better than.
+    """Return the sentence on the best of three or more checkpoints, or on those that no comparison found worse.
 
     "" if it was not asked for or is not decided, or if a test of scores only shows that they differ.
     """
