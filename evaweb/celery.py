@@ -16,7 +16,10 @@ log = logging.getLogger(__name__)
 
 
 class Transport(filesystem.Transport):
-    """File-system transport with short polls: celery's loop polls for two seconds at a time, twice while it ends."""
+    """File-system transport that polls for a short time only.
+
+    Celery's loop would poll for two seconds at a time, and twice while it ends.
+    """
 
     def drain_events(self, connection: Any, timeout: float | None = None) -> Any:
         """Deliver pending messages; raise socket.timeout if no message arrives within _LONGEST_S."""

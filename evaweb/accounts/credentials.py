@@ -77,7 +77,7 @@ class Login:
 
     @property
     def account(self) -> Any:
-        """Unsaved model instance for foreign keys, without a query."""
+        """Unsaved model instance of the user, for foreign keys; needs no query."""
         return get_user_model()(pk=self.pk, username=self.username)
 
 
@@ -108,7 +108,10 @@ class CredentialCache:
         }
 
     def register_kind(self, kind: str, owner: Callable[[str], Any]) -> None:
-        """Register the function that looks up the user of a credential of `kind`, None if there is none."""
+        """Register the function `owner`, which looks up the user of a credential of `kind`.
+
+        It returns None if there is no such user.
+        """
         self._owners[kind] = owner
 
     def look_up(self, kind: str, secret: str) -> Any:

@@ -85,7 +85,10 @@ class StationEventIngester:
         self._news.set()
 
     def _write(self) -> None:
-        """Write the lease first, then events, then lost results; a station without a row is skipped."""
+        """Write the lease first, then events, then outcomes of commands and preflights whose answers were lost.
+
+        A station without a row is skipped.
+        """
         sweep = time.monotonic() - self._swept > _SWEEP_S
         state, history = self._feed.state, self._feed.history
         lease = self._lease_of(state)

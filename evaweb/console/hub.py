@@ -185,7 +185,7 @@ class StationRoom:
             self._looking = None
 
     def _flush(self) -> None:
-        """Send to all pages; pages with the same parts get the same bytes."""
+        """Send the pending frames to all pages; pages with the same parts get the same bytes."""
         self._timer, self._flushed = None, self._loop.time()
         self._frames += 1
         now, made = time.monotonic(), {}

@@ -118,7 +118,7 @@ class Mailbox:
         self._covered_up_to = (history.newest, last) if self.redacts_events else (0, 0)
 
     def _send(self, message: dict[str, object]) -> bool:
-        """Send a text, unless the page has not responded to many; return whether it was sent."""
+        """Send a text, unless the page has left many texts unanswered; return whether it was sent."""
         if self._unheard >= _TEXTS_UNHEARD:
             return False
         self._unheard += 1

@@ -48,7 +48,7 @@ class Watch:
 
 @dataclass(frozen=True, slots=True)
 class Credit:
-    """Report that a frame has been drawn."""
+    """Message of a page that it has drawn a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Renew:
 
 @dataclass(frozen=True, slots=True)
 class EStop:
-    """E-stop press."""
+    """E-stop press of a page."""
 
     uuid: UUID
     why: str
@@ -69,7 +69,7 @@ class EStop:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Stop or halt, under the lease of this epoch."""
+    """Stop or halt of a page, under the lease of this epoch."""
 
     kind: str
     uuid: UUID
@@ -96,7 +96,7 @@ Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
 def may_be_stop(text: str) -> bool:
-    """Return True if a message that is not parsed completely may stop a robot."""
+    """Return True if a message may stop a robot; for this it need not be parsed completely."""
     if pressing.parse_json_press(text, "type") is not None:
         return True
     return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))

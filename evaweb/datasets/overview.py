@@ -171,7 +171,7 @@ def overviews() -> list[Overview]:
 
 
 def camera_keys(features: dict[str, Any]) -> dict[str, str]:
-    """Return the feature of each camera's images, videos first, by its short name."""
+    """Return a dict from each camera's short name to the feature of its images; videos come first."""
     keys = [*layout.video_keys(features), *layout.image_keys(features)]
     return {key.removeprefix("observation.images.").removeprefix("observation."): key for key in keys}
 

@@ -93,7 +93,7 @@ class PlayedEpisode:
 
     @property
     def cameras(self) -> dict[str, str]:
-        """Feature of each camera's images by its short name."""
+        """Dict from each camera's short name to the feature of its images."""
         return camera_keys(dict(self.dataset.features))
 
     def video(self, camera: str) -> Span | None:

@@ -134,7 +134,7 @@ class ReplayOffer:
 
     @property
     def run(self) -> str:
-        """Arguments of the run command, as JSON: it ends by itself after the last row."""
+        """Arguments of the run command, as JSON: the run ends by itself after the last row."""
         return json.dumps({"duration_s": round(self.recorded.seconds + TAIL_S, 3)})
 
     @property
@@ -260,7 +260,10 @@ def make_offer(recorded: PlayableEpisode, station: Station, space: str) -> Repla
 
 
 def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
-    """Return the facts of the station's robot and True; else those of its description and False."""
+    """Return the robot's facts, and whether they are from the running station.
+
+    If it does not respond, the facts are those of the robot's description.
+    """
     try:
         return connection_to(station.name).status()["facts"], True
     except (StationGone, KeyError):

@@ -59,7 +59,7 @@ def _strategies(heads: Any) -> tuple[list[str], Array]:
 
 
 def _planned(raw: Any, numbers: Array) -> tuple[Array, Array]:
-    """Return the first and the last row of each chunk with a planned step."""
+    """Return for each chunk the first and the last of its rows that have a planned step."""
     used = raw.filter(np.asarray(raw.column("target_step").to_numpy() >= 0))
     places = np.searchsorted(numbers, used.column("chunk_id").to_numpy())
     index = used.column("index").to_numpy()

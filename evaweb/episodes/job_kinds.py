@@ -172,7 +172,7 @@ def reconcile_all(work: JobContext) -> Mapping[str, Any]:
 
 @startup_task("reconcile")
 def reconcile_at_start() -> None:
-    """Reconcile with changes on the disk while no worker was running."""
+    """Reconcile the database with changes that were made on the disk while no worker was running."""
     enqueue(kind="reconcile", key="reconcile", args={})
 
 

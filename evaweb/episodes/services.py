@@ -205,7 +205,7 @@ def request_smoothness(*, most: int) -> int:
 
 
 def request_publish(*, episode: Episode, version: str = "") -> Job | None:
-    """Queue the publication of an episode, again with the current score if it is published.
+    """Queue the publication of an episode; if it is published already, it is published again with the current score.
 
     `version` is that of a new dataset, "" for the default. Returns None for a run with a simulated robot, which is
     never published.

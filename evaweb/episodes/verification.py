@@ -43,7 +43,10 @@ def request_scrub() -> Job | None:
 
 
 def scrub_due(work: JobContext) -> Mapping[str, Any]:
-    """Verify the next due recordings and store each result immediately; return the counts."""
+    """Verify the next due recordings and store each result immediately.
+
+    Returns: Number of recordings by result.
+    """
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
     for uuid in _next():
@@ -63,7 +66,10 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
 
 
 def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
-    """Store the result of a verification on disk and in the row; return it with changes known from the row."""
+    """Store the result of a verification on disk and in the row.
+
+    Returns: The result after the comparison with the row (see `compare_with_row`).
+    """
     row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
     verdict = compare_with_row(row, verdict) if row else verdict
     if verdict.state == "damaged":

@@ -93,7 +93,7 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
 
 
 def _ranked(query: str, candidates: Iterable[Candidate]) -> list[FoundItem]:
-    """Return the matching items, best first, equal ranks in the given order."""
+    """Return the matching items, best first; items of equal rank keep the given order."""
     fits = [(rank(query, found.title, more), found) for found, more in candidates]
     known = [(fit, found) for fit, found in fits if fit is not None]
     return [found for _, found in sorted(known, key=lambda one: one[0])]
@@ -171,7 +171,7 @@ def _scenes(query: str, role: Role) -> Iterator[Candidate]:
 
 
 def _administered(kind: str, key: int, name: str, role: Role) -> str:
-    """Return the address of the editor for administrators, and of the recordings for other users."""
+    """Return the address of an item: that of its editor for administrators, of its recordings for other users."""
     if role is Role.ADMIN:
         return reverse(f"admin:trials_{kind}_change", args=[key])
     return f"{reverse('replay-list')}?{urlencode({'words': name})}"

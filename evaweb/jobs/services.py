@@ -225,7 +225,7 @@ def _tell(job: Job, progress: str) -> None:
 
 
 def heartbeat(*, job: Job) -> bool:
-    """Record a heartbeat of the job; return False if this claim has lost it."""
+    """Record a heartbeat of the job; return False if this process has lost its claim to the job."""
     return bool(_ours(job).update(seen_at=Now()))
 
 

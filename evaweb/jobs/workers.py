@@ -79,7 +79,7 @@ def lab_folder_named() -> None:
 
 
 def record_heartbeat(*, owner: UUID, queues: Sequence[str]) -> bool:
-    """Record a heartbeat of the worker, which registers it; return True."""
+    """Record a heartbeat of the worker, which also registers a new worker; always return True."""
     told = {
         "host": socket.gethostname(),
         "queues": list(queues),

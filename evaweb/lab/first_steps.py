@@ -39,7 +39,7 @@ class Progress(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Step with its name, which is also that of its template, its title and progress."""
+    """Step with its name, title and progress; its template has the same name."""
 
     name: str
     title: str
@@ -103,7 +103,10 @@ _TITLES = {
 
 
 def walk(*, name: str = "") -> Walk:
-    """Return the steps of the named station, else of the newest; it need not have a database row yet."""
+    """Return the steps of the station called `name`, which need not have a database row yet.
+
+    If there is no such station, they are those of the newest.
+    """
     stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
     kept = stored_deployment(name) if name else None
     station = next((one for one in stations if one.name == name), None)

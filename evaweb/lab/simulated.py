@@ -110,8 +110,9 @@ def _starting(
 
 
 def known_port(name: str) -> int:
-    """Return the port of the checkpoint's previous policy server if it is free, else 0: a frozen plan
-    contains the address.
+    """Return the port of the checkpoint's previous policy server if it is free, else 0.
+
+    The same port is preferred because a frozen plan contains the address.
     """
     return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
 

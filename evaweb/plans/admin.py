@@ -63,11 +63,11 @@ class PlanForm(forms.ModelForm):
         fields = _FROZEN
 
     def clean_strategy(self) -> Any:
-        """Return None for an empty field: the plan has no strategy of its own."""
+        """Return the strategy's table; None for an empty field: then the plan has no strategy of its own."""
         return self.cleaned_data["strategy"] or None
 
     def clean_look_after(self) -> list[int]:
-        """Return [] for an empty field: a look after every pair."""
+        """Return the numbers of pairs; [] for an empty field: then there is a look after every pair."""
         try:
             given = self.cleaned_data["look_after"]
             return [] if given in self.fields["look_after"].empty_values else look_schedule(given)

@@ -165,7 +165,7 @@ def record_references(*, user: User, station: Station, position: Position | None
 
 @transaction.atomic
 def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
-    """Create a reference with the same picture and these regions: [{"name", "x", "y", "width", "height"}, ...].
+    """Create a reference with the same picture and the regions `drawn`: [{"name", "x", "y", "width", "height"}, ...].
 
     Raises: Conflict if there is a newer one, or a running plan with a least match has used this camera's reference.
     """

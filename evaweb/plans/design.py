@@ -395,7 +395,10 @@ def counted_now(plan: Plan) -> dict[str, Any]:
 
 
 def _sums(plan: Plan) -> list[dict[str, Any]]:
-    """Return by checkpoint the counting trials, successes and mean score, in the order of the document."""
+    """Return for each checkpoint the number of counting trials and of successes, and the mean score.
+
+    The order is that of the plan's document.
+    """
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by("number")
     found: dict[str, list[tuple[bool, float]]] = defaultdict(list)
     for name, success, score in rows.values_list(

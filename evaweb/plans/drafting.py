@@ -77,7 +77,7 @@ def merged(
 
 
 def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
-    """Set the draft's fields to `values`; only positions, stations and checkpoints are saved."""
+    """Set the draft's fields to `values`; of these, only positions, stations and checkpoints are saved here."""
     roles = _roles(plan)  # read before the change: their meaning depends on `comparing`
     for name in values.keys() & set(_PLAIN):
         setattr(plan, name, values[name])

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class RevealLine(Line):
-    """Reveal of a plan, with the result that counts from then on."""
+    """Journal line of a plan's reveal, with the result that counts from then on."""
 
     kind: Literal["reveal"] = "reveal"
     name: str

@@ -35,7 +35,10 @@ def plan_list(*, user: Any) -> QuerySet[Plan]:
 
 
 def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
-    """Return that version, or the newest that is not a draft. Raises: NotFound, which lists the existing plans."""
+    """Return version `version` of the plan, or its newest version that is not a draft.
+
+    Raises: NotFound, which lists the existing plans.
+    """
     rows = plan_list(user=user).filter(name=name).order_by("-version")
     frozen = rows.exclude(state=PlanState.DRAFT)
     found = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()

@@ -147,7 +147,10 @@ def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> 
 
 
 def require_drafter(user: User) -> None:
-    """Raise NotAllowed unless the user may create plans: a frozen blind plan hides its checkpoints from all."""
+    """Raise NotAllowed unless the user may create plans.
+
+    Only administrators may, because a frozen blind plan hides its checkpoints from all users.
+    """
     if role_of(user) is not Role.ADMIN:
         raise NotAllowed(_ADMINISTRATORS_MAKE_PLANS)
 

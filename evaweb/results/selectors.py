@@ -127,7 +127,7 @@ def plan_at_reveal(digest: str) -> Plan:
 
 
 def plan_get(*, name: str, version: int | None = None) -> Plan:
-    """Return that version of the plan, or its newest.
+    """Return version `version` of the plan, or without it the newest version.
 
     Raises:
         NotFound: If it does not exist; the message names the versions.
@@ -161,7 +161,10 @@ def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
 
 
 def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
-    """Return the plans with their progress, in two queries; independent of checkpoints, so that it reveals nothing."""
+    """Return the plans with their progress, in two queries.
+
+    The progress does not depend on checkpoints, so that it reveals nothing.
+    """
     given = list(plans)
     slots = Slot.objects.filter(plan__in=given).order_by().values_list("plan").annotate(n=Count("pk"))
     foreseen: dict[int, int] = dict(slots)

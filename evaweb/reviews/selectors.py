@@ -99,9 +99,9 @@ def unreviewed_episodes() -> QuerySet[Episode]:
 
 
 def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
-    """Return the next unreviewed episode after `after` in the list, wrapping around, and the number of all.
+    """Return the next unreviewed episode after `after` in the list, wrapping around, and the number of unreviewed ones.
 
-    Without `after` the first. The episode itself is never returned.
+    Without `after` it is the first. The episode `after` itself is never returned.
     """
     waiting = unreviewed_episodes()
     count = waiting.count()

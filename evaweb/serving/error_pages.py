@@ -37,7 +37,10 @@ _FAILED = fixed("web.failed", "this failed; see the log of the web")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):
-    """Login middleware that skips the user lookup for views without login; Django's own queries the user for all."""
+    """Login middleware that does not look up the user for views without login.
+
+    Django's own middleware queries the user for all views.
+    """
 
     def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
         if not getattr(view, "login_required", True):

@@ -41,7 +41,10 @@ class ManyNames:
     """Authentication backend that refuses addresses from which passwords of many names are guessed."""
 
     def authenticate(self, request: HttpRequest | None, **given: Any) -> None:
-        """Raise PermissionDenied for such an address; the axes middleware then responds with `lockout_response`."""
+        """Raise PermissionDenied for an address from which passwords of many names are guessed.
+
+        The axes middleware then responds with `lockout_response`.
+        """
         if request is not None and _many_names_until(request) is not None:
             request.axes_locked_out = True  # type: ignore[attr-defined]
             raise PermissionDenied

@@ -35,7 +35,7 @@ class Missing:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Kind of thing: description, count, newest item, addresses of list and form, and what is missing."""
+    """Card of one kind of thing: description, count, newest item, addresses of list and form, and what is missing."""
 
     title: str
     what: str

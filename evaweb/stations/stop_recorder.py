@@ -76,7 +76,7 @@ class StopRecorder:
             )
 
     def write_due(self, *, all_of_them: bool = False) -> float | None:
-        """Pass on all rows that are due; return the delay until the next one [s], None if none is waiting."""
+        """Pass on all rows that are due; return the delay until the next row [s], None if no row is waiting."""
         now = self._clock()
         with self._news:
             self._written = {key: at for key, at in self._written.items() if now - at < _APART_S}
@@ -154,7 +154,7 @@ def merge_key(row: Command) -> _Key:
 
 
 def _has_station(row: Command) -> bool:
-    """Return True if the station exists or the disk does not tell: an extra record is better than a lost one."""
+    """Return True if the station exists, or if the disk fails: an extra record is better than a lost one."""
     if row.station.pk is not None:
         return True
     try:

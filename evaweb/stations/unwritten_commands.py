@@ -106,7 +106,7 @@ class UnwrittenCommands:
     def _adopt(self, lines: Sequence[bytes]) -> bool:
         """Store the journaled commands of a killed process: one per merge key, with a count.
 
-        Returns: Whether all lines were commands; others are logged.
+        Returns: Whether all lines were commands; other lines are logged.
         """
         counted: dict[tuple[str, ...], list[Command]] = {}
         whole = True

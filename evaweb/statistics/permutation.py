@@ -33,7 +33,7 @@ def sign_flip_test(differences: Sequence[float], widest: float = 1.0) -> SignFli
     Exact: all 2^n combinations of signs are counted.
 
     Raises:
-        StatisticsError: If there is no difference, or one lies outside.
+        StatisticsError: If there is no difference, or one is outside -widest to widest.
     """
     if not differences:
         raise StatisticsError("no pair: a permutation test needs at least one")

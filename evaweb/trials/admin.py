@@ -285,7 +285,7 @@ class FailureTermAdmin(LabelledRows, ActiveActions, admin.ModelAdmin):
 
 
 class CheckpointForm(forms.ModelForm):
-    """Form of a policy and its connection."""
+    """Form of a checkpoint: its policy, and the connection to it."""
 
     policy = Table(
         required=False,
@@ -324,12 +324,12 @@ class CheckpointForm(forms.ModelForm):
         )
 
     def clean_policy(self) -> dict[str, Any]:
-        """Return {} for an empty field: everything as in the deployment."""
+        """Return the policy's table; {} for an empty field: then everything is as in the deployment."""
         given = self.cleaned_data["policy"]
         return {} if given is None else given
 
     def clean_strategy(self) -> Any:
-        """Return None for an empty field: the strategy of plan or station."""
+        """Return the strategy's table; None for an empty field: then that of the plan or station applies."""
         return self.cleaned_data["strategy"] or None
 
 
@@ -407,18 +407,18 @@ class CheckpointAdmin(ActiveActions, LogsValues):
 
 
 class ReadOnly:
-    """Mixin of read-only records."""
+    """Mixin of admin pages of read-only records."""
 
     def has_add_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Return False."""
+        """Return False: records cannot be added here."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Return False."""
+        """Return False: records cannot be changed."""
         return False
 
     def has_delete_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Return False."""
+        """Return False: records cannot be deleted."""
         return False
 
 

@@ -81,7 +81,7 @@ def ordered_terms() -> Mapping[str, tuple[str, ...]]:
 
 
 def clean_failure(*, failure_phase: str, failure: str) -> dict[str, str]:
-    """Return phase and cause as stored. Raises: EvaError if they cannot be."""
+    """Return phase and cause in the form in which they are stored. Raises: EvaError if they cannot be stored."""
     found = {
         "failure": clean_text("failure", failure, LONGEST_FAILURE),
         "failure_phase": clean_text("failure_phase", failure_phase, LONGEST_FAILURE),

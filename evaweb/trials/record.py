@@ -54,7 +54,7 @@ class Column(RowPath):
     label: str = ""  # label on the trial's page; "" if it is shown elsewhere or not at all
 
     def shown(self, name: str, hint: Any, trial: Trial, sight: Visibility) -> Any:
-        """Return the value as this user may see it."""
+        """Return the column's value for a trial, as this user may see it."""
         if self.masked_value is not None:
             return self.masked_value(sight, trial)
         if self.always_visible or not sight.hides(trial):
@@ -207,7 +207,7 @@ def visible_labels(trial: Trial, sight: Visibility) -> Iterator[tuple[str, Any]]
 
 
 class OutcomeLine(Line):
-    """Milestone as it was at scoring time."""
+    """Milestone in a score's journal line, as it was at scoring time."""
 
     order: _Small
     text: Annotated[str, Field(max_length=200)]
@@ -218,7 +218,7 @@ class OutcomeLine(Line):
 
 
 class ScoreLine(Line):
-    """Score of a trial."""
+    """Journal line of a score of a trial."""
 
     kind: Literal["score"] = "score"
     uuid: UUID
@@ -243,7 +243,7 @@ class ScoreLine(Line):
 
 
 class VoidLine(Line):
-    """Void of a trial."""
+    """Journal line of a void of a trial."""
 
     kind: Literal["void"] = "void"
     trial: TrialRecord
@@ -258,7 +258,7 @@ class VoidLine(Line):
 
 
 class VoidRequestLine(Line):
-    """Request of an operator to void a trial."""
+    """Journal line of an operator's request to void a trial."""
 
     kind: Literal["void_request"] = "void_request"
     uuid: UUID
@@ -269,7 +269,10 @@ class VoidRequestLine(Line):
 
 
 class VoidAnswerLine(Line):
-    """Answer to a void request; `at` is when it was answered, or lapsed through a user's action."""
+    """Journal line of the answer to a void request.
+
+    `at` is when it was answered, or when it lapsed through a user's action.
+    """
 
     ELSEWHERE = frozenset({"kind", "uuid"})
     kind: Literal["void_answer"] = "void_answer"

@@ -255,7 +255,10 @@ def _score(trial: Trial, line: ScoreLine) -> None:
 
 
 def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int, str], Milestone]:
-    """Return the scene's milestones by order and text; a placeholder scene gets those of the first score with any."""
+    """Return the scene's milestones by order and text.
+
+    A placeholder scene gets the milestones of the first score that has any.
+    """
     if (
         not scene.active
         and scene.criterion.startswith(placeholders.PLACEHOLDER_NOTE)

@@ -125,7 +125,7 @@ def scene_write(
 
 
 def _equals(scene: Scene, wanted: SceneTable) -> bool:
-    """Return True if the scene already equals `wanted`; new rows have no id there."""
+    """Return True if the scene already equals `wanted`, in which new rows have no id."""
     there = SceneTable.model_validate(scene_table(scene))
     pairs = (
         zip(there.positions, wanted.positions, strict=False),
@@ -241,7 +241,10 @@ def _write_milestones(scene: Scene, wanted: Sequence[MilestoneTable]) -> list[Fa
 
 
 def _make_room(scene: Scene, n: int) -> None:
-    """Move rows that are not in the first `n` places out of them, so that the order stays unique at all times."""
+    """Move all milestones of the scene to places above the first `n`, so that these are free.
+
+    The order so stays unique while the milestones are then moved to their new places one by one.
+    """
     taken = set(scene.milestones.values_list("order", flat=True))
     free = (place for place in count(n + 1) if place not in taken)
     for row in scene.milestones.all():

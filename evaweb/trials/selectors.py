@@ -221,7 +221,7 @@ def attempts_of(*, trial: Trial) -> QuerySet[Trial]:
 
 
 def commands_of(*, trial: Trial) -> QuerySet[Command]:
-    """Return the commands sent to its station from its preparation to its end, oldest first."""
+    """Return the commands sent to the trial's station between its preparation and its end, oldest first."""
     until = trial.ended_at or (None if trial.status in UNFINISHED else trial.changed_at)
     asked = Command.objects.filter(station=trial.station, issued_at__gte=trial.prepared_at)
     asked = asked.filter(issued_at__lte=until) if until else asked

@@ -439,7 +439,9 @@ def lock_trial(trial: Trial) -> Trial:
 
 
 def _reject_repeat(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
-    """Raise Conflict if this equals an earlier score of the rater, as it may be a late copy of a corrected one."""
+    """Raise Conflict if this equals an earlier score of the rater: it may be a late copy of a score that was
+    corrected.
+    """
     before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
     if any(_is_same_score(score, said, found) for score in before):
         raise Conflict(_SAID_BEFORE(trial=trial.pk))

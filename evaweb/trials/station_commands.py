@@ -255,7 +255,7 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
 
 
 def _require_same(first: Command, trial: Trial, same: bool) -> None:
-    """Raise Conflict if the uuid was used for another trial; a repeated one returns its first answer."""
+    """Raise Conflict unless the command that already has this uuid is the `same` command for this trial."""
     if not same:
         raise Conflict(_UUID_OF_ANOTHER(uuid=first.pk, first=first, trial=trial.pk))
 

@@ -175,7 +175,7 @@ def bench_images(trial: Trial) -> list[Any]:
 
 
 def _is_checked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
-    """Whether the milestone's box is ticked: as typed, else as last scored."""
+    """Return True if the milestone's box is ticked: as typed, else as last scored."""
     if typed and "milestones" in typed:
         return bool(typed["milestones"].get(milestone))
     outcomes = trial.scores.all()[0].outcomes.all() if trial.verdict_id else ()

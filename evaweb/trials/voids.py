@@ -63,12 +63,12 @@ def register_two_person_rule(rule: Callable[[Trial], bool]) -> None:
 
 
 def needs_two_people(trial: Trial) -> bool:
-    """Whether voiding the trial needs the agreement of a second operator."""
+    """Return True if voiding the trial needs the agreement of a second operator."""
     return trial.verdict_id is not None and any(rule(trial) for rule in _rules)
 
 
 def can_answer_void(trial: Trial, user: User) -> bool:
-    """Whether the trial has an open void request that this user may answer."""
+    """Return True if the trial has an open void request that this user may answer."""
     asked = trial.void_requests.filter(answer="").first()
     return asked is not None and _why_not(asked, user) is None
 

@@ -163,7 +163,7 @@ def _write_times(arm: Arm) -> dict[str, Any]:
 
 
 def _write_failures(arm: Arm) -> dict[str, Any]:
-    """Return the number of failures by specified cause, over all phases, and all modes."""
+    """Return the number of failures by cause, summed over all phases, and the list of all failure modes."""
     by_cause: Counter[str] = Counter()
     for mode in arm.failures:
         if mode.cause:

@@ -65,7 +65,9 @@ class PowerRequest:
         return sorted(found | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
 
     def at(self, rule: str, pairs: int) -> DesignPower:
-        """Return the power of a design with `pairs` pairs, its looks at the same shares of the trials."""
+        """Return the power of a design with `pairs` pairs, whose looks are at the same shares of its trials as
+        requested.
+        """
         if self.scores is not None:
             return _computed(score_course, rule, pairs, self.scores, self.alpha)
         looks = self.looks if rule == self.rule else ()
@@ -148,7 +150,7 @@ def _need(asked: PowerRequest, rule: str) -> _Step:
 
 
 class _Desk:
-    """Queue of requests; only the newest of each person is computed, earlier ones are abandoned."""
+    """Queue of requests; of each person only the newest request is computed."""
 
     def __init__(self) -> None:
         self._changed = Condition()

@@ -67,7 +67,7 @@ class Statistic:
 
 
 def statistic(*declared: Any, **more: Any) -> Any:
-    """Return the field of a dataclass that is a `Statistic`."""
+    """Return a dataclass field that declares a `Statistic` with these arguments."""
     return field(metadata={_ROW: Statistic(*declared, **more)})
 
 

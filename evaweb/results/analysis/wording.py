@@ -35,12 +35,12 @@ def signed_points(share: float) -> str:
 
 
 def probability(p: float) -> str:
-    """Return a probability in the format of papers."""
+    """Return a probability as papers print it, for example "0.03" or "< 0.001"."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def p_words(p: float) -> str:
-    """Return "p = 0.03" or "p < 0.001"."""
+    """Return a p-value as text, for example "p = 0.03" or "p < 0.001"."""
     return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
 
 
@@ -60,7 +60,7 @@ def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
 
 
 def evidence_text(found: Evidence) -> str:
-    """Return the state of the evidence as text, and whether it suffices."""
+    """Return as text whether the evidence suffices, and since when or how strong it is."""
     if found.stop is not None:
         return f"suffices since pair {found.stop}"
     if not found.pairs:

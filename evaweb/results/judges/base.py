@@ -89,11 +89,11 @@ class CaseJudgement:
 
 
 class Judge(Protocol):
-    """Judge of whether a trial's milestones were reached; called once per trial."""
+    """Automatic judge of whether a trial's milestones were reached; it is called once per trial."""
 
     @property
     def version(self) -> str:
-        """Version; it changes whenever the same case could be judged differently."""
+        """Version of the judge; it changes whenever the same case could be judged differently."""
 
     def prompt_text(self, case: TrialCase) -> str:
         """Return the complete text of the prompt, "" if there is none."""

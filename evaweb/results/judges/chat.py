@@ -160,7 +160,7 @@ class ChatJudge:
 
     @property
     def version(self) -> str:
-        """Version with the name of the model."""
+        """Version of the judge, with the name of the model."""
         return f"chat 1, {self._setup.model}"
 
     def prompt_text(self, case: TrialCase) -> str:

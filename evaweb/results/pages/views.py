@@ -104,7 +104,7 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
-    """Render the trials behind a number."""
+    """Render the list of the plan's trials that the filters in the address select."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -149,7 +149,7 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render how the trials were made, and the headline under each reason for doubt."""
+    """Render how the trials were made, and the alternative headlines."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:

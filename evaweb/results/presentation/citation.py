@@ -88,7 +88,10 @@ class Citation:
 
     @property
     def address(self) -> str:
-        """Path of its page, permanent after a reveal; without a host, because a lab may have several names."""
+        """Path of the citation's page, permanent after a reveal.
+
+        It has no host, because a lab may have several names.
+        """
         if self.digest:
             return reverse("result-frozen", args=[self.digest])
         return reverse("result-cite", args=[self.plan.name, self.plan.version])

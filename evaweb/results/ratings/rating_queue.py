@@ -103,7 +103,7 @@ class Pair:
 
 
 def rating_sample(plan: Plan) -> list[int]:
-    """Return the schedule positions of the trials to rate again, in their order; drawn by the plan's key."""
+    """Return the schedule positions of the trials to be rated again, in a random order drawn by the plan's key."""
     n = plan.slots.count()
     drawn = SeededDraws(bytes(plan.key or b""), "second rater").shuffled(range(n))
     return drawn[: math.ceil(plan.second_rater_share * n)]
@@ -311,7 +311,7 @@ def _handout(plan: Plan, code: str) -> Handout:
 
 
 def _is_repeat(before: T, said: Mapping[str, Any], twice: str) -> T:
-    """Return the earlier answer if the same is sent again, as after a lost reply.
+    """Return the earlier answer `before`, because the same answer was sent again, as after a lost reply.
 
     Raises:
         Conflict: If the new answer differs.

@@ -55,13 +55,13 @@ def difference_text(found: Difference) -> str:
 
 @register.filter
 def probability(p: float) -> str:
-    """Return a probability in the format of papers."""
+    """Return a probability as papers print it, for example "0.03" or "< 0.001"."""
     return wording.probability(p)
 
 
 @register.filter
 def p_value_text(p: float) -> str:
-    """Return "p = 0.03" or "p < 0.001"."""
+    """Return a p-value as text, for example "p = 0.03" or "p < 0.001"."""
     return wording.p_words(p)
 
 
@@ -145,7 +145,7 @@ def minus(count: int, shown: list[Any]) -> int:
 
 @register.filter
 def field_text(name: str) -> str:
-    """Return a draft's field by its name on the page."""
+    """Return the name of a draft's field as the page shows it."""
     return _FIELD_WORDS.get(name, name.replace("_", " ").capitalize())
 
 

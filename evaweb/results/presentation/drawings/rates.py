@@ -110,7 +110,10 @@ def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
 
 
 def draw_difference(found: Comparison) -> Drawing:
-    """Draw the first minus the second in percentage points, with Newcombe's interval, on an axis centred at 0."""
+    """Draw the first checkpoint's rate minus the second's in percentage points.
+
+    The interval is Newcombe's; the axis is centred at 0.
+    """
     height = 114
     scale = Scale(-1, 1, 30, WIDTH - 30)
     interval = found.difference.interval

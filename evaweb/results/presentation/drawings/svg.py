@@ -126,12 +126,12 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def words(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> str:
-    """Return a line of text."""
+    """Return an element with one line of text at (`x`, `y`)."""
     return element("text", escape(text), x=float(x), y=float(y), text_anchor=anchor, class_=class_ or None)
 
 
 def line(points: Sequence[tuple[float, float]], class_: str) -> str:
-    """Return straight lines between points."""
+    """Return an element with straight lines between points."""
     return element("path", d=path(points), class_=class_)
 
 
@@ -152,7 +152,10 @@ def series(i: int | None) -> str:
 
 
 def mark(i: int | None, x: float, y: float, r: float = 5) -> str:
-    """Return the mark of the i-th series, with its own shape because not every reader can distinguish the colours."""
+    """Return the mark of the i-th series.
+
+    Each series has a shape of its own, because not every reader can distinguish the colours.
+    """
     shapes = (
         f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
         path([(x - r, y - r), (x + r, y - r), (x + r, y + r), (x - r, y + r)]) + "Z",

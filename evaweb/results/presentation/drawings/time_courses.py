@@ -258,7 +258,7 @@ def _names(labels: Sequence[tuple[float, int, str]], x: float, lowest: float) ->
 def _apart(
     labels: Sequence[tuple[float, int, str]], gap: float, lowest: float
 ) -> list[tuple[float, int, str]]:
-    """Return the labels moved down until none overlaps, and up again if they would leave the figure."""
+    """Return the labels moved down until they do not overlap, and up again if they would leave the figure."""
     placed: list[tuple[float, int, str]] = []
     for y, i, name in sorted(labels):
         placed.append((max(y, placed[-1][0] + gap) if placed else y, i, name))

@@ -76,7 +76,7 @@ def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
 
 
 def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
+    """Return a dict from each milestone's text to its value; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:
         label, n = text, 1

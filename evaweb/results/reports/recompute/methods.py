@@ -44,7 +44,9 @@ Ends = list[float]
 
 
 def solve(rises: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """Return the argument in [low, high] at which an increasing function has the `wanted` value, by bisection."""
+    """Return the argument in [low, high] at which the increasing function `rises` has the `wanted` value, by
+    bisection.
+    """
     for _ in range(200):
         middle = (low + high) / 2
         if not low < middle < high:
@@ -296,7 +298,7 @@ def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, ob
 
 
 def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
-    """Return log e after each pair (outcome of the worse, outcome of the better) of a bet on the latter."""
+    """Return log e after each pair of outcomes (first, second), for a bet that the second arm is better."""
     log_e, path = 0.0, []
     for t, (worse, better_one) in enumerate(pairs):
         p = (1 + sum(w for w, _ in pairs[:t])) / (3 + t)

@@ -88,7 +88,7 @@ class Node:
                 yield " " if each.tag in ("br", "p", "li", "td", "th", "div", "dd", "dt") else ""
 
     def all(self, *tags: str) -> Iterator[Node]:
-        """Yield the descendants in document order, with these tags or all."""
+        """Yield the descendants that have one of these tags, or all without tags, in document order."""
         for each in self.inner:
             if isinstance(each, Node):
                 if not tags or each.tag in tags:

@@ -130,7 +130,7 @@ def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
 
 
 def _cells(arm: Mapping[str, Any]) -> list[str]:
-    """Return the cells of a checkpoint's row after its letters."""
+    """Return the expected cells of a checkpoint's row that follow its letters."""
     rate = f"{arm['successes']}/{arm['n']}, {100 * arm['rate']:.0f} % [{_ends(arm['wilson'])}]"
     means = (
         f"{100 * arm[name]['value']:.0f} % [{_ends(arm[name]['gaffke'])}]" for name in ("score", "macro")
