@@ -32,7 +32,10 @@ _SWEEP_S = 5.0  # period of searching for lost results
 
 
 class StationEventIngester:
-    """Thread that writes one station's events and lease changes to the database, in order and each at least once."""
+    """Thread that writes one station's events and lease changes to the database.
+
+    They are written in order, and each at least once.
+    """
 
     def __init__(self, station: str, heard: Feeds) -> None:
         self._station = station

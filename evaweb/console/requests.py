@@ -53,7 +53,7 @@ class Credit:
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """Heartbeat of the page that holds the lease of this epoch; `hidden` tells whether its browser tab is hidden."""
+    """Heartbeat of the page that holds the lease of this epoch; `hidden` is True if its browser tab is hidden."""
 
     epoch: int
     hidden: bool = False

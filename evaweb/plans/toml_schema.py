@@ -115,7 +115,7 @@ class ReferenceTable(Table):
 
 
 class File(Table):
-    """Whole file."""
+    """Content of a whole file."""
 
     scene: list[SceneTable] = []
     checkpoint: list[CheckpointTable] = []

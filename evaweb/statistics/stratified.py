@@ -127,9 +127,9 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
 
 
 def _fillings(tables: Sequence[dict[int, int]], left: int) -> Iterator[int]:
-    """Yield a number of combinations for each choice of successes by stratum.
+    """Yield a number of combinations for each choice of successes of the first arm in every stratum.
 
-    They are successes of the first arm, and their sum is `left`.
+    Only choices whose sum is `left` are considered.
     """
     first, *rest = tables
     if not rest:

@@ -200,7 +200,7 @@ def _share(
 ) -> float:
     """Return alpha of one comparison.
 
-    Planned comparisons share alpha equally; any other comparison has an equal share among all of them.
+    Planned comparisons share alpha equally. For any other comparison it is divided by the number of all comparisons.
     """
     return alpha / (len(planned) if couple in planned else len(couples))
 
