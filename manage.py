@@ -12,7 +12,7 @@ from robots.broken_pipe import exit_on_broken_pipe
 
 @exit_on_broken_pipe
 def main() -> int:
-    """Exit code 0, or that of the command."""
+    """Run the command line; return the exit code."""
     os.environ.setdefault("DJANGO_SETTINGS_MODULE", "evaweb.settings")
     try:
         execute_from_command_line(sys.argv)

@@ -16,10 +16,13 @@ log = logging.getLogger(__name__)
 
 
 class Transport(filesystem.Transport):
-    """File-system transport with short polls: celery's loop polls for two seconds at a time, twice while it ends."""
+    """File-system transport that polls for a short time only.
+
+    Celery's loop would poll for two seconds at a time, and twice while it ends.
+    """
 
     def drain_events(self, connection: Any, timeout: float | None = None) -> Any:
-        """Deliver pending messages; raise socket.timeout if none arrives within _LONGEST_S at most."""
+        """Deliver pending messages; raise socket.timeout if no message arrives within _LONGEST_S."""
         return super().drain_events(connection, timeout=min(timeout or _LONGEST_S, _LONGEST_S))
 
 

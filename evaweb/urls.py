@@ -15,7 +15,7 @@ from evaweb.lab import first_account
 
 @login_not_required
 async def healthz(request: HttpRequest) -> HttpResponse:
-    """Respond as long as this process works; checks neither database nor stations."""
+    """Return "ok" as long as this process works; neither database nor stations are checked."""
     return HttpResponse("ok\n", content_type="text/plain")
 
 

@@ -60,7 +60,10 @@ class LabAdminSite(AdminSite):
 
 
 class LabelledRows:
-    """Mixin of a ModelAdmin with an editable list: screen readers get a label per field, as column heads are none."""
+    """Mixin of a ModelAdmin with an editable list: each field gets a label for screen readers.
+
+    The column heads are not labels of the fields for them.
+    """
 
     def get_changelist_form(self, request: HttpRequest, **named: Any) -> Any:
         """Return the form with an aria-label per field, which names field and row."""

@@ -59,11 +59,11 @@ _NO_TURN = Pattern("credentials.no_turn", "login lookup: not served within {seco
 
 
 class Unverifiable(Exception):
-    """The database did not report the user of a credential."""
+    """Error if the database did not report the user of a credential."""
 
 
 class LookupOverload(Exception):
-    """The database responds, but too many lookups from this address are queued."""
+    """Error if the database responds, but too many lookups from this address are queued."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Login:
 
     @property
     def account(self) -> Any:
-        """Unsaved model instance for foreign keys, without a query."""
+        """Unsaved model instance of the user, for foreign keys; needs no query."""
         return get_user_model()(pk=self.pk, username=self.username)
 
 
@@ -108,7 +108,10 @@ class CredentialCache:
         }
 
     def register_kind(self, kind: str, owner: Callable[[str], Any]) -> None:
-        """Register the function that looks up the user of a credential of `kind`, None if there is none."""
+        """Register the function `owner`, which looks up the user of a credential of `kind`.
+
+        It returns None if there is no such user.
+        """
         self._owners[kind] = owner
 
     def look_up(self, kind: str, secret: str) -> Any:
@@ -278,7 +281,11 @@ class CredentialCache:
             self._asked.pop(key, None)
 
     def _query(self, kind: str, secret: str) -> Login | None:
-        """Look up a credential; kinds "of any age" try the valid credential first, then the expired one."""
+        """Look up a credential and return its login.
+
+        If `kind` is one that also accepts expired credentials, the valid credential is tried first, then the expired
+        one.
+        """
         try:
             with short_lock_wait():
                 for one in (*(now for now, ever in EXPIRED_ALLOWED.items() if ever == kind), kind):

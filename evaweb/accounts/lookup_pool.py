@@ -1,4 +1,7 @@
-"""Thread pool for database lookups that strangers can cause: clients have shares, a crowd waits behind itself."""
+"""Thread pool for database lookups that unknown clients can cause.
+
+Each client has a share, so that many lookups of one client delay only that client.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ _MOST = 1024  # queued lookups of all shares
 
 
 class LookupQueueFull(Exception):
-    """The queue is full."""
+    """Error if the queue of lookups is full."""
 
     def __init__(self) -> None:
         super().__init__("too many logins from this address are looked up at once")

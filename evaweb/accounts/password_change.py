@@ -14,7 +14,7 @@ from evaweb.accounts.client_addresses import lockable_of
 
 
 class OwnPasswordForm(PasswordChangeForm):
-    """Django's form, whose check of the old password counts as a login attempt."""
+    """Form for a new password, whose check of the old password counts as a login attempt."""
 
     request: Any = None
 
@@ -31,7 +31,7 @@ class OwnPasswordForm(PasswordChangeForm):
 
 
 class OwnPasswordView(PasswordChangeView):
-    """Django's view with the lab's template and form."""
+    """Page for a new password, with the lab's template and form."""
 
     form_class = OwnPasswordForm
     template_name = "registration/password.html"

@@ -27,7 +27,7 @@ _NICE = 10
 
 
 class HashingOverload(EvaError):
-    """Too many passwords are being checked."""
+    """Error if too many passwords are being checked."""
 
     status = 503
     retry_after_s = 5
@@ -41,7 +41,7 @@ _turns: FairLookupPool[str] = FairLookupPool(1, _MOST_WAITING, "passwords", _low
 
 
 class QueuedHasher(PBKDF2PasswordHasher):
-    """Django's PBKDF2 hashes, computed in one thread of this process."""
+    """Password hasher like Django's PBKDF2 hasher that computes in one thread of this process."""
 
     def encode(self, password: str, salt: str, iterations: int | None = None) -> str:
         """Return the hash. Raises: HashingOverload if too many are waiting."""

@@ -67,7 +67,7 @@ def set_role(*, user: Any, role: Role) -> None:
 
 
 def get_or_create_person(name: str) -> Any:
-    """Return the account of that name; if it is gone, create it deactivated and without a password."""
+    """Return the account of that name; if there is none, create it deactivated and without a password."""
     from django.contrib.auth import get_user_model  # models cannot be imported before the apps are ready
 
     person, made = get_user_model().objects.get_or_create(

@@ -1,7 +1,7 @@
-"""Redaction of a station's messages for users from whom a checkpoint is hidden: what they need to act, not more.
+"""Redaction of a station's messages for users from whom a checkpoint is hidden: only what they need to act remains.
 
-A message is shown if its id is listed here, with all arguments that are names and numbers of robot, cameras or
-people, or messages that are shown themselves. A refusal by safety is reduced to the limit, without the policy's values.
+A message is shown if its id is listed here, with all arguments that are names and numbers of robot, cameras or people,
+or messages that are shown themselves. A refusal by safety is reduced to the limit, without the policy's values.
 Everything else is hidden, also foreign text within a message: a fault may name a server.
 """
 

@@ -10,7 +10,7 @@ from evaweb.collect.models import CollectSession, Demonstration, SessionEvent
 
 
 class _ReadOnlyAdmin(admin.ModelAdmin):
-    """Base of read-only records."""
+    """Base of admin pages of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -37,7 +37,7 @@ class _Events(admin.TabularInline):
 
 @admin.register(CollectSession)
 class CollectSessionAdmin(_ReadOnlyAdmin):
-    """Collection sessions; opened, closed and resumed on the station's Collect page."""
+    """Admin page of sessions, which are opened, closed and resumed on the station's Collect page."""
 
     list_display = ("task", "dataset", "station", "operator", "target", "episodes", "opened_at", "closed_at")
     list_filter = ("station", "dataset", "operator")
@@ -56,7 +56,7 @@ class CollectSessionAdmin(_ReadOnlyAdmin):
 
 @admin.register(Demonstration)
 class DemonstrationAdmin(_ReadOnlyAdmin):
-    """Demonstrations with their labels."""
+    """Admin page of demonstrations with their labels."""
 
     list_display = ("episode", "session", "result", "discarded", "labelled_by", "labelled_at")
     list_filter = ("result", "discarded", "session__dataset")

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class CollectConfig(AppConfig):
-    """Collection sessions and their demonstrations."""
+    """Configuration of the app for collection sessions and their demonstrations."""
 
     name = "evaweb.collect"
     default_auto_field = "django.db.models.BigAutoField"

@@ -36,7 +36,11 @@ class EventLine(Line):
 
     @classmethod
     def written(cls, row: SessionEvent, **given: Any) -> dict[str, Any]:
-        """Return the line; `opened` has the whole session, `target` the target, others neither."""
+        """Return the line of an event that is about to be saved.
+
+        The line of `opened` has all values of the session, that of `target` only the target; other kinds have none of
+        them.
+        """
         without = {"opened": (), "target": _OPENED}.get(row.kind, ("target", *_OPENED))
         return {name: value for name, value in super().written(row).items() if name not in without}
 

@@ -110,7 +110,7 @@ def _from_manifest(uuid: UUID, episode: Episode) -> CollectSession:
 
 
 def _create(uuid: UUID, station: Station, **facts: Any) -> CollectSession:
-    """Create the session; closed if another one is open at the station."""
+    """Create the session; it is closed if the station has another open session."""
     if facts["closed_at"] is None and CollectSession.objects.filter(station=station, closed_at=None).exists():
         facts["closed_at"] = timezone.now()
     return CollectSession.objects.create(uuid=uuid, station=station, **facts)

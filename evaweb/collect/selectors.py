@@ -29,7 +29,10 @@ PUBLISHED_RESULTS = (Result.SUCCESS.value, Result.PARTIAL.value)
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Numbers of a session's episodes: `saved` (complete, not discarded) in all and by result; `cut` are incomplete."""
+    """Numbers of a session's episodes.
+
+    `saved` (complete, not discarded) are counted in all and by result; `cut` are incomplete, not discarded episodes.
+    """
 
     saved: int
     success: int
@@ -125,7 +128,10 @@ def demonstrations_of(*, session: CollectSession) -> QuerySet[Demonstration]:
 
 
 def accepted_demonstrations(*, session: CollectSession, results: tuple[str, ...]) -> QuerySet[Demonstration]:
-    """Return those that may be published: complete, not discarded, with these results, not failed by review."""
+    """Return the session's demonstrations that may be published.
+
+    They are complete, not discarded, have one of `results`, and were not failed by a review.
+    """
     return (
         demonstrations_of(session=session)
         .filter(_saved(), result__in=results)

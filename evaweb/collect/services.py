@@ -224,9 +224,9 @@ def _require_none_open(station: Station) -> None:
 
 
 def _commanded_snapshot(user: Any, station: Station, *, needed: bool = True) -> dict[str, Any]:
-    """Return the station's snapshot. Raises: Conflict while another user commands it.
+    """Return the station's snapshot; {} if the station does not respond and the snapshot is not `needed`.
 
-    If not `needed`, {} for a station that does not respond.
+    Raises: Conflict while another user commands the station.
     """
     try:
         snapshot = connection_to(station.name).status()

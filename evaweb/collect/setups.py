@@ -26,7 +26,7 @@ _PLAIN = ("robot", "groups", "joints", "fps")
 
 
 class SetupChanged(Conflict):
-    """The station's set-up differs from that of the session."""
+    """Error if the station's set-up differs from that of the session."""
 
 
 def setup_from_snapshot(snapshot: Mapping[str, Any], station: str) -> dict[str, Any]:

@@ -83,7 +83,10 @@ class AimQueries:
 
 
 def _refused(reason: str) -> dict[str, Any]:
-    """Return a refusal; `sentence` holds the reason's pattern id and arguments, because "id" is the query's."""
+    """Return a refused answer to a query.
+
+    Its `sentence` holds the reason's pattern id and arguments, because the answer's own "id" is that of the query.
+    """
     known = {"sentence": identity(reason)} if isinstance(reason, Sentence) else {}
     return {"ok": False, "reason": reason, **known}
 
@@ -91,7 +94,7 @@ def _refused(reason: str) -> dict[str, Any]:
 def query_aim(
     station: str, username: str, args: Mapping[str, Any], looks: DrawnRobot | None
 ) -> dict[str, Any]:
-    """Return the station's answer about a target, with the poses of the links there as `links` [P * 16]."""
+    """Return the station's answer about a target; `links` [P * 16] in it are the poses of the links at that target."""
     command = messages.Command(str(uuid4()), "aim", args, user=username, holder=username)
     try:
         messages.encode(command)  # an encoding error is the page's fault, not the station's
@@ -107,7 +110,10 @@ def query_aim(
 
 
 def _links(looks: DrawnRobot | None, joints: Any) -> list[float]:
-    """Return the pose of every link in the world frame, each matrix column by column; [] if the robot is not drawn."""
+    """Return the pose of every link at `joints` in the world frame, each matrix in column-major order.
+
+    [] if the robot is not drawn.
+    """
     target = np.asarray(joints, np.float64)
     if looks is None or target.shape != (looks.robot.dim,):
         return []

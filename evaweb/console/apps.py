@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class ConsoleConfig(AppConfig):
-    """Live page of a station, and its live socket."""
+    """Configuration of the app for the live page of a station and its live socket."""
 
     name = "evaweb.console"
     default_auto_field = "django.db.models.BigAutoField"

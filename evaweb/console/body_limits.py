@@ -42,12 +42,11 @@ _LINGER_S = (
 
 @dataclass(frozen=True, slots=True)
 class BodyBound:
-    """Limit of a request body [bytes], and the refusal of a longer one; with status 0 the body is dropped and the
-    request continues.
+    """Limit of a request body (`largest`, in bytes), and the refusal of a longer one.
 
-    A body longer than `sure` is accepted only if the first session of `keys` with a user is an administrator's. With
-    `may_press`, the first `largest` bytes of a longer body decide whether it is an e-stop press, whose remaining body
-    is dropped.
+    With status 0 a longer body is dropped and the request continues. A body longer than `sure` is accepted only if the
+    first session of `keys` that has a user is an administrator's. With `may_press`, the first `largest` bytes of a
+    longer body decide whether it is an e-stop press; if it is, the rest of the body is dropped.
     """
 
     largest: int
@@ -101,7 +100,7 @@ class BoundedRequest(WebRequest):
         super().__init__(*given, parsePOSTFormSubmission=False, **named)
 
     def gotLength(self, length: int | None) -> None:
-        """Check the length after the headers have arrived."""
+        """Check the length that the headers declare; refuse a body that is too long, or look up its sender."""
         self._path = unquote_to_bytes(self.channel._path.partition(b"?")[0])
         headers = self.requestHeaders
         cookies = headers.getRawHeaders(b"cookie", [])
@@ -146,7 +145,9 @@ class BoundedRequest(WebRequest):
         super().connectionLost(reason)
 
     def admitted(self) -> None:
-        """Called when a client was granted a long body, which may take time to arrive."""
+        """Do nothing; a subclass overrides this to react when a client is granted a long body, which may take time to
+        arrive.
+        """
 
     def _too_long(self) -> None:
         if self._bound.may_press:

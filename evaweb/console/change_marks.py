@@ -24,7 +24,7 @@ ChangeMarks = dict[str, Any]
 
 
 async def read_marks(station: str) -> ChangeMarks | None:
-    """Return the station's current marks, or None if the database does not answer: nothing live depends on it."""
+    """Return the station's current marks, or None if the database does not answer, which stops nothing live."""
     try:
         return await database_sync_to_async(change_marks, thread_sensitive=False)(station)
     except Error as error:

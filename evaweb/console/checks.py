@@ -12,7 +12,7 @@ _WANTED = {"uplot/uPlot.esm.js": "curves", "meshcat/main.min.js": "the 3D scene"
 
 @register()
 def check_third_party_scripts(**options: Any) -> list[CheckMessage]:
-    """Warn if a third-party script is not found among the static files."""
+    """Return a warning for each third-party script that is not found among the static files."""
     return [
         Warning(
             f"{script} is absent: pages are shown without {what}",

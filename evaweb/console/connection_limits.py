@@ -89,7 +89,7 @@ class Request(BoundedRequest):
         self.channel.transport.sent()
 
     def process(self) -> None:
-        """Process the complete request: stops at once, everything else in its turn of the event loop."""
+        """Process the complete request: a stop at once, any other request in its turn of the event loop."""
         self.channel.transport.sent()
         if is_stop(self.path):
             super().process()
@@ -107,7 +107,7 @@ class Request(BoundedRequest):
 
 
 class StopRequest(Request):
-    """Request to the process for stops: without a long body and without websockets."""
+    """Request to the process for stops, which accepts neither long bodies nor websockets."""
 
     bound_of = staticmethod(stop_bound_of)
 
@@ -130,7 +130,7 @@ class _Connection(ProtocolWrapper):
         self.factory.arrivals.remove(id(self))
 
     def answered(self) -> None:
-        """Wait for the next request on this connection."""
+        """Limit the connection again while it waits for its next request."""
         self._wait(NEXT_REQUEST_S, self.transport.loseConnection)
 
     def _wait(self, seconds: float, close: Callable[[], object]) -> None:

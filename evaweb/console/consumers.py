@@ -96,8 +96,10 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._leave()
 
     async def dispatch(self, message: dict[str, Any]) -> None:
-        """Dispatch without Channels' closing of old database connections, whose thread may be waiting for the
-        database.
+        """Dispatch a message to its handler.
+
+        Unlike Channels' own method it does not close old database connections first: their thread may be waiting for
+        the database.
         """
         if message["type"] == "websocket.receive":
             await self.websocket_receive(message)
@@ -106,8 +108,9 @@ class StationConsumer(AsyncWebsocketConsumer):
             await super().dispatch(message)
 
     async def connect(self) -> None:
-        """Accept the socket, and close it with a code if the page is not allowed: browsers report only codes
-        sent after accepting.
+        """Accept the socket, and close it with a code if the page is not allowed.
+
+        It is accepted first because browsers report only codes that are sent after accepting.
         """
         await self.accept()
         said = (value.decode("latin-1") for name, value in self.scope["headers"] if name == b"cookie")
@@ -129,7 +132,7 @@ class StationConsumer(AsyncWebsocketConsumer):
             self._run_until_closed(self._admit())
 
     async def _admit(self) -> None:
-        """Query the user until the database answers; stops are obeyed meanwhile."""
+        """Query the user until the database answers, then admit or refuse the page; stops are obeyed meanwhile."""
         admitted = None
         while admitted is None:
             try:
@@ -326,9 +329,9 @@ _Admitted = tuple[str, Any, Station | None, Role, dict[str, Any], Visibility]
 
 
 def _admitted(name: str, sessions: list[str]) -> _Admitted:
-    """Return session, user, station, role, robot description and visibility of the first session with a user.
+    """Return data for the first session that has a user: session, user, station, role, robot description, visibility.
 
-    Without a user, the session is "" and nothing may be shown.
+    If no session has a user, the session is "" and nothing may be shown.
 
     Raises:
         NotFound: If the station does not exist.
@@ -349,7 +352,10 @@ def _admitted(name: str, sessions: list[str]) -> _Admitted:
 
 
 def _decode_binary(message: bytes) -> str:
-    """Return the text of a binary message: our pages send none, but it may be an e-stop press."""
+    """Return the text of a binary message.
+
+    Our pages send no binary messages, but one from another client may be an e-stop press.
+    """
     return message.decode(json.detect_encoding(message), "replace")
 
 
@@ -358,12 +364,12 @@ def _as_text(message: dict[str, Any]) -> str:
 
 
 async def _in_database(work: Any, *arguments: Any, **named: Any) -> Any:
-    """Run `work` in its own thread, so that a slow query does not block others."""
+    """Run `work` in a thread of its own and return its result, so that a slow query does not block others."""
     return await database_sync_to_async(work, thread_sensitive=False)(*arguments, **named)
 
 
 def _go_on(work: Coroutine[Any, Any, None]) -> None:
-    """Run a task to its end in parallel to further messages, also if the page is closed."""
+    """Start a task that runs to its end in parallel to further messages, even if the page is closed."""
     task = asyncio.create_task(work)
     _under_way.add(task)
     task.add_done_callback(_finished)

@@ -55,8 +55,9 @@ def raw_refusal(status: int, sentence: str, path: bytes) -> bytes:
 
 
 class Channel(HTTPChannel):  # type: ignore[misc]
-    """Twisted's HTTP channel with an answer to every malformed request; Twisted would close without one, or
-    give no reason.
+    """Twisted's HTTP channel with an answer to every malformed request.
+
+    Twisted itself would close the connection without an answer, or give no reason.
     """
 
     def lineReceived(self, line: bytes) -> None:

@@ -22,11 +22,11 @@ _WORDS = ("chunk", "run", "state", "observation_step", "step", "overlap", "ik")
 
 
 def encode_chunk(content: Mapping[str, Any], looks: DrawnRobot | None, now: float) -> EncodedPart:
-    """Return stream `chunk` for pages; {"chunk": 0} if there is none.
+    """Return the part of stream `chunk` for pages; {"chunk": 0} if there is no chunk.
 
-    In addition to the station's own keys: `targets` [H], the step of each row (-1: not executed), and `ghost_rows`
-    [N], the rows drawn as robots. Arrays: `tips` float32 [H, arms, 3], fingertip positions of each row [m, world];
-    `ghost` float32 [N, P, 16], only of a proposed chunk. Both are omitted if the robot is not drawn.
+    In addition to the station's own keys: `targets` [H], the step of each row (-1: not executed), and `ghost_rows` [N],
+    the rows drawn as robots. Arrays: `tips` float32 [H, arms, 3], fingertip positions of each row [m, world]; `ghost`
+    float32 [N, P, 16], only of a proposed chunk. Both are omitted if the robot is not drawn.
     """
     words: dict[str, Any] = {key: content[key] for key in _WORDS if key in content}
     rows = np.asarray(content.get("rows", np.empty((0, 0))), np.float64)

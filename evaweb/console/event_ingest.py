@@ -32,7 +32,10 @@ _SWEEP_S = 5.0  # period of searching for lost results
 
 
 class StationEventIngester:
-    """Thread that writes one station's events and lease changes to the database, in order and each at least once."""
+    """Thread that writes one station's events and lease changes to the database.
+
+    They are written in order, and each at least once.
+    """
 
     def __init__(self, station: str, heard: Feeds) -> None:
         self._station = station
@@ -85,7 +88,10 @@ class StationEventIngester:
         self._news.set()
 
     def _write(self) -> None:
-        """Write the lease first, then events, then lost results; a station without a row is skipped."""
+        """Write the lease first, then events, then outcomes of commands and preflights whose answers were lost.
+
+        A station without a row is skipped.
+        """
         sweep = time.monotonic() - self._swept > _SWEEP_S
         state, history = self._feed.state, self._feed.history
         lease = self._lease_of(state)
@@ -162,8 +168,9 @@ def _advance(station: Station, boot: str, number: int) -> None:
 
 
 def _hand_on(station: Station, boot: str, event: Mapping[str, Any]) -> None:
-    """Pass one event to the services; a failure is logged and must not block later events. Database errors
-    are raised.
+    """Pass one event to the services.
+
+    A failure of a service is logged, so that it does not block later events; database errors are raised.
     """
     unbegun = event["data"].get("unbegun") or {}
     try:

@@ -159,7 +159,10 @@ class _StateReader(_Reader):
         return bool(state) and (state["boot"], state["newest_event"]) != (history.boot, history.newest)
 
     def _catch_up(self) -> None:
-        """Request the missing events: published events only signal news, and may be lost."""
+        """Request the events after the last known one.
+
+        Published events may be lost, so they only signal that there are new ones.
+        """
         history = self._feed.history
         try:
             boot, rows = self._wire.events_since(history.newest, timeout=_EVENTS_S)
@@ -185,7 +188,7 @@ def _check_snapshot(state: Any) -> dict[str, Any]:
 
 
 class _Shown(_Reader):
-    """Reader of streams that are only displayed, passed on unchanged."""
+    """Reader of streams that are only displayed; it passes their messages to the feed unchanged."""
 
     def __init__(
         self, feed: StationFeed, wire: StationConnection, process: str, key: str, *streams: str
@@ -226,7 +229,7 @@ class StationFeed:
     def subscribe(self, listener: Listener, *, pictures: bool) -> None:
         """Call `listener` with the known values, then with every message; the first listener starts the threads.
 
-        Images, joints and chunks are read while any listener has requested `pictures`.
+        Images, joints and chunks are read only while at least one listener has set `pictures`.
         """
         with self._lock:
             self._listeners[listener] = pictures

@@ -43,7 +43,7 @@ AT_ONCE = 400.0
 
 
 class MessageQuota:
-    """Token bucket: AT_ONCE messages in a burst, PER_SECOND sustained."""
+    """Quota of a page's messages (token bucket): AT_ONCE messages in a burst, then PER_SECOND."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

@@ -46,14 +46,14 @@ class EncodedPart:
 
 
 def encode_facts(stream: str, content: Mapping[str, Any], received: float) -> EncodedPart:
-    """Return the part of a map such as the state."""
+    """Return the part that encodes a map, such as the state."""
     return EncodedPart(stream, (f'{_key(stream)}:{{"json":{_json(content)}}}',), b"", received)
 
 
 def encode_numbers(
     stream: str, content: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], received: float
 ) -> EncodedPart:
-    """Return the part of a map with float32 arrays, such as the joints."""
+    """Return the part that encodes a map with float32 arrays, such as the joints."""
     entry: list[str | int] = [f'{_key(stream)}:{{"json":{_json(content)},"arrays":{{']
     body = b""
     for count, (name, array) in enumerate(arrays.items()):
@@ -63,14 +63,14 @@ def encode_numbers(
 
 
 def encode_array(stream: str, content: NDArray[Any], received: float) -> EncodedPart:
-    """Return the part of one float32 array, such as the poses."""
+    """Return the part that encodes one float32 array, such as the poses."""
     return EncodedPart(
         stream, (f'{_key(stream)}:{{"offset":', 0, f",{_shape(content)}}}"), _bytes(content), received
     )
 
 
 def encode_picture(stream: str, jpeg: bytes, received: float) -> EncodedPart:
-    """Return the part of one JPEG image; its entry carries the image's age when the frame is sent."""
+    """Return the part that encodes one JPEG image; its entry carries the image's age when the frame is sent."""
     entry = (f'{_key(stream)}:{{"mime":"image/jpeg","length":{len(jpeg)},"offset":', 0, ',"age":', _AGE, "}")
     return EncodedPart(stream, entry, _padded(jpeg), received)
 

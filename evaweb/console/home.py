@@ -51,7 +51,10 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class PlanNow:
-    """Running plan; `evidence` is its address if this user may see it, else `sealed` is the reason."""
+    """Running plan on the home page.
+
+    `evidence` is the address of its evidence, or "" if this user may not see it; then `sealed` is the reason.
+    """
 
     row: PlanRow
     evidence: str
@@ -161,7 +164,7 @@ def alarms() -> Iterator[Item]:
 
 
 def _cameras_lost(state: Mapping[str, Any]) -> str:
-    """Return the cameras whose newest image is too old, for a station whose joints arrive."""
+    """Return the cameras whose newest image is too old; [] unless the station's joints arrive."""
     ages = dict(state.get("link", {}).get("ages", {}))
     joints = ages.pop("joints", None)
     if joints is None or not joints < _OLD_S:

@@ -61,7 +61,7 @@ class StationRoom:
         return not self._viewers
 
     def join(self, deliver: Deliver, user: Any, sight: Visibility) -> Mailbox:
-        """Return a mailbox for one more page of `user`, with the visibility that was queried when it connected."""
+        """Add a page of `user`, with the visibility that was queried when it connected, and return its mailbox."""
         first = not self._viewers
         mailbox = Mailbox(deliver, user)
         mailbox.sight = sight
@@ -100,7 +100,7 @@ class StationRoom:
             self._loop.call_soon_threadsafe(self._take, stream, content, encoded, covered)
 
     def _encode_redacted(self, stream: str, content: Any) -> list[EncodedPart]:
-        """Return the redacted parts of a message, [] if no viewer needs them."""
+        """Return the redacted parts of a message; [] if every viewer may see the unredacted ones."""
         if not self._covers:
             return []
         said = veil.redact_state(content, FULL_VISIBILITY) if stream == "state" else content
@@ -143,7 +143,7 @@ class StationRoom:
         return self._covered if viewer.veiled else self._newest
 
     def _update_viewer(self, viewer: Mailbox) -> None:
-        """Update what the page may see of the station now; on a change notify the page and resend its streams."""
+        """Update what the page may see of the station now; if that changes, notify the page and resend its streams."""
         veiled = viewer.sight.redacts_snapshot(self.station, self._state)
         viewer.redacts_events = viewer.sight.redacts_events(self.station)
         if veiled is not viewer.veiled:
@@ -153,7 +153,10 @@ class StationRoom:
             viewer.watch(viewer.watched, self._shown_to(viewer).values())
 
     def _count_covered(self) -> None:
-        """Update whether redacted parts are needed; outdated ones are discarded when they are needed again."""
+        """Update whether any viewer needs redacted parts.
+
+        When the first such viewer appears, redacted parts from before are discarded, because they are outdated.
+        """
         before, self._covers = self._covers, any(viewer.veiled for viewer in self._viewers)
         if self._covers and not before:
             self._covered.clear()
@@ -182,7 +185,7 @@ class StationRoom:
             self._looking = None
 
     def _flush(self) -> None:
-        """Send to all pages; pages with the same parts get the same bytes."""
+        """Send the pending frames to all pages; pages with the same parts get the same bytes."""
         self._timer, self._flushed = None, self._loop.time()
         self._frames += 1
         now, made = time.monotonic(), {}

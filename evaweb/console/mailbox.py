@@ -26,8 +26,8 @@ MakeFrame = Callable[[Iterable[EncodedPart]], bytes]
 class Mailbox:
     """Messages of one page at one station; for the event loop only.
 
-    `veiled` is True if `user` must not see which checkpoint the station is set up for, `redacts_events` the same for
-    its events; both follow from `sight`.
+    `veiled` is True if `user` must not see which checkpoint the station is set up for; `redacts_events` is True if its
+    events must be redacted for that user. Both follow from `sight`.
     """
 
     def __init__(self, deliver: Deliver, user: Any = None) -> None:
@@ -69,7 +69,7 @@ class Mailbox:
         self._changed.update(what)
 
     def want_events(self, after: int, boot: str) -> None:
-        """Send the events of `boot` after number `after` from now on."""
+        """Set which events the page is sent from now on: those of `boot` after number `after`."""
         self._events_after, self._events_of, self._covered_up_to = after, boot, (0, 0)
 
     def credit(self) -> None:
@@ -118,7 +118,7 @@ class Mailbox:
         self._covered_up_to = (history.newest, last) if self.redacts_events else (0, 0)
 
     def _send(self, message: dict[str, object]) -> bool:
-        """Send a text, unless the page has not responded to many; return whether it was sent."""
+        """Send a text, unless the page has left many texts unanswered; return whether it was sent."""
         if self._unheard >= _TEXTS_UNHEARD:
             return False
         self._unheard += 1

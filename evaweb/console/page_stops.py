@@ -1,4 +1,4 @@
-"""Stops by a page: executed at once if the user is known, and also if the database cannot name the user.
+"""Stops by a page: executed at once if the user is known, and even if the database cannot name the user.
 
 Nothing here waits for the database, and the number of presses is not limited.
 """
@@ -98,7 +98,7 @@ class PageStops:
         self._answer("estop", uuid, answer, note)
 
     def _stop(self, request: Stop, login: Login, at: datetime) -> None:
-        """Execute a stop; a viewer's is refused and not recorded."""
+        """Execute a stop; if the user is a viewer, it is refused and not recorded."""
         if login.role is Role.VIEWER:
             refused = stops.Answer(CommandStatus.REFUSED, stops.refused_to_a_viewer(login.username))
             self._acknowledge(request.kind, request.uuid, refused)

@@ -35,7 +35,7 @@ class RecentSamples:
 
     Arrays float32 [K, D]: `measured`; `raw`, the newest chunk; `planned`, the merged plan; `executed`, sent to the
     robot or, in simulation, to the simulated robot. Missing values are NaN. Columns per sample: `step`, the leading
-    `chunk` (-1: none, 0: hold target), the number of `chunks` that contributed, whether safety `limited` it, and
+    `chunk` (-1: no chunk, 0: hold target), the number of `chunks` that contributed, whether safety `limited` it, and
     whether the executing robot was `simulated`. Consecutive parts overlap.
     """
 
@@ -45,7 +45,7 @@ class RecentSamples:
     def add_sample(
         self, vectors: Mapping[str, NDArray[Any]], words: Mapping[str, Any], now: float
     ) -> EncodedPart:
-        """Return the stream after adding the sample of time `now`."""
+        """Add the sample measured at `now`, and return the part of the stream with it."""
         sample = _sample(vectors, words, now)
         if self._samples and self._samples[-1].curves[0].shape != sample.curves[0].shape:
             self._samples.clear()  # another robot

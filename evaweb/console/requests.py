@@ -36,24 +36,24 @@ _LONGEST_STOP = 4096  # [characters] limit of a stop or halt from a page that fl
 
 
 class BadRequest(EvaError):
-    """Invalid message of a page; the text names what was given and what is allowed."""
+    """Error for an invalid message of a page; the text names the given and the allowed values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """Request to send these streams."""
+    """Request of a page to be sent these streams from now on."""
 
     streams: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Credit:
-    """Report that a frame has been drawn."""
+    """Message of a page that it has drawn a frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Renew:
-    """Heartbeat of the page that holds the lease of this epoch, visible or hidden."""
+    """Heartbeat of the page that holds the lease of this epoch; `hidden` is True if its browser tab is hidden."""
 
     epoch: int
     hidden: bool = False
@@ -61,7 +61,7 @@ class Renew:
 
 @dataclass(frozen=True, slots=True)
 class EStop:
-    """E-stop press."""
+    """E-stop press of a page."""
 
     uuid: UUID
     why: str
@@ -69,7 +69,7 @@ class EStop:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Stop or halt, under the lease of this epoch."""
+    """Stop or halt of a page, under the lease of this epoch."""
 
     kind: str
     uuid: UUID
@@ -96,7 +96,7 @@ Request = Watch | Credit | Renew | EStop | Stop | Events | Aim
 
 
 def may_be_stop(text: str) -> bool:
-    """Return True if a message that is not parsed completely may stop a robot."""
+    """Return True if a message may stop a robot; for this it need not be parsed completely."""
     if pressing.parse_json_press(text, "type") is not None:
         return True
     return len(text) <= _LONGEST_STOP and any(f'"{kind}"' in text for kind in ("stop", "halt"))
@@ -158,7 +158,7 @@ def _stop(kind: str) -> Callable[[Mapping[str, Any]], Stop]:
 
 
 def _uuid(said: Mapping[str, Any]) -> UUID:
-    """Return the page's own id, by which it recognises the answer, or a new one."""
+    """Return the uuid in the request, by which the page recognises the answer; a new uuid if it has no valid one."""
     try:
         return UUID(str(said.get("uuid")))
     except ValueError:

@@ -25,7 +25,7 @@ SESSION_KEY = "station"
 
 @dataclass(frozen=True, slots=True)
 class StationRow:
-    """Station in the list of the home page; `lease` and `trial` are the open ones there."""
+    """Station in the list of the home page, with its open `lease` and its open `trial`."""
 
     station: Station
     lease: Lease | None
@@ -36,11 +36,12 @@ class StationRow:
 class EvalPanel:
     """Contents of the four steps of an evaluation, as visible to one user.
 
-    `trial` is the unfinished trial, with the `milestones` of its scene; `failures` are the possible failure levels,
-    `set_up` is whether the station was last set up for it. Without a trial, `scene`, `position` and `checkpoint` are
-    the initial choice, after `last`, the newest finished trial. `plans` are the plans open here, `plan` the selected
-    one, `handout` the trial's allocation, `cameras` this user's camera check while it is valid. `views` are the
-    reference images by camera, of the trial's position or, without a trial, of the camera.
+    `trial` is the unfinished trial, with the `milestones` of its scene; `failures` are the possible failure levels, and
+    `set_up` is whether the station was last set up for that trial. Without a trial, `scene`, `position` and
+    `checkpoint` are the initial choice, which follows from `last`, the newest finished trial. `plans` are the plans
+    open here, `plan` is the selected one, `handout` the trial's allocation, and `cameras` this user's camera check
+    while it is valid. `views` are the reference images by camera: those of the trial's position or, without a trial, of
+    the camera.
     """
 
     station: Station
@@ -115,8 +116,9 @@ def station_rows() -> list[StationRow]:
 
 
 def robot_facts(*, robot: str) -> dict[str, Any]:
-    """Return names and units of the robot's vector, and its cameras; empty with "error" if its description is
-    unreadable.
+    """Return names and units of the robot's vector, and its cameras.
+
+    If the description of the robot is unreadable, they are empty and "error" is the reason.
     """
     found = describe_robot(robot)
     return {
@@ -139,7 +141,7 @@ def eval_panel(
         user: User who sees the panel.
         sight: Visibility of that user.
         scene: Name of the scene being chosen; "" for the last one.
-        plan: Name of the plan to work on; "" for none, None for that of the last trial.
+        plan: Name of the plan to work on; "" for no plan, None for the plan of the last trial.
     """
     trial = trial_open(station)
     last = None if trial else trial_list().filter(station=station).first()
@@ -174,7 +176,10 @@ def eval_panel(
 
 
 def _plan(plans: tuple[Plan, ...], name: str | None, last: Trial | None) -> Plan | None:
-    """Return the plan called `name`; without a name, that of the last trial if it is still open."""
+    """Return the open plan called `name`, None if there is no such plan.
+
+    If `name` is None, it is the last trial's plan, if that is still open.
+    """
     if name is not None:
         return next((plan for plan in plans if plan.name == name), None)
     handout = handout_of(trial=last) if last else None
@@ -191,7 +196,10 @@ def _chosen_scene(scenes: tuple[Scene, ...], name: str) -> Scene | None:
 
 
 def _next_position(positions: tuple[Position, ...], last: Trial | None) -> Position | None:
-    """Return the position after the last trial's, or the same if that trial has no score."""
+    """Return the position after the last trial's; the same position again if that trial has no score.
+
+    The first position without a last trial, None if the scene has no positions.
+    """
     if not positions:
         return None
     if last is None or last.position not in positions:

@@ -37,13 +37,13 @@ _TURN_S = (
 
 
 class BackgroundService(Protocol):
-    """Service that runs while the process serves."""
+    """Service that runs beside the server for as long as the process serves."""
 
     def start(self) -> None:
-        """Start; called when the process serves."""
+        """Start the service; called when the process has begun to serve."""
 
     def end(self) -> None:
-        """Stop."""
+        """Stop the service."""
 
 
 def serve(
@@ -93,7 +93,7 @@ class _Server(Server):
         self._entrance, self._arrivals = entrance, arrivals
 
     async def handle_reply(self, protocol: Any, message: Any) -> None:
-        """Send a part of an answer; returns when the next piece may be produced."""
+        """Send a part of an answer; return when its next part may be produced."""
         await super().handle_reply(protocol, message)
         if message["type"] == "http.response.body" and message.get("more_body"):
             await until_read(protocol)
@@ -146,7 +146,10 @@ def _watch(server: Server) -> None:
 
 
 def _exit_after_grace() -> None:
-    """Exit after a grace period, because a thread that waits for the database or a station cannot be interrupted."""
+    """Exit the process after a grace period, however many threads are still running.
+
+    A thread that waits for the database or a station cannot be interrupted.
+    """
     last = threading.Timer(_LAST_S, os._exit, (1,))
     last.daemon = True
     last.start()

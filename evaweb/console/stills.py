@@ -24,7 +24,7 @@ _turns: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
 
 def still_of(station: Station) -> bytes:
-    """Return a JPEG that was requested at most KEPT_S ago.
+    """Return a JPEG of the station's first camera that was requested at most KEPT_S [s] ago.
 
     Raises:
         NotFound: If the station does not run, has no camera or sends no image.
@@ -44,7 +44,7 @@ def still_of(station: Station) -> bytes:
 
 
 def _fetch(station: Station, cameras: list[str]) -> bytes:
-    """Return the image, b"" if none came in time."""
+    """Return the image, b"" if no image came in time."""
     try:
         return image_store.current_images(station, cameras, _PATIENCE_S)[cameras[0]]
     except Conflict:

@@ -55,8 +55,9 @@ def history(request: HttpRequest) -> HttpResponse:
 
 @require_safe
 def still(request: HttpRequest, name: str) -> HttpResponse:
-    """Return the newest image of a station's first camera; an empty answer (204) if there is none, which is
-    not a fault.
+    """Return the newest image of a station's first camera.
+
+    If there is none, the answer is empty (204), because that is not a fault.
     """
     found = _station(name)
     try:
@@ -80,7 +81,10 @@ def debug(request: HttpRequest, name: str) -> HttpResponse:
 
 
 def _replayed(request: HttpRequest, station: Station) -> dict[str, Any]:
-    """Return the episode named by ?replay=, as this station would replay it, or the reason if it cannot."""
+    """Return the station's offer to replay the episode in ?replay=, or the reason why it cannot.
+
+    {} without ?replay=.
+    """
     source = request.GET.get("replay", "")
     if not source:
         return {}
@@ -150,7 +154,7 @@ def _page(request: HttpRequest, station: Station, page: str, extra: dict[str, An
 
 
 def _remember(request: HttpRequest, station: Station) -> None:
-    """Remember the station that this browser's tabs lead to; a database failure is only logged."""
+    """Remember this station as the one to which this browser's tabs lead; a database failure is only logged."""
     if request.session.get(selectors.SESSION_KEY) == station.name:
         return
     request.session[selectors.SESSION_KEY] = station.name

@@ -62,12 +62,12 @@ class Row:
 
     @property
     def may_cancel(self) -> bool:
-        """True if it has not ended and was not cancelled."""
+        """True if the job has not ended and was not cancelled."""
         return self.job.cancelled_by_id is None and self.job.status in (JobStatus.QUEUED, JobStatus.RUNNING)
 
     @property
     def may_repeat(self) -> bool:
-        """True if it has failed."""
+        """True if the job has failed."""
         return self.job.status == JobStatus.FAILED
 
     @property
@@ -119,7 +119,10 @@ def job_act(request: HttpRequest, what: str) -> HttpResponse:
 
 
 def row_of(job: Job, sight: Visibility, having: Served) -> Row:
-    """Return a job as displayed; one that may reveal a hidden checkpoint shows only that it exists."""
+    """Return a job as displayed; if it may reveal a hidden checkpoint, the row shows only that it exists.
+
+    `having` are the queues that the running workers serve.
+    """
     title, lacks, said, cover = (
         KINDS.get(job.kind, job.kind),
         having.lacks(job),

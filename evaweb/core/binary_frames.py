@@ -25,7 +25,7 @@ DTYPES = ("f4", "f8", "i4", "u1")  # types with a typed array in browsers
 
 
 class FrameError(EvaError):
-    """A message violates the layout, or a value cannot be encoded in it."""
+    """Error if a message violates the layout, or a value cannot be encoded in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

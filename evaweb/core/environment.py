@@ -215,9 +215,10 @@ def data_dir(default: Path) -> Path:
 
 
 def private_file(path: Path) -> Path:
-    """Return `path` after creating the file if absent, with mode 600, as SQLite's files next to it.
+    """Return `path` after creating the file if it does not exist.
 
-    A restored copy that other accounts could read is made private again.
+    The file gets mode 600, and so do SQLite's files next to it: a restored copy that other accounts could read is made
+    private again.
     """
     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
     for file in database_files(path):

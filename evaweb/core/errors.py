@@ -8,9 +8,10 @@ from runtime.core.sentences import Sentence, identity, plain
 
 
 class EvaError(Exception):
-    """A request that cannot be fulfilled; the message names the offender, the given value and the allowed ones.
+    """Error for a request that cannot be fulfilled.
 
-    If the message is a `Sentence`, str() of the exception returns that Sentence.
+    The message names the offender, the given value and the allowed ones. If it is a `Sentence`, str() of the exception
+    returns that Sentence.
     """
 
     status = 400
@@ -18,25 +19,25 @@ class EvaError(Exception):
 
 
 class NotAllowed(EvaError):
-    """The user lacks the right to do this."""
+    """Error if the user lacks the right to do this."""
 
     status = 403
 
 
 class NotFound(EvaError):
-    """The named object does not exist."""
+    """Error if the named object does not exist."""
 
     status = 404
 
 
 class Conflict(EvaError):
-    """The request is impossible in the present state."""
+    """Error if the request is impossible in the present state."""
 
     status = 409
 
 
 class StationGone(EvaError):
-    """The station does not respond."""
+    """Error if the station does not respond."""
 
     status = 503
 

@@ -15,7 +15,7 @@ RESTORING = ".restoring"  # folder in DATA with files that a restore has copied 
 
 @register(Tags.security)
 def check_private_files(**options: Any) -> list[CheckMessage]:
-    """Warn if other accounts can read the data folder, the database or the secret key."""
+    """Return a warning for each of data folder, database and secret key that other accounts can read."""
     return [
         Warning(
             f"{path} can be read by others: {path.stat().st_mode & 0o777:o}",
@@ -29,7 +29,7 @@ def check_private_files(**options: Any) -> list[CheckMessage]:
 
 @register()
 def data_is_whole(**options: Any) -> list[CheckMessage]:
-    """Report an error if a restore is running or was interrupted: the database then lacks its files."""
+    """Return an error if a restore is running or was interrupted: the database then lacks its files."""
     draft = Path(settings.DATA_DIR) / RESTORING
     if not draft.exists():
         return []
@@ -44,7 +44,7 @@ def data_is_whole(**options: Any) -> list[CheckMessage]:
 
 @register(Tags.security)
 def check_declared_proxy(**options: Any) -> list[CheckMessage]:
-    """Warn if HTTPS is on without a declared proxy: all logins then seem to come from one address."""
+    """Return a warning if HTTPS is on without a declared proxy: all logins then seem to come from one address."""
     if not settings.SESSION_COOKIE_SECURE or settings.EVA_PROXIES:
         return []
     return [

@@ -35,9 +35,9 @@ class FingerprintCache(Generic[T]):
         return made
 
     def renew(self, key: Hashable, make: Callable[[T | None], T]) -> T:
-        """Replace the value of `key` by `make` of the previous value (None if there is none) and return it.
+        """Replace the value of `key` by the result of `make`, and return it.
 
-        Concurrent callers each make a value.
+        `make` gets the previous value, None if there is none. Concurrent callers each make a value.
         """
         with self._lock:
             found = self._rows.get(key)

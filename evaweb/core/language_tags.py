@@ -16,7 +16,7 @@ register = template.Library()
 
 @register.simple_tag(takes_context=True)
 def localized(context: Any, sentence: object) -> str:
-    """Return a sentence, or that of an error, in the chosen language; English if it has no translation."""
+    """Return a sentence, or the message of an error, in the chosen language; English if it has no translation."""
     request = context.get("request")
     return languages.translated(str(sentence), languages.chosen(request) if request else None)
 

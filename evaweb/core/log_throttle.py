@@ -11,7 +11,10 @@ _OTHERS = None  # common entry of all names beyond `most`
 
 
 class LogThrottle:
-    """Rate limit of one line per name and `every_s` [s]; beyond `most` names the others share one. Thread-safe."""
+    """Rate limit of one line per name and `every_s` [s]. Thread-safe.
+
+    If there are more than `most` names, the further ones share one limit.
+    """
 
     def __init__(self, every_s: float, most: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._every_s, self._most, self._clock = every_s, most, clock

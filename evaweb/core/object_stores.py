@@ -40,7 +40,7 @@ _CHANGED = Pattern(
 
 
 class StoreError(EvaError):
-    """An object store is missing, full or refuses a request; the message names store and request."""
+    """Error if an object store is missing, full or refuses a request; the message names store and request."""
 
     status = 503
 
@@ -242,7 +242,7 @@ def the_store() -> Store | None:
 
 
 def required_store() -> Store:
-    """Return the lab's store. Raises: StoreError if none is configured any more."""
+    """Return the lab's store. Raises: StoreError if no store is configured any more."""
     store = the_store()
     if store is None:
         raise StoreError(_NO_STORE)

@@ -31,7 +31,7 @@ def is_duplicate(error: BaseException) -> bool:
 
 
 def once_more(write: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Decorate a transaction to run a second time if its name was taken: it then finds the other row."""
+    """Decorate a transaction to run a second time if its name was taken: the second run then finds the other row."""
 
     @wraps(write)
     def written(*args: _Given.args, **kwargs: _Given.kwargs) -> _Found:

@@ -67,7 +67,10 @@ def import_dataset(
 
 
 def _target(dataset: Path, to: str) -> Path:
-    """Return the folder below datasets/ of that name, or the one in which the dataset is already."""
+    """Return the folder below datasets/ called `to`; without `to`, the dataset's own folder if it is there already.
+
+    Raises: EvaError if `to` is not a plain name.
+    """
     here, root = dataset.resolve(), datasets_dir().resolve()
     if not to and here.parent == root:
         return datasets_dir() / here.name

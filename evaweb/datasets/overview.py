@@ -56,7 +56,10 @@ _OWN = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """Content of info.json; if it is unreadable or contradictory, `problem` is the reason and all else is unset."""
+    """Content of a dataset's info.json.
+
+    If it is unreadable or contradictory, `problem` is the reason, and only `name` is set besides.
+    """
 
     name: str  # folder relative to the data folder
     version: str = ""
@@ -95,9 +98,9 @@ def dataset_names() -> list[str]:
 
 
 def _walk(folder: Path, depth: int) -> Iterator[Path]:
-    """Yield the datasets below `folder`; hidden ones are drafts, or left by a crash.
+    """Yield the dataset folders below `folder`; hidden folders are skipped: they are drafts, or remains of a crash.
 
-    Folders with names that no URL can carry are skipped: one of them would break the whole list.
+    Folders with names that no URL can carry are skipped too: one of them would break the whole list.
     """
     try:
         below = [Path(entry.path) for entry in os.scandir(folder) if entry.is_dir()]
@@ -168,7 +171,7 @@ def overviews() -> list[Overview]:
 
 
 def camera_keys(features: dict[str, Any]) -> dict[str, str]:
-    """Return the feature of each camera's images, videos first, by its short name."""
+    """Return a dict from each camera's short name to the feature of its images; videos come first."""
     keys = [*layout.video_keys(features), *layout.image_keys(features)]
     return {key.removeprefix("observation.images.").removeprefix("observation."): key for key in keys}
 

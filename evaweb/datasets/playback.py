@@ -53,7 +53,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlayedEpisode:
-    """Episode of a dataset; `robot` is the robot that its values are for, "" if unknown.
+    """Episode of a dataset; `robot` is the robot to which its values belong, "" if unknown.
 
     `robot_is_assumed`: the user has chosen the robot, whatever the dataset declares, and the values are in its order.
     """
@@ -68,7 +68,7 @@ class PlayedEpisode:
 
     @property
     def result(self) -> str:
-        """Label by its operator, "" if there is none."""
+        """Label that its operator gave the episode, "" if there is none."""
         return result_of(self.told)
 
     @property
@@ -93,7 +93,7 @@ class PlayedEpisode:
 
     @property
     def cameras(self) -> dict[str, str]:
-        """Feature of each camera's images by its short name."""
+        """Dict from each camera's short name to the feature of its images."""
         return camera_keys(dict(self.dataset.features))
 
     def video(self, camera: str) -> Span | None:
@@ -161,9 +161,11 @@ def _vectors(dataset: Dataset) -> list[str]:
 
 
 def as_recording(shown: PlayedEpisode) -> Episode:
-    """Return the episode with the tables of a recording, including the three action streams if in a sidecar.
+    """Return the episode with the tables of a recording; also with the three action streams if a sidecar has them.
 
-    If state and action have different dimensions, the joints are those of both. Raises: RecordingError.
+    If state and action have different dimensions, the joints are the names of the state followed by those of the
+    action.
+    Raises: RecordingError.
     """
     table = shown.dataset.table(shown.index)
     joints, measured, commanded = _numbers(shown, table)
@@ -201,7 +203,7 @@ def as_recording(shown: PlayedEpisode) -> Episode:
 
 
 def _numbers(shown: PlayedEpisode, table: Any) -> tuple[list[str], Array, Array]:
-    """Return joint names, and measured and commanded joints [N, D]; NaN if a column lacks a joint."""
+    """Return joint names, and measured and commanded joints [N, D]; NaN for joints that a column lacks."""
     state, action = shown.state, shown.action
     if not state and not action:
         raise RecordingError(f"{shown.name} has no column of joints, neither measured nor commanded")
@@ -324,7 +326,10 @@ def _with_streams(shown: PlayedEpisode, path: Path, rows: Any) -> Episode:
 
 
 def _renamed(table: Any, new: Mapping[str, str], same: tuple[str, ...], numbers: tuple[str, ...]) -> Any:
-    """Return columns under the names of a recording; in `numbers`, null becomes -1."""
+    """Return a table with the columns in `new` renamed, and those in `same` and `numbers` under their own names.
+
+    In `numbers`, null becomes -1.
+    """
     columns = {name: table[old] for name, old in new.items()} | {name: table[name] for name in same}
     return pa.table(columns | {name: table[name].fill_null(-1) for name in numbers})
 

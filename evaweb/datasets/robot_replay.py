@@ -134,7 +134,7 @@ class ReplayOffer:
 
     @property
     def run(self) -> str:
-        """Arguments of the run command, as JSON: it ends by itself after the last row."""
+        """Arguments of the run command, as JSON: the run ends by itself after the last row."""
         return json.dumps({"duration_s": round(self.recorded.seconds + TAIL_S, 3)})
 
     @property
@@ -163,7 +163,9 @@ def replay_command(
     args: Mapping[str, Any] | None = None,
     **given: Any,
 ) -> Command:
-    """Set a station up to play an episode, given by uuid or DATASET:INDEX; `given` as in `issue_command`.
+    """Set a station up to play an episode, given by uuid or DATASET:INDEX.
+
+    The further arguments are those of `issue_command`.
 
     Raises: EvaError for other commands; Conflict if the station's robot is not the episode's.
     """
@@ -258,7 +260,10 @@ def make_offer(recorded: PlayableEpisode, station: Station, space: str) -> Repla
 
 
 def _facts(station: Station) -> tuple[Mapping[str, Any], bool]:
-    """Return the facts of the station's robot and True; else those of its description and False."""
+    """Return the robot's facts, and whether they are from the running station.
+
+    If it does not respond, the facts are those of the robot's description.
+    """
     try:
         return connection_to(station.name).status()["facts"], True
     except (StationGone, KeyError):

@@ -97,7 +97,7 @@ def _chosen(given: str) -> str:
 
 @require_GET
 def dataset_work(request: HttpRequest) -> HttpResponse:
-    """Return the newest jobs as a fragment; make the page reload when none is active."""
+    """Return the newest jobs as a fragment; if no job is active, make the page reload."""
     given = request.GET.get("dataset", "")
     name = dataset_orders.full_name(given) if given else ""
     context = {"name": name, **_work(name)}

@@ -12,7 +12,7 @@ from evaweb.episodes.models import Episode
 
 @admin.register(Episode)
 class EpisodeAdmin(admin.ModelAdmin):
-    """Episodes; the folders are authoritative, and only services write the rows."""
+    """Admin page of episodes; the folders are authoritative, and only services write the rows."""
 
     list_display = (
         "uuid",

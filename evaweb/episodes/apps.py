@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class EpisodesConfig(AppConfig):
-    """Recorded episodes: index, replay, datasets, reconcile."""
+    """Configuration of the app for recorded episodes: index, replay, datasets, reconcile."""
 
     name = "evaweb.episodes"
     default_auto_field = "django.db.models.BigAutoField"

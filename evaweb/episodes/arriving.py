@@ -28,7 +28,10 @@ _DECLINED = Pattern(
 
 
 def owner_of(uuid: str) -> str:
-    """Return the name of the station that owns an episode, "" if unknown. Raises: OSError if the database is away."""
+    """Return the name of the station that owns an episode, "" if unknown.
+
+    Raises: OSError if the database does not answer.
+    """
     try:
         return Episode.objects.filter(uuid=uuid).values_list("station__name", flat=True).first() or ""
     except Error as error:
@@ -38,7 +41,7 @@ def owner_of(uuid: str) -> str:
 
 
 def whereabouts(episode: Episode) -> str:
-    """Return the location of an episode in transfer, and the transferred part, as a message."""
+    """Return a message that says where an episode in transfer is, and how much of it has arrived."""
     name = episode.station.name
     found = progress_of(data_dir(), name, str(episode.uuid))
     if found is None:

@@ -11,9 +11,10 @@ from runtime.recording.reader import Episode, open_episode
 
 
 def bench_course(folder: Path) -> list[dict[str, Any]]:
-    """Return the positions of the objects, [{row, blocks, plate}] at each row where they changed, without outcomes.
+    """Return the positions of the objects, [{row, blocks, plate}] at each row where they changed.
 
-    [] for a recording without simulated bench. Raises: RecordingError, which names the absent or damaged file.
+    Outcomes are left out. [] for a recording without simulated bench. Raises: RecordingError, which names the absent or
+    damaged file.
     """
     course: list[dict[str, Any]] = []
     for row, said in truth_changes(open_episode(folder).rows):
@@ -24,7 +25,7 @@ def bench_course(folder: Path) -> list[dict[str, Any]]:
 
 
 def milestones_reached(episode: Episode) -> Iterator[tuple[str, int]]:
-    """Yield (name, row) of every milestone in the ground truth, at the first row with it."""
+    """Yield (name, row) of every milestone that the ground truth reports; `row` is the first at which it is reached."""
     known: set[str] = set()
     for row, said in truth_changes(episode.rows):
         reached = {name for name, yes in (said.get(JUDGED) or {}).items() if yes is True}

@@ -52,14 +52,14 @@ def chunk_arrays(episode: Episode, times_of: Callable[[Array], Array]) -> Stream
 
 
 def _strategies(heads: Any) -> tuple[list[str], Array]:
-    """Return the kinds of strategies, and the index of each chunk's."""
+    """Return the distinct kinds of strategies, and for each chunk the index of its kind (-1: unknown)."""
     kinds = [kind or "" for kind in heads.column("strategy").to_pylist()]
     names = sorted(set(kinds) - {""})
     return names, np.array([names.index(kind) if kind else UNKNOWN for kind in kinds], np.int32)
 
 
 def _planned(raw: Any, numbers: Array) -> tuple[Array, Array]:
-    """Return the first and the last row of each chunk with a planned step."""
+    """Return for each chunk the first and the last of its rows that have a planned step."""
     used = raw.filter(np.asarray(raw.column("target_step").to_numpy() >= 0))
     places = np.searchsorted(numbers, used.column("chunk_id").to_numpy())
     index = used.column("index").to_numpy()

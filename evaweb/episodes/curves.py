@@ -38,14 +38,14 @@ def curve_message(
 
     Times are seconds of the video: row k is at k / fps. Streams, vectors joint by joint (one row per joint):
     ticks, at the control rate: time f8 [M], measured, smoothed and executed f4 [D, M] (NaN if nothing was planned or
-    sent), safety u1 [M] (1 changed, 2 refused), chunk i4 [M] (with the largest weight, -1 none, 0 the held target),
+    sent), safety u1 [M] (1 changed, 2 refused), chunk i4 [M] (with the largest weight, -1 no chunk, 0 the held target),
     makers i4 [M + 1]: tick k consists of the entries makers[k] to makers[k + 1] of stream makers.
     makers: chunk i4 [W], weight f4 [W]. raw, if the policy answers in joints: time f8 [R], values f4 [D, R],
     chunk i4 [R]. chunks: see evaweb.episodes.chunks.
 
     Args:
-        covered: Omit what reveals the policy, as if its answers had not been recorded.
-        unscored: Omit what the ground truth reveals about the outcome.
+        covered: Omit all data that reveal the policy, as if its answers had not been recorded.
+        unscored: Omit the data of the ground truth that reveal the outcome.
         milestones: (time of the run [s], text) as scored; if empty, those of the ground truth are marked.
 
     Raises:
@@ -200,7 +200,10 @@ def _raw(episode: Episode, start: float) -> Stream:
 
 
 def _times_of(episode: Episode, steps: Array) -> Array:
-    """Return the time of each control step on the clock of the tables; outside the recording by the rate."""
+    """Return the time of each control step on the clock of the tables.
+
+    Steps outside the recording are extrapolated by the control rate.
+    """
     ticks = episode.ticks
     if not ticks.num_rows:
         return np.zeros(len(steps))
@@ -230,7 +233,7 @@ def _spans(there: Sequence[bool], fps: float) -> list[list[float]]:
 
 
 def _interventions(episode: Episode) -> list[dict[str, Any]]:
-    """Return marks of a person's interventions; none if a person drove throughout."""
+    """Return marks of the spans in which a person intervened; [] if a person drove the robot throughout."""
     if "intervention" not in episode.rows.column_names:
         return []
     spans = _spans([bool(one) for one in episode.rows.column("intervention").to_pylist()], episode.layout.fps)

@@ -31,10 +31,11 @@ class Membership:
 
 
 def sync_memberships() -> list[str]:
-    """Update the rows of episodes with the dataset that contains them, or none.
+    """Update the rows of episodes with the dataset that contains them, or with no dataset.
 
-    Of several datasets, one that the episode was published to is preferred to copies; then a scored one; then the
-    previous. Unreadable datasets are returned as messages, and rows that refer to them are unchanged.
+    If several datasets contain an episode, one to which it was published is preferred to copies; then a scored one;
+    then the one recorded so far. Unreadable datasets are returned as messages, and rows that refer to them are
+    unchanged.
     """
     places: dict[UUID, list[Membership]] = defaultdict(list)
     problems, unread = [], set()
@@ -63,7 +64,10 @@ def sync_memberships() -> list[str]:
 
 
 def primary_membership(places: Sequence[Membership], before: str) -> Membership | None:
-    """Return the membership that counts, None if there is none; `before` is the previous dataset."""
+    """Return the membership that counts, None if there is none; `before` is the dataset that counted until now.
+
+    The order of preference is that of `sync_memberships`.
+    """
     return min(
         places,
         key=lambda place: (
@@ -77,7 +81,9 @@ def primary_membership(places: Sequence[Membership], before: str) -> Membership 
 
 
 def _datasets() -> list[Path]:
-    """Return the dataset folders; hidden ones are drafts, or left by a crash and removed by `repair`."""
+    """Return the dataset folders; hidden ones are left out: they are drafts, or remains of a crash that a repair
+    removes.
+    """
     root = datasets_dir()
     there = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
     return sorted(path for path in there if not path.name.startswith("."))
@@ -88,7 +94,7 @@ def _name(folder: Path) -> str:
 
 
 def _places(folder: Path) -> list[tuple[UUID, Membership]]:
-    """Return the lab's episodes in a dataset; foreign ones have no uuid."""
+    """Return the lab's episodes in a dataset; episodes without a uuid, which come from elsewhere, are left out."""
     told = folder / EVA_EPISODES
     if not (folder / INFO).exists():
         return []

@@ -12,9 +12,10 @@ _givers: list[SidecarWriter] = []
 
 
 def register_sidecar_writer(function: SidecarWriter) -> SidecarWriter:
-    """Register a function that writes sidecar files, by kind; apps of higher layers call this in `ready`.
+    """Register a function that writes sidecar files and returns them by kind.
 
-    It gets the episode's uuid and a folder of its own, and writes JSON Lines there.
+    Apps of higher layers call this in `ready`. The function gets the episode's uuid and a folder of its own, and writes
+    JSON Lines there.
     """
     if function not in _givers:
         _givers.append(function)

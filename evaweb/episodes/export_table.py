@@ -30,7 +30,7 @@ CONTENT_TYPE = "application/vnd.apache.parquet"
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """State of an episode's table: ready, preparing, failed, absent or none; `size` [bytes]."""
+    """State of an episode's table: "ready", "preparing", "failed", "absent" or "none"; `size` is in bytes."""
 
     name: str
     sentence: str = ""

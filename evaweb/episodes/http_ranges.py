@@ -38,13 +38,14 @@ class Span:
 
 
 class Unsatisfiable(Exception):
-    """A well-formed range that starts beyond the end of the file."""
+    """Error for a well-formed range that starts beyond the end of the file."""
 
 
 def requested_range(header: str | None, size: int) -> Span | None:
-    """Return the single range that `header` requests; None for no, several or malformed ranges.
+    """Return the single range that `header` requests.
 
-    Those are answered with the whole file, which section 14.2 permits. Raises: Unsatisfiable.
+    None without a range, for several ranges or a malformed header: then the whole file is the answer, which section
+    14.2 permits. Raises: Unsatisfiable.
     """
     match = _RANGE.fullmatch(header or "")
     if not match or match[1] == match[2] == "" or max(len(match[1]), len(match[2])) > _DIGITS:

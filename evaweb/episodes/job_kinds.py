@@ -61,14 +61,14 @@ def store_at_start() -> None:
 
 @job_kind("export")
 def export_episode(work: JobContext) -> Mapping[str, Any]:
-    """Write the three action streams as one Parquet table, unless the station has; args: uuid."""
+    """Write the three action streams as one Parquet table, unless the station has written it; args: uuid."""
     path = write_export(journal_folder(UUID(work.args["uuid"])), data_dir())
     return {"file": str(path.relative_to(data_dir())), "bytes": path.stat().st_size}
 
 
 @job_kind("smoothness")
 def measure_smoothness(work: JobContext) -> Mapping[str, Any]:
-    """Measure the smoothness of the robot's motion, or store why it is unknown; args: uuid."""
+    """Measure the smoothness of the robot's motion and store it, or the reason why it is unknown; args: uuid."""
     uuid = UUID(work.args["uuid"])
     try:
         found = smoothness_in(journal_folder(uuid))
@@ -172,7 +172,7 @@ def reconcile_all(work: JobContext) -> Mapping[str, Any]:
 
 @startup_task("reconcile")
 def reconcile_at_start() -> None:
-    """Reconcile with changes on the disk while no worker was running."""
+    """Reconcile the database with changes that were made on the disk while no worker was running."""
     enqueue(kind="reconcile", key="reconcile", args={})
 
 

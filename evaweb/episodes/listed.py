@@ -12,7 +12,7 @@ from evaweb.stations.models import Station
 
 
 def filters(sight: Visibility) -> list[Filter]:
-    """Return the filters; none is for checkpoints, whose names are found by the word search."""
+    """Return the filters. There is no filter for checkpoints: the word search finds their names."""
     stations = [(station.name, str(station)) for station in Station.objects.all()]
     return [
         Filter("words", "Words", kind=SEARCH, hint="task, scene, checkpoint, operator, code"),
@@ -26,7 +26,10 @@ def filters(sight: Visibility) -> list[Filter]:
 
 
 def columns(sight: Visibility) -> list[Column]:
-    """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
+    """Return the columns of the list of episodes.
+
+    Sorting by checkpoint is offered only if no checkpoint is hidden, because the order would reveal it.
+    """
     checkpoint = ("trial__checkpoint__name", "checkpoint") if sight.hides_nothing else ()
     return [
         Column("picture", "Picture", quiet=True),

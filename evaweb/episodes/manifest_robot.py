@@ -47,7 +47,10 @@ def drawn_robot_for(manifest: Mapping[str, Any]) -> DrawnRobot:
 
 
 def robot_for(manifest: Mapping[str, Any]) -> robots.Robot:
-    """Return the robot's present description, without its scene. Raises: NotFound as `drawn_robot_for`."""
+    """Return the robot's present description, without its scene.
+
+    Raises: NotFound if it is not described any more, or its joints differ from the recorded ones.
+    """
     name, groups = str(robot_of_manifest(manifest).get("name", "")), groups_of_manifest(manifest)
     if name not in robots.robot_names():
         raise NotFound(_ROBOT_DOES_NOT_EXIST_THERE(name=name, names=", ".join(robots.robot_names())))

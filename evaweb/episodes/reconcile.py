@@ -130,7 +130,10 @@ def _folders() -> tuple[list[UUID], list[str]]:
 
 
 def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
-    """Return the uuids in file names; other names are reported, because the file would not be found again."""
+    """Return the uuids in file names.
+
+    Any other name is added to `problems` as "is `otherwise`", because the file would not be found again.
+    """
     found = set()
     for path in sorted(paths):
         try:

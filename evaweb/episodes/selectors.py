@@ -133,7 +133,7 @@ def tag_counts(*, sight: Visibility = FULL_VISIBILITY) -> dict[str, int]:
 
 
 def _by_someone(seen: Q, author: str, sight: Visibility) -> Q:
-    """Return the condition for opinions that this user may see: on visible episodes, or their own."""
+    """Return the condition for opinions that this user may see: those on episodes in `seen`, and their own."""
     return Q() if sight.hides_nothing else seen | Q(**{author: sight.user})
 
 

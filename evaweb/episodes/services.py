@@ -156,9 +156,9 @@ def sync_episode(*, uuid: UUID, station: Station | None = None) -> Episode:
 
 
 def outcome_change(row: Episode, seal: str | None) -> str:
-    """Return how the outcome of a closed episode has changed, to follow its name; "" if unchanged.
+    """Return how the outcome of a closed episode has changed, as words that follow its name; "" if unchanged.
 
-    `seal` is that of the present outcome: None if there is none, "" if it has no seal.
+    `seal` is that of the present outcome: None if there is no outcome, "" if it has no seal.
     """
     if seal is None:
         return f"is absent, though the recording was closed as {row.status}"
@@ -205,7 +205,7 @@ def request_smoothness(*, most: int) -> int:
 
 
 def request_publish(*, episode: Episode, version: str = "") -> Job | None:
-    """Queue the publication of an episode, again with the current score if it is published.
+    """Queue the publication of an episode; if it is published already, it is published again with the current score.
 
     `version` is that of a new dataset, "" for the default. Returns None for a run with a simulated robot, which is
     never published.
@@ -226,7 +226,7 @@ def close_unheard_episodes() -> int:
 
 
 def mark_missing() -> int:
-    """Mark every row without a folder as missing; return the total number of missing ones."""
+    """Mark every row without a folder as missing; return the number of all missing episodes."""
     fresh = Q(status=EpisodeStatus.RECORDING, created_at__gt=Now() - APPEARS_WITHIN)
     known = Episode.objects.exclude(fresh).exclude(status=EpisodeStatus.MISSING).filter(away_since=None)
     # A recording on another computer is there until it is closed, and then in transfer.
@@ -284,7 +284,10 @@ def _station_of(recorded: RecordedEpisode) -> Station:
 def get_or_create_station(
     *, name: str, robot: str, simulated: bool, source: str, active: bool = True
 ) -> Station:
-    """Return the station of that name; create it with the given values, known from `source`."""
+    """Return the station of that name; create it with the given values if it does not exist.
+
+    `source` names where these values are from, for the log.
+    """
     station, made = Station.objects.get_or_create(
         name=name, defaults={"robot": robot, "simulated": simulated, "title": name, "active": active}
     )

@@ -35,10 +35,10 @@ _LEAST_RATE = 0.95 * 2 * CUT_OFF  # least rate of observations [1/s]; tolerates 
 
 @dataclass(frozen=True, slots=True)
 class Smoothness:
-    """Smoothness of a run: mean over its arms weighted by path length; None, with `why`, if unknown.
+    """Smoothness of a run: mean over its arms weighted by path length.
 
-    `arms` of those that moved: name -> {"measured", "commanded": SPARC or None, "measured_m", "commanded_m": path
-    length [m]}.
+    It is None if unknown, and `why` is the reason. `arms` has the arms that moved: name -> {"measured", "commanded":
+    SPARC or None, "measured_m", "commanded_m": path length [m]}.
     """
 
     measured: float | None
@@ -108,7 +108,7 @@ class _Samples:
 class _TipTrack:
     """Positions of all end effectors [steps, arms, 3] at the control rate, one span per uninterrupted motion.
 
-    Linearly interpolated between samples; `seen`: samples per second, None without samples.
+    They are linearly interpolated between samples. `seen` is the number of samples per second, None without samples.
     """
 
     spans: tuple[Array, ...]

@@ -43,7 +43,10 @@ def request_scrub() -> Job | None:
 
 
 def scrub_due(work: JobContext) -> Mapping[str, Any]:
-    """Verify the next due recordings and store each result immediately; return the counts."""
+    """Verify the next due recordings and store each result immediately.
+
+    Returns: Number of recordings by result.
+    """
     counts = dict.fromkeys(("sound", "damaged", "unsealed", "open"), 0)
     damaged, problems, read = [], [], 0
     for uuid in _next():
@@ -63,7 +66,10 @@ def scrub_due(work: JobContext) -> Mapping[str, Any]:
 
 
 def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
-    """Store the result of a verification on disk and in the row; return it with changes known from the row."""
+    """Store the result of a verification on disk and in the row.
+
+    Returns: The result after the comparison with the row (see `compare_with_row`).
+    """
     row = Episode.objects.filter(uuid=UUID(verdict.path.name)).first()
     verdict = compare_with_row(row, verdict) if row else verdict
     if verdict.state == "damaged":
@@ -80,7 +86,7 @@ def record_verification(verdict: IntegrityCheck) -> IntegrityCheck:
 
 
 def compare_with_row(row: Episode, verdict: IntegrityCheck) -> IntegrityCheck:
-    """Return the result as damaged if a closed recording lost its outcome, or has another one."""
+    """Return the result of a verification; damaged if a closed recording has no outcome any more, or another one."""
     if row.status not in CLOSED or verdict.state == "damaged":
         return verdict
     why = outcome_change(row, None if verdict.state == "open" else verdict.seal)
@@ -98,7 +104,7 @@ def _verify_folder(folder: Path) -> IntegrityCheck:
 
 
 def unverified() -> tuple[int, int]:
-    """Return the numbers of damaged recordings, and of closed ones overdue for verification by a day."""
+    """Return the number of damaged recordings, and of closed ones whose verification is overdue by more than a day."""
     late = timezone.now() - LATE_AFTER
     never = Q(verified_at=None, created_at__lt=late - OLD_AFTER)
     closed = Episode.objects.filter(status__in=CLOSED, away_since=None)

@@ -23,7 +23,10 @@ def words_of(query: str) -> list[str]:
 
 
 def rank(query: str, name: str, more: str = "") -> Rank | None:
-    """Return the rank of an item; `more` are further searchable words. None if a word is in neither."""
+    """Return the rank of an item; None if a word of the query is neither in `name` nor in `more`.
+
+    `more` are further searchable words.
+    """
     wanted, called, text = " ".join(query.casefold().split()), name.casefold(), f"{name} {more}".casefold()
     if wanted == called:
         return Rank.EXACT

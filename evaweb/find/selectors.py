@@ -53,7 +53,7 @@ class FoundItem:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Items of one kind, best first; `more` if there are others."""
+    """Items of one kind, best first; `more` is True if there are further items."""
 
     name: str
     items: tuple[FoundItem, ...]
@@ -93,14 +93,17 @@ def find(*, query: str, user: Any, sight: Visibility) -> list[Group]:
 
 
 def _ranked(query: str, candidates: Iterable[Candidate]) -> list[FoundItem]:
-    """Return the matching items, best first, equal ranks in the given order."""
+    """Return the matching items, best first; items of equal rank keep the given order."""
     fits = [(rank(query, found.title, more), found) for found, more in candidates]
     known = [(fit, found) for fit, found in fits if fit is not None]
     return [found for _, found in sorted(known, key=lambda one: one[0])]
 
 
 def _narrowed(rows: QuerySet[Any], query: str, *fields: str) -> QuerySet[Any]:
-    """Return the rows with the longest words of the query in some of the fields, prefix matches first."""
+    """Return the first rows that contain the longest words of the query in their `fields`.
+
+    Exact matches come first, then rows that begin with the query.
+    """
     for word in sorted(words_of(query), key=len, reverse=True)[:_COMPARED]:
         rows = rows.filter(_any_of(fields, "icontains", word))
     nearness = Case(
@@ -168,7 +171,7 @@ def _scenes(query: str, role: Role) -> Iterator[Candidate]:
 
 
 def _administered(kind: str, key: int, name: str, role: Role) -> str:
-    """Return the address of the editor for administrators, and of the recordings for other users."""
+    """Return the address of an item: that of its editor for administrators, of its recordings for other users."""
     if role is Role.ADMIN:
         return reverse(f"admin:trials_{kind}_change", args=[key])
     return f"{reverse('replay-list')}?{urlencode({'words': name})}"
@@ -202,7 +205,10 @@ def _without(query: str, kind: str) -> str:
 
 
 def _trials(query: str) -> list[FoundItem]:
-    """Return the trials by number, then by code, each exact matches first, then prefixes."""
+    """Return the trials whose number begins with the query, then those whose code begins with it.
+
+    In both groups exact matches come first.
+    """
     asked = _without(query, "trial").removeprefix("#")
     rows = Trial.objects.select_related("scene", "position", "station", "handout")
     found: dict[int, Trial] = {}

@@ -12,7 +12,7 @@ from evaweb.jobs.models import Job, JobStatus
 
 @admin.register(Job)
 class JobAdmin(admin.ModelAdmin):
-    """Jobs; only services write the rows."""
+    """Admin page of jobs; only services write the rows."""
 
     list_display = (
         "key",

@@ -5,7 +5,7 @@ from django.utils.module_loading import autodiscover_modules
 
 
 class JobsConfig(AppConfig):
-    """Background jobs: rows that workers claim, execute and reclaim."""
+    """Configuration of the app for background jobs."""
 
     name = "evaweb.jobs"
     default_auto_field = "django.db.models.BigAutoField"

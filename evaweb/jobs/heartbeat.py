@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Lapse:
-    """Action `then` that runs once no heartbeat has reached the database for `after_s` [s], or one was rejected."""
+    """Action `then`, which runs if no heartbeat has reached the database for `after_s` [s], or one was rejected."""
 
     after_s: float
     then: Callable[[], None]
@@ -24,8 +24,8 @@ class Lapse:
 class Heartbeat:
     """Context manager that calls `beat` every `period_s` [s] until the block ends or `beat` returns False.
 
-    It has its own database connection. A failed beat is logged and the next one tried; the job continues until its
-    `lapse`, and is reclaimed by others if no beat arrives for too long.
+    It has its own database connection. If a beat fails, that is logged and the next one is tried. The job continues
+    until its `lapse`; if no beat arrives for too long, other workers reclaim it.
     """
 
     def __init__(self, beat: Callable[[], bool], period_s: float, lapse: Lapse | None = None) -> None:
@@ -67,7 +67,10 @@ class Heartbeat:
             connection.close()
 
     def _lapsing(self) -> threading.Timer:
-        """Return a timer that runs the lapse (started if there is one); a hanging database cannot delay it."""
+        """Return a timer that runs the lapse; it is started only if there is a lapse.
+
+        It is a thread of its own, so that a hanging database cannot delay it.
+        """
         lapse = self._lapse or Lapse(0.0, lambda: None)
         timer = threading.Timer(lapse.after_s, lapse.then)
         timer.daemon = True

@@ -60,15 +60,15 @@ _starts: dict[str, Chore] = {}
 
 
 class JobTakenOver(Exception):
-    """Another worker has the job now: stop, and write nothing more."""
+    """Error if another worker has the job now: stop, and write nothing more."""
 
 
 class Cancelled(Exception):
-    """A user has cancelled the job: stop."""
+    """Error if a user has cancelled the job: stop."""
 
 
 class UnknownKind(EvaError):
-    """No app has declared jobs of that kind."""
+    """Error if no app has declared jobs of that kind."""
 
 
 def job_kind(

@@ -32,7 +32,7 @@ class ClaimantState(Enum):
 
 @contextmanager
 def exclusive_job(key: str, owner: UUID | None) -> Iterator[bool]:
-    """Hold the lock of a job; yields False if another process holds it."""
+    """Hold the lock of a job during the block; yield False if another process holds it."""
     path = _path(key)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor = _locked(path)

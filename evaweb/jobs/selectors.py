@@ -99,10 +99,10 @@ def _done_since() -> Q:
 
 
 def pace_of(job: Job, now: datetime | None = None) -> Pace:
-    """Estimate the progress of a running job.
+    """Return the estimated progress of a running job.
 
-    From the steps that it reports ("n of m") and their rate so far; without them from the median duration of the last
-    jobs of its kind.
+    The estimate is from the steps that the job reports ("n of m") and their rate so far; without such steps it is from
+    the median duration of the last jobs of its kind.
     """
     if job.status != JobStatus.RUNNING or job.claimed_at is None:
         return Pace()

@@ -179,7 +179,10 @@ def _result_of(job: Job) -> Args:
 
 
 def _lapsed(job: Job) -> None:
-    """Exit this process, because another worker may have claimed the job; every job can be killed at any moment."""
+    """Exit this process, because another worker may have claimed the job.
+
+    This is safe because every job may be killed at any moment and run again.
+    """
     log.error(
         "job %s is not known to be ours any more: this worker ends before another one does the same", job.key
     )
@@ -189,7 +192,7 @@ def _lapsed(job: Job) -> None:
 def hold(job: Job, names: Collection[str]) -> None:
     """Wait until no other running job holds any of `names`, then hold them until this job ends.
 
-    They replace its earlier holds, so that two jobs cannot deadlock. Raises: TakenOver, Cancelled.
+    They replace its earlier holds, so that two jobs cannot deadlock. Raises: JobTakenOver, Cancelled.
     """
     while (by := retry_while_locked(partial(_acquire_names, job, sorted(set(names))))) is not None:
         _tell(job, f"waits for another job at work on the same: {by}")
@@ -222,7 +225,7 @@ def _tell(job: Job, progress: str) -> None:
 
 
 def heartbeat(*, job: Job) -> bool:
-    """Record a heartbeat of the job; return False if this claim has lost it."""
+    """Record a heartbeat of the job; return False if this process has lost its claim to the job."""
     return bool(_ours(job).update(seen_at=Now()))
 
 
@@ -258,7 +261,7 @@ def _finish(job: Job, **facts: Any) -> bool:
 
 
 def _ours(job: Job) -> QuerySet[Job]:
-    """Return the row as a queryset, empty once the claim is lost."""
+    """Return the job's row as a queryset, which is empty if this process's claim is lost."""
     return Job.objects.filter(pk=job.pk, status=JobStatus.RUNNING, owner=job.owner)
 
 

@@ -79,7 +79,7 @@ def lab_folder_named() -> None:
 
 
 def record_heartbeat(*, owner: UUID, queues: Sequence[str]) -> bool:
-    """Record a heartbeat of the worker, which registers it; return True."""
+    """Record a heartbeat of the worker, which also registers a new worker; always return True."""
     told = {
         "host": socket.gethostname(),
         "queues": list(queues),
@@ -91,7 +91,7 @@ def record_heartbeat(*, owner: UUID, queues: Sequence[str]) -> bool:
 
 
 def worker_ended(*, owner: UUID) -> None:
-    """Remove the worker from the registry, and those silent for a day."""
+    """Remove the worker from the registry, and all workers that have sent no heartbeat for a day."""
     gone = Q(pk=owner) | Q(seen_at__lt=Now() - timedelta(seconds=_FORGOTTEN_S))
     WorkerProcess.objects.filter(gone).delete()
 

@@ -4,6 +4,6 @@ from django.apps import AppConfig
 
 
 class LabConfig(AppConfig):
-    """Complete lab on one machine."""
+    """Configuration of the app for a complete lab on one machine."""
 
     name = "evaweb.lab"

@@ -16,7 +16,10 @@ from runtime.config.loader import ConfigurationError, load
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """Station of this lab: its deployment file and overrides; with `runs` it is running already."""
+    """Station of this lab: its deployment file, and assignments that override values in it.
+
+    If `runs` is set, the station is running already.
+    """
 
     deployment: Path
     assignments: Sequence[str] = ()

@@ -121,7 +121,9 @@ def demo_plan(
     design: str = StoppingRule.EVIDENCE,
     order: str = Allocation.PAIRED,
 ) -> Plan:
-    """Return a frozen blind plan that compares two checkpoints at all positions of a scene, created or amended.
+    """Return a frozen blind plan that compares two checkpoints at all positions of a scene.
+
+    It is created, or amended if there is one by that name.
 
     Raises:
         Conflict: If it cannot be amended, because trials are not finished.

@@ -74,7 +74,7 @@ class StoredDeployment:
 
     @property
     def chosen(self) -> bool:
-        """True if the file was created as a simulated station: the lab starts no others.
+        """True if the file was created as a simulated station; the lab starts no other deployments.
 
         The mark is in the comments at the head of the file, where input from pages never goes.
         """
@@ -169,7 +169,9 @@ def write_draft(
 
 
 def cameras_exchanged(*, name: str, shown: Mapping[str, str]) -> None:
-    """Rename the deployment's cameras by what they show; `shown` maps each name to the camera whose image it shows.
+    """Rename the deployment's cameras so that each name fits the image.
+
+    `shown` maps each name to the camera whose image it shows.
 
     Raises:
         EvaError: If an image is named twice, or a camera to be renamed is named by the robot's node.
@@ -324,7 +326,7 @@ def _require_no_holder(station: Station) -> None:
 
 
 def _require_no_program(part: str, typed: Mapping[str, str]) -> None:
-    """Check that the keys of BY_HAND have their defaults.
+    """Check that the keys in BY_HAND, which only a person with access to the machine may set, have their defaults.
 
     Raises:
         EvaError: If one has another value.
@@ -366,7 +368,9 @@ def _taken(name: str) -> Conflict:
 def _put(
     path: Path, tree: Mapping[str, Any], *about: str, place: Callable[[Path, Path], object] = os.replace
 ) -> None:
-    """Write the file, and `place` it if the runtime can load it.
+    """Write `tree` as a deployment file to `path`, if the runtime can load it.
+
+    `about` are lines of the comment at its head. `place` moves the checked draft to `path`.
 
     Raises:
         EvaError: If it cannot be loaded.

@@ -42,18 +42,18 @@ class Part:
 
     @property
     def asked(self) -> list[Typed]:
-        """Keys that are addresses."""
+        """Keys whose values are addresses."""
         return [one for one in self.keys if one.entry.address]
 
     @property
     def further(self) -> list[Typed]:
-        """All other keys."""
+        """Keys whose values are not addresses."""
         return [one for one in self.keys if not one.entry.address]
 
 
 @dataclass(frozen=True, slots=True)
 class DraftForm:
-    """Complete form."""
+    """Form of a draft: name, robot, task, and the tables of the deployment."""
 
     name: str
     robot: str

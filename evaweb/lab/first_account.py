@@ -37,7 +37,10 @@ def is_offered() -> bool:
 
 
 def is_missing() -> bool:
-    """Return True if there is no account; False if the database does not answer, which the login page then reports."""
+    """Return True if there is no account.
+
+    False if the database does not answer; the login page then reports that.
+    """
     try:
         return has_no_accounts()
     except Error:
@@ -58,7 +61,7 @@ def administrator_make(*, username: str, password: str) -> User:
     """Create the first administrator.
 
     Raises:
-        Conflict: If there is an account already; of two simultaneous requests, one gets it.
+        Conflict: If there is an account already; of two simultaneous requests only one succeeds.
     """
     if not has_no_accounts():
         raise Conflict("this lab has an account already: log in, or ask an administrator for one")

@@ -33,13 +33,13 @@ class Progress(StrEnum):
 
     @property
     def tone(self) -> str:
-        """Tone of its chip."""
+        """Tone of the progress chip, by its name in the style sheets."""
         return {"done": "ok", "now": "active"}.get(self.value, "neutral")
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Step with its name, which is also that of its template, its title and progress."""
+    """Step with its name, title and progress; its template has the same name."""
 
     name: str
     title: str
@@ -53,10 +53,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Walk:
-    """Steps of one station; without a station the first step is the current one.
+    """First steps of one station, or of a lab without a station, where the first step is the current one.
 
-    `snapshot` is the station's state, {} if it does not answer; `standing` is the status of its deployment `kept` in
-    the lab.
+    `snapshot` is the station's state, {} if it does not answer; `kept` is its deployment file, and `standing` the
+    status of that deployment in the lab.
     """
 
     station: Station | None
@@ -103,7 +103,10 @@ _TITLES = {
 
 
 def walk(*, name: str = "") -> Walk:
-    """Return the steps of the named station, else of the newest; it need not have a database row yet."""
+    """Return the steps of the station called `name`, which need not have a database row yet.
+
+    If there is no such station, they are those of the newest.
+    """
     stations = tuple(Station.objects.filter(active=True).order_by("-created_at"))
     kept = stored_deployment(name) if name else None
     station = next((one for one in stations if one.name == name), None)

@@ -64,7 +64,10 @@ class Lab:
         return str(web["url"])
 
     def watch(self, how: Benches | None = None) -> None:
-        """Restart processes that end, and start new deployments of the data folder, until a signal arrives."""
+        """Restart processes that end, and start new deployments of the data folder, until a signal arrives.
+
+        `how` are the settings of the simulated benches that it starts.
+        """
         pickup = Pickup(self.processes, how or Benches())
         while True:
             self.processes.watch()

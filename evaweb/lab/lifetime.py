@@ -18,7 +18,10 @@ _ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequested(BaseException):
-    """The lab was asked to end; a BaseException, so that no handler of errors stops it on the way."""
+    """Request to end the lab.
+
+    It is a BaseException, so that no error handler catches it on its way to the main program.
+    """
 
 
 @contextmanager

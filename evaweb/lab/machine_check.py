@@ -43,7 +43,7 @@ print(json.dumps([got, advice(got, {0})]))
 
 
 class State(StrEnum):
-    """Result of one check; `tone` is its colour."""
+    """Verdict of one check."""
 
     GOOD = "good"
     LACKING = "lacking"  # works, but worse than it could
@@ -52,7 +52,7 @@ class State(StrEnum):
 
     @property
     def tone(self) -> str:
-        """Tone of its chip."""
+        """Tone of the verdict's chip, by its name in the style sheets."""
         return {"good": "ok", "lacking": "warn", "bad": "danger"}.get(self.value, "neutral")
 
 

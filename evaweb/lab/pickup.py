@@ -18,7 +18,7 @@ Coming = Generator[str, None, bool]  # yields what is being started; returns whe
 
 
 class Pickup:
-    """Starter of the data folder's simulated stations, one after the other; call `look` regularly."""
+    """Starter of the data folder's simulated stations, one after the other; call `poll` regularly."""
 
     def __init__(self, processes: ChildProcesses, how: simulated.Benches) -> None:
         self._processes, self._how = processes, how

@@ -114,7 +114,7 @@ def _require_blind(code: str, trial: Mapping[str, Any]) -> None:
 
 
 def _give_up(operator: RestClient, page: LivePage, trial: int, fault: str) -> None:
-    """Free the station for the next attempt, whatever the trial's status."""
+    """Stop, abandon or void the trial, whatever its status, so that the station is free for the next attempt."""
     status = operator.get(f"trials/{trial}")["status"]
     if status in ("running", "paused"):
         page.command("stop")

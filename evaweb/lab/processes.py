@@ -34,15 +34,15 @@ Starting = Generator[None, None, Mapping[str, Any]]  # returns the addresses tha
 
 
 class LabError(EvaError):
-    """The lab cannot start or continue; the message names part and reason."""
+    """Error if the lab cannot start or continue; the message names part and reason."""
 
 
 @dataclass(frozen=True)
 class ProgramSpec:
-    """Process `python ARGUMENTS --lifeline`.
+    """Specification of a program: the process `python ARGUMENTS --lifeline`.
 
-    A program that `announces` prints its addresses as a line of JSON when it is ready. For a restart, `again` converts
-    them to arguments, so that it has the same addresses again.
+    If `announces` is set, the program prints its addresses as a line of JSON when it is ready. For a restart, `again`
+    converts these addresses to arguments, so that the program has them again.
     """
 
     name: str
@@ -240,7 +240,10 @@ class ChildProcesses:
         return f"{lines[-1] if lines else 'no output'} (see {path})"
 
     def _restart(self, child: _Child, code: int, now: float) -> None:
-        """Restart it with the same addresses; its announcement is known and goes to its log."""
+        """Restart a child with the addresses that it had announced; its new announcement goes to its log.
+
+        A child that has ended too often is not restarted before a pause.
+        """
         program = child.program
         if not child.restarts.admit(now):
             child.rests_until = now + _REST_S

@@ -1,4 +1,4 @@
-"""Programs of a lab as command lines."""
+"""Programs of a lab, as specifications of their processes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MANAGE = str(settings.BASE_DIR / "manage.py")
 
 
 def web(host: str, port: int) -> ProgramSpec:
-    """Return the web process: pages, REST and websockets."""
+    """Return the program of the web process: pages, REST and websockets."""
 
     def arguments(where: object) -> tuple[str, ...]:
         return (_MANAGE, "serve", "--host", host, "--port", str(where))
@@ -31,7 +31,10 @@ def web(host: str, port: int) -> ProgramSpec:
 
 
 def stops(descriptor: int, web_port: str) -> ProgramSpec:
-    """Return the process for stops of the web's pages, on an inherited socket; it has priority over the web."""
+    """Return the program that answers stops of the web's pages, on the inherited socket `descriptor`.
+
+    It has priority over the web.
+    """
     return ProgramSpec(
         "stops",
         (_MANAGE, "stops", "--descriptor", str(descriptor), "--web-port", web_port),
@@ -43,7 +46,10 @@ def stops(descriptor: int, web_port: str) -> ProgramSpec:
 
 
 def gate(host: str, port: int) -> ProgramSpec:
-    """Return the gate for stations on other computers: at this port, images at the next port."""
+    """Return the program of the gate for stations on other computers.
+
+    It listens at `port`; images use the next port.
+    """
     return ProgramSpec(
         "gate",
         (_MANAGE, "gate", "--host", host, "--port", str(port)),
@@ -54,23 +60,23 @@ def gate(host: str, port: int) -> ProgramSpec:
 
 
 def worker() -> ProgramSpec:
-    """Return the worker of every queue; interrupted work is repeated at the next start."""
+    """Return the program of a worker of every queue; interrupted work is repeated at its next start."""
     return ProgramSpec("worker", (_MANAGE, "worker"), patience_s=20.0, of_web=True)
 
 
 def station(deployment: str, assignments: Sequence[str]) -> ProgramSpec:
-    """Return the runtime of a station, which supervises its own processes."""
+    """Return the program of a station's runtime, which supervises its own processes."""
     sets = [part for assignment in assignments for part in ("--set", assignment)]
     return ProgramSpec(f"station-{_stem(deployment)}", ("-m", "runtime", deployment, *sets), patience_s=15.0)
 
 
 def bench(seed: int, width: int, height: int) -> tuple[str, ...]:
-    """Return the options of a simulated bench: seed of the first layout, and image size [pixels]."""
+    """Return the command-line options of a simulated bench: seed of the first layout, and image size [pixels]."""
     return ("--seed", str(seed), "--width", str(width), "--height", str(height))
 
 
 def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> ProgramSpec:
-    """Return the simulated bench with these options, on free ports that it keeps after restarts."""
+    """Return the program of a simulated bench; it picks free ports, and has them again after a restart."""
 
     def arguments(observations: str, commands: str) -> tuple[str, ...]:
         ends = ("--obs-endpoint", observations, "--action-endpoint", commands)
@@ -86,7 +92,10 @@ def tabletop(robot: str, options: Sequence[str], name: str = "bench") -> Program
 
 
 def leader(robot: str, observations: str, seed: int) -> ProgramSpec:
-    """Return the simulated leader, which demonstrates the bench's task, on a free port that it keeps."""
+    """Return the program of a simulated leader, which demonstrates the bench's task.
+
+    It picks a free port, and has it again after a restart.
+    """
 
     def arguments(endpoint: str) -> tuple[str, ...]:
         watching = ("-m", "runtime.simulation.leader", "--robot", robot, "--obs-endpoint", observations)
@@ -107,7 +116,10 @@ def _serving(name: str, robot: str, options: Sequence[str], port: object) -> tup
 
 
 def policy(name: str, robot: str, options: Sequence[str], port: int = 0) -> ProgramSpec:
-    """Return a scripted policy on that port, or on a free port that it keeps."""
+    """Return the program that serves a scripted policy on `port`.
+
+    0 picks a free port, which it has again after a restart.
+    """
 
     def arguments(port: object) -> tuple[str, ...]:
         return ("-m", "runtime.standins.serve", *_serving(name, robot, options, port))
@@ -124,7 +136,7 @@ def lockstep(
     policies: Mapping[str, tuple[Sequence[str], int]],
     options: Sequence[str],
 ) -> ProgramSpec:
-    """Return a station, its simulated bench and its policy servers in one process on a virtual clock.
+    """Return the program of a station, its simulated bench and its policy servers in one process on a virtual clock.
 
     `policies` maps names to options and port (0: free); the addresses are announced. `options` are those of the bench,
     and --paced.

@@ -37,7 +37,7 @@ _TOKEN = re.compile(r'name="csrfmiddlewaretoken" value="([^"]+)"')
 
 
 class StateTimeout(DemoFailed):
-    """No state in time satisfied the condition."""
+    """Error if no state satisfied the condition in time."""
 
 
 class _NoRedirect(HTTPRedirectHandler):
@@ -213,7 +213,10 @@ class LivePage:
         what: str,
         mark: Callable[[Mapping[str, Any]], object],
     ) -> Mapping[str, Any]:
-        """Wait like `wait`, as long as there is progress: `mark` of the state changes with any progress."""
+        """Return the first state that satisfies `reached`; wait as long as `mark` of the state keeps changing.
+
+        `mark` returns facts of a state that change with any progress.
+        """
         patience = ProgressTimeout(what)
         while True:
             try:

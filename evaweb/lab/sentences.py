@@ -48,7 +48,7 @@ def modules() -> Iterator[str]:
 
 
 def of_python() -> list[Entry]:
-    """Return every pattern of Python, ordered by id."""
+    """Return the sentences that Python modules declare, ordered by id."""
     for module in modules():
         import_module(module)
     return [_entry(pattern) for pattern in declared_patterns()]
@@ -108,9 +108,10 @@ def catalogue(entries: Iterable[Entry]) -> list[dict[str, Any]]:
 
 
 def compared(entries: Sequence[Entry], translated: Mapping[str, str]) -> dict[str, list[str]]:
-    """Return the ids that a language lacks ("missing"), that do not exist ("unknown"), or that do not fit.
+    """Return the ids in which a language differs from the catalogue, by kind of difference.
 
-    "other_arguments" are texts with unknown arguments, or texts that cannot be parsed.
+    "missing": not translated; "unknown": not in the catalogue; "other_arguments": the translated text has unknown
+    arguments or cannot be parsed.
     """
     english = {one.id: one for one in entries}
     return {
@@ -136,7 +137,7 @@ def once(entries: Iterable[Entry]) -> list[Entry]:
 
 
 def _labels(tree: ast.AST) -> Iterator[str]:
-    """Yield the titles of columns, filters and tabs."""
+    """Yield the titles of columns, filters and tabs in a parsed module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith("_TABS"):
             yield from (title for title, _ in ast.literal_eval(node.value))

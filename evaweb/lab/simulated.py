@@ -40,11 +40,11 @@ class Benches:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Options of the bench."""
+        """Command-line options of a bench."""
         return programs.bench(self.seed, *self.pictures)
 
     def skill(self, policy: str) -> tuple[str, ...]:
-        """Return the options of a policy's server."""
+        """Return the command-line options of a policy's server, which determine its skill."""
         return (*POLICIES[policy][1], "--seed", str(self.seed))
 
 
@@ -74,10 +74,10 @@ def benches_of(options: Mapping[str, Any]) -> Benches:
 def bring(
     processes: ChildProcesses, station: str, robot: str, how: Benches
 ) -> Generator[str, None, list[str]]:
-    """Start bench and policies of a station step by step; yield what is being started.
+    """Start bench and policies of a station step by step; yield the name of each as it is started.
 
-    Returns the overrides of its deployment. A policy server is shared by all stations with this robot; its checkpoint
-    is updated with its address.
+    Returns the assignments that override the station's deployment. A policy server is shared by all stations with this
+    robot; its checkpoint is updated with its address.
     """
     program = programs.tabletop(robot, how.options, f"bench-{station}")
     node = yield from _starting(processes, program, "the simulated bench")
@@ -110,8 +110,9 @@ def _starting(
 
 
 def known_port(name: str) -> int:
-    """Return the port of the checkpoint's previous policy server if it is free, else 0: a frozen plan
-    contains the address.
+    """Return the port of the checkpoint's previous policy server if it is free, else 0.
+
+    The same port is preferred because a frozen plan contains the address.
     """
     return free_port_of(Checkpoint.objects.filter(name=name).values_list("policy__url", flat=True).first())
 

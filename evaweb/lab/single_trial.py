@@ -179,7 +179,7 @@ def score_by_truth(visitor: RestClient, trial: int) -> Mapping[str, Any]:
 
 
 def wait_for_recorded(visitor: RestClient, trial: int) -> Mapping[str, Any]:
-    """Return the trial when its duration is that of its recording."""
+    """Wait for the duration of the trial's recording, then return the trial with that duration."""
     uuid = visitor.get(f"trials/{trial}")["episode"]
     episode = _worked_on(visitor, uuid, ("duration_s",), "waiting for the recording")
     return wait_for_recording(visitor, trial, episode)
@@ -190,7 +190,11 @@ def _published(visitor: RestClient, episode: str) -> Mapping[str, Any]:
 
 
 def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) -> Mapping[str, Any]:
-    """Return the episode when these facts are known; activity of the worker counts as progress."""
+    """Return the episode as soon as these facts of it are known; any activity of the worker counts as progress.
+
+    Raises:
+        DemoFailed: If there is no progress, or the episode's publication fails.
+    """
 
     def ask() -> tuple[Mapping[str, Any], Sequence[Mapping[str, Any]]]:
         return visitor.get(f"episodes/{uuid}"), visitor.get("jobs?limit=50")["items"]
@@ -205,7 +209,7 @@ def _worked_on(visitor: RestClient, uuid: str, facts: Sequence[str], what: str) 
 
 
 def wait_for_recording(visitor: RestClient, trial: int, episode: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the trial when its duration is that of its recording; before, it is that of the commands."""
+    """Return the trial as soon as its duration is that of its recording; until then it is that of the commands."""
     found: Mapping[str, Any] = wait_until(
         lambda: visitor.get(f"trials/{trial}"),
         lambda facts: facts["duration_s"] == episode["duration_s"],

@@ -14,11 +14,11 @@ Found = TypeVar("Found")
 
 
 class DemoFailed(EvaError):
-    """The lab answered something unexpected; the message quotes it."""
+    """Error if the lab's answer is unexpected; the message quotes it."""
 
 
 class NoReply(DemoFailed):
-    """No reply in time; whether the request was executed is unknown."""
+    """Error if no reply came in time; whether the request was executed is unknown."""
 
 
 class ProgressTimeout:
@@ -49,10 +49,10 @@ def wait_until(
     what: str,
     mark: Callable[[Found], Any] = lambda found: found,
 ) -> Found:
-    """Poll `ask` until the result is `reached`, and return it; missing replies are retried.
+    """Call `ask` until its result satisfies `reached`, and return that result; missing replies are retried.
 
     Raises:
-        DemoFailed: If there is no progress.
+        DemoFailed: If `mark` of the result has not changed for too long.
     """
     patience = ProgressTimeout(what)
     while True:

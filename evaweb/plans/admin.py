@@ -63,11 +63,11 @@ class PlanForm(forms.ModelForm):
         fields = _FROZEN
 
     def clean_strategy(self) -> Any:
-        """Return None for an empty field: the plan has no strategy of its own."""
+        """Return the strategy's table; None for an empty field: then the plan has no strategy of its own."""
         return self.cleaned_data["strategy"] or None
 
     def clean_look_after(self) -> list[int]:
-        """Return [] for an empty field: a look after every pair."""
+        """Return the numbers of pairs; [] for an empty field: then there is a look after every pair."""
         try:
             given = self.cleaned_data["look_after"]
             return [] if given in self.fields["look_after"].empty_values else look_schedule(given)
@@ -76,7 +76,7 @@ class PlanForm(forms.ModelForm):
 
 
 class Conditions(forms.ModelMultipleChoiceField):
-    """Choice of initial conditions of several scenes, labelled by scene and position."""
+    """Form field to choose positions of several scenes, each labelled by scene and position."""
 
     def label_from_instance(self, obj: Any) -> str:
         """Return scene and position."""
@@ -84,7 +84,7 @@ class Conditions(forms.ModelMultipleChoiceField):
 
 
 class EventInline(ReadOnly, admin.TabularInline):
-    """Events of a plan."""
+    """Table of a plan's events on its admin page."""
 
     model = PlanEvent
     extra = 0
@@ -113,7 +113,7 @@ class FileForm(forms.Form):
 
 @admin.register(Plan)
 class PlanAdmin(admin.ModelAdmin):
-    """Plans: a question, and the trials that answer it."""
+    """Admin page of plans."""
 
     form = PlanForm
     list_display = ("title", "name", "version", "state", "owner", "blind", "trials", "frozen_at")
@@ -154,7 +154,10 @@ class PlanAdmin(admin.ModelAdmin):
         return super().formfield_for_manytomany(db_field, request, **kwargs)
 
     def get_readonly_fields(self, request: HttpRequest, obj: Plan | None = None) -> tuple[str, ...]:
-        """Return the frozen fields; for a draft of a later version the name, shared by all versions."""
+        """Return the read-only fields: those of a frozen plan; of a draft of a later version only the name.
+
+        All versions share the name.
+        """
         if obj is None:
             return ()
         frozen = tuple("conditions" if name == "positions" else name for name in _FROZEN)

@@ -63,7 +63,7 @@ _SCENE_CHECKPOINT_RENAMED_SINCE_FROZEN = Pattern(
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Numbers of slots, of slots that count already, and of attempts."""
+    """Number of slots (`total`), of slots that count already, and of attempts."""
 
     total: int
     counted: int
@@ -170,7 +170,10 @@ def _check_goes_on(plan: Plan) -> None:
 
 
 def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
-    """Return the slot for the station, and its newest attempt if there was one that does not count."""
+    """Return the next slot for the station, and its newest attempt, None if there was none.
+
+    Raises: Conflict if no slot is left for the station.
+    """
     tried = without_dropped(plan.slots.all(), dropped_of(plan))
     slots = _with_newest(tried.select_related("scene", "position", "checkpoint").order_by("index"))
     for slot in slots.filter(station=station):
@@ -189,7 +192,10 @@ def _next(plan: Plan, station: Station) -> tuple[Slot, Trial | None]:
 
 
 def _with_newest(slots):  # type: ignore[no-untyped-def]
-    """Annotate slots with `newest`: status of the attempt that counts, else of the newest; None before any."""
+    """Annotate slots with `newest`, the status of a trial.
+
+    It is the trial that counts, otherwise the newest attempt; None before any attempt.
+    """
     counts = Case(When(trial__status=TrialStatus.SCORED, then=0), default=1)
     attempts = Handout.objects.filter(slot=OuterRef("pk")).order_by(counts, "-number")
     newest = attempts.values("trial__status")[:1]

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class PlansConfig(AppConfig):
-    """Evaluation plans: pre-registered, frozen and run blind."""
+    """Configuration of the app for evaluation plans."""
 
     name = "evaweb.plans"
     default_auto_field = "django.db.models.BigAutoField"

@@ -103,7 +103,8 @@ def current_camera_check(*, user: User, station: Station) -> CameraCheck | None:
 def confirm_cameras(*, user: User, station: Station, first: bool = False) -> CameraCheck:
     """Record that each camera shows the same as its reference, with its current image and match.
 
-    `first`: create missing references from the current images. Raises: Conflict, which names cameras without reference.
+    With `first`, missing references are created from the current images. Raises: Conflict, which names cameras without
+    reference.
     """
     require_role(user, Role.OPERATOR)
     cameras = cameras_of(station)
@@ -129,16 +130,17 @@ def confirm_cameras(*, user: User, station: Station, first: bool = False) -> Cam
 
 
 def references(*, station: Station, position: Position | None) -> dict[str, Reference]:
-    """Return the newest reference of each camera, at a position or, for None, of the camera itself."""
+    """Return the newest reference of each camera at a position; if `position` is None, of the cameras themselves."""
     rows = Reference.objects.filter(station=station, position=position).order_by("pk")
     return {row.camera: row for row in rows}
 
 
 @transaction.atomic
 def record_references(*, user: User, station: Station, position: Position | None) -> list[Reference]:
-    """Make the current images the references of a position, or of the cameras; older ones stay in the record.
+    """Make the current images the references of a position or, if `position` is None, of the cameras themselves.
 
-    Regions keep their place in the picture. Raises: Conflict if a running plan uses one of the references as a gate.
+    Older references stay in the record. Regions keep their place in the picture. Raises: Conflict if a running plan
+    uses one of the references as a gate.
     """
     require_role(user, Role.OPERATOR)
     found = image_store.current_images(station, cameras_of(station))
@@ -163,7 +165,7 @@ def record_references(*, user: User, station: Station, position: Position | None
 
 @transaction.atomic
 def save_regions(*, user: User, reference: Reference, drawn: Any) -> Reference:
-    """Create a reference with the same picture and these regions: [{"name", "x", "y", "width", "height"}, ...].
+    """Create a reference with the same picture and the regions `drawn`: [{"name", "x", "y", "width", "height"}, ...].
 
     Raises: Conflict if there is a newer one, or a running plan with a least match has used this camera's reference.
     """
@@ -328,13 +330,13 @@ def _check_before(what: str, trial: Trial, user: Any) -> None:
 
 
 def _repeated(handout: Handout) -> bool:
-    """Whether another attempt counts in place of this one."""
+    """Return True if another attempt at the same slot counts."""
     others = Handout.objects.filter(plan=handout.plan_id, slot=handout.slot_id).exclude(pk=handout.pk)
     return others.filter(trial__status=TrialStatus.SCORED).exists()
 
 
 def _of_two(trial: Trial) -> bool:
-    """Whether two operators must agree to a void: in a blind plan, or if the plan counts the trial as a failure.
+    """Return True if two operators must agree to a void: in a blind plan, or if the plan counts the trial as a failure.
 
     Otherwise an unwelcome trial could be repeated instead.
     """

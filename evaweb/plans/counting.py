@@ -33,15 +33,19 @@ ENDS = {f"on_{name}": words for name, words in ENDINGS.items()}
 
 
 def ended_by(trial: Trial) -> str:
-    """Return the key of `ENDS` that ended the trial's run; "" if it ended by itself or the operator stopped it."""
+    """Return the key of `ENDS` for what ended the trial's run.
+
+    "" if the run ended by itself or the operator stopped it.
+    """
     end = end_of(trial.ended_by, trial.status, trial.reason, trial.episode and trial.episode.status)
     return f"on_{end}" if end else ""
 
 
 def end_of(kept: str | None, status: str, reason: str, recording: str | None) -> str:
-    """Return one of `ENDINGS` or "": the stored value `kept`.
+    """Return the cause that ended a run: one of `ENDINGS`, or "".
 
-    For trials that predate it (None), derived from status, reason and the status of the recording (None without one).
+    It is the stored value `kept`. For trials that predate this value (`kept` is None), it is derived from status,
+    reason and the status of the recording (None without a recording).
     """
     if kept is not None:
         return kept
@@ -58,9 +62,9 @@ def require_scored_first(plan: Plan, before: Trial | None) -> None:
 
 
 def fails_by(plan: Plan, trial: Trial) -> bool:
-    """Whether the trial is a failure by the plan, whatever its score.
+    """Return True if the trial is a failure by the plan, whatever its score.
 
-    Not if nothing of its run was recorded, because it could not be scored.
+    It is not if nothing of its run was recorded, because it could not be scored.
     """
     counts = getattr(plan, ended_by(trial) or "on_nothing", CountsAs.JUDGED)
     episode = trial.episode

@@ -11,7 +11,7 @@ from evaweb.jobs.models import Job
 
 
 class Cover(Enum):
-    """Hidden part of a job: nothing, its texts (which may name a server), or also its subject and times."""
+    """Part of a job that is hidden: nothing, its texts (which may name a server), or also its subject and times."""
 
     NOTHING = 0
     WORDS = 1
@@ -21,8 +21,8 @@ class Cover(Enum):
 def cover_of(job: Job, sight: Visibility) -> Cover:
     """Return how much of a job is hidden from this user.
 
-    All for a blind trial or plan; nothing for a visible recording, unless its texts name a hidden checkpoint; the texts
-    for everything else.
+    A job of a blind trial or plan is hidden entirely. A job of a visible recording is hidden only if its texts name a
+    hidden checkpoint. Of any other job the texts are hidden.
     """
     if sight.hides_nothing:
         return Cover.NOTHING

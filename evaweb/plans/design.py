@@ -150,8 +150,8 @@ def frozen_design(document: Mapping[str, Any]) -> Design | None:
 class Tried:
     """Outcomes of the compared checkpoints, block by block as scheduled, up to the last block that a comparison uses.
 
-    `counted` is what counts. `at_first` has the first score of each slot, as if no scored trial had been voided or
-    corrected. `again` tells for each counting trial whether an earlier attempt was discarded unscored.
+    `counted` are the outcomes that count. `at_first` has the first score of each slot, as if no scored trial had been
+    voided or corrected. `again` is True for each trial that counts if an earlier attempt at it was discarded unscored.
     """
 
     counted: list[Block]
@@ -159,7 +159,7 @@ class Tried:
     again: list[list[bool]]
 
     def against(self, winner: int, loser: int) -> list[Block]:
-        """Return `counted` with the worst case for `winner` wherever an attempt was discarded unscored."""
+        """Return `counted` with the worst outcome for `winner` in each trial that had an attempt discarded unscored."""
         worst = {winner: 0.0, loser: 1.0}
         return [
             tuple(
@@ -174,8 +174,9 @@ class Tried:
 class Attempt:
     """Scored or interrupted attempt of a compared checkpoint, of slot `slot` in block `block`.
 
-    `counts`: whether its score counts. `outcome` is that of its newest score, `first` that of its first score before
-    the result was stored; None without a score. `attempt` is above 1 if an earlier one did not count.
+    `counts`: whether its score counts. `outcome` is the outcome by its newest score, `first` that by its first score;
+    both ignore scores after the result was stored, and are None without a score. `attempt` is above 1 if an earlier
+    attempt did not count.
     """
 
     block: int
@@ -230,7 +231,7 @@ def attempts_of(plan: Plan) -> list[Attempt]:
 
 
 def current_pairs(plan: Plan) -> Tried:
-    """Return the current blocks of a frozen plan, empty without a comparison; one query."""
+    """Return the current outcomes of a frozen plan by block; empty without a comparison. Takes one query."""
     document = plan.document or {}
     found = frozen_design(document) if document else None
     if found is None:
@@ -239,7 +240,7 @@ def current_pairs(plan: Plan) -> Tried:
 
 
 def blocks_of(found: Design, arms: Sequence[str], attempts: Iterable[Attempt]) -> Tried:
-    """Return the blocks formed by these attempts, which must be in the order of handout."""
+    """Return the outcomes by block of these attempts, which must be in the order of handout."""
     counted: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     at_first: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     thrown: set[int] = set()
@@ -267,14 +268,17 @@ def stored_blocks(plan: Plan) -> list[Block] | None:
 
 
 def blocks_of_record(kept: Mapping[str, Any]) -> list[Block]:
-    """Return the blocks of a `reveal_record`, including old ones that stored pairs."""
+    """Return the blocks of a `reveal_record`; an old record, which stored pairs, is converted to blocks."""
     if "blocks" not in kept:
         return in_blocks([(one, other) for one, other in kept["pairs"]])
     return [tuple((arm, value) for arm, value in block) for block in kept["blocks"]]
 
 
 def same_blocks(one: Sequence[Block], other: Sequence[Block]) -> bool:
-    """Return whether both have the same trials; order within a block is ignored, as old reveals did not store it."""
+    """Return True if both lists have the same trials.
+
+    The order within a block is ignored, because old reveals did not store it.
+    """
     return [sorted(block) for block in one] == [sorted(block) for block in other]
 
 
@@ -285,7 +289,10 @@ def blocks_that_count(plan: Plan) -> list[Block]:
 
 
 def findings_of(plan: Plan) -> Findings | None:
-    """Return the findings of the frozen design, at the reveal if there was one, else now; None without a comparison."""
+    """Return the findings of the frozen design from the blocks that count; None without a comparison.
+
+    Those are the blocks of the reveal if there was one, else the current ones.
+    """
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
         return None
@@ -318,19 +325,25 @@ def end_reason(plan: Plan, found: Findings) -> str:
 
 
 def end_at_request(plan: Plan) -> str:
-    """Return why the plan ended, as found at a request for a trial or at its last one; "" if it has not."""
+    """Return the reason why the plan has ended, "" if it has not.
+
+    The end is found when a trial is requested, or at the last trial.
+    """
     told = plan.events.filter(what=ENDED_EVENT).values_list("text", flat=True).first()
     return told or ""
 
 
 def crossed_while_waiting(plan: Plan, since: datetime) -> str:
-    """Return why the plan would have ended, as found since a void was requested; "" if it would not."""
+    """Return why the plan would have ended at a request for a trial at or after `since`, when a void was requested.
+
+    "" if it would not have ended.
+    """
     told = plan.events.filter(what=CROSSED_EVENT, at__gte=since).values_list("text", flat=True).first()
     return told or ""
 
 
 def visible_close_reason(plan: Plan, sealed: bool) -> str:
-    """Return why the plan was closed; if it is `sealed` for the reader, only a reason by the server.
+    """Return why the plan was closed; if it is `sealed` for the reader, only a reason that the server gave.
 
     Since format 6 the server's reasons are recorded, so that an owner's reason with the same beginning is not confused
     with them.
@@ -346,7 +359,7 @@ _told_of: list[Callable[[Plan], dict[str, Any]]] = []
 
 
 def register_reveal_data(told: Callable[[Plan], dict[str, Any]]) -> None:
-    """Register a function that returns further data to store at a reveal."""
+    """Register a function that returns further data to store when a plan is revealed."""
     _told_of.append(told)
 
 
@@ -382,7 +395,10 @@ def counted_now(plan: Plan) -> dict[str, Any]:
 
 
 def _sums(plan: Plan) -> list[dict[str, Any]]:
-    """Return by checkpoint the counting trials, successes and mean score, in the order of the document."""
+    """Return for each checkpoint the number of counting trials and of successes, and the mean score.
+
+    The order is that of the plan's document.
+    """
     rows = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by("number")
     found: dict[str, list[tuple[bool, float]]] = defaultdict(list)
     for name, success, score in rows.values_list(

@@ -22,14 +22,14 @@ _ENOUGH = 20  # pairs that, if all are won by one checkpoint, are significant at
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Message about a draft, and the step of its page at which that is changed."""
+    """Message about a draft, and the step of its page at which the cause can be changed."""
 
     step: str
     text: str
 
 
 def problems(plan: Plan) -> Iterator[Remark]:
-    """Yield everything that prevents freezing, except an unsuitable random order, which freezing draws."""
+    """Yield everything that prevents freezing, except a random order that does not fit: freezing draws another one."""
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     if not plan.positions.exists():
         yield Remark("conditions", f"{plan} has no position: choose initial conditions")
@@ -45,7 +45,7 @@ def problems(plan: Plan) -> Iterator[Remark]:
 
 
 def _served(plan: Plan) -> Iterator[Remark]:
-    """Yield strategies that stations would refuse, and conflicts between those of plan and checkpoints."""
+    """Yield strategies that stations would refuse, and conflicts between the strategies of plan and checkpoints."""
     try:
         check_strategy(plan.strategy)
     except ValidationError as error:  # the draft predates this validation
@@ -58,7 +58,7 @@ def _served(plan: Plan) -> Iterator[Remark]:
 
 
 def covered(plan: Plan, sight: Visibility) -> Callable[[str], str]:
-    """Return a function that replaces names of hidden checkpoints in messages for this user."""
+    """Return a function that replaces the names of checkpoints hidden from this user in a message."""
     rows = [*plan.checkpoints.filter(pk__in=sight.checkpoints), *filter(None, (plan.first, plan.second))]
     names = sorted({row.name for row in rows if row.pk in sight.checkpoints}, key=len, reverse=True)
 

@@ -24,7 +24,8 @@ def read(
 ) -> tuple[Values, dict[str, str]]:
     """Return the values of the valid fields, and messages for the invalid ones by name.
 
-    `hidden` checkpoints (ids) cannot be chosen; the draft has `unseen` of them. `owners`: whether the owner is a field.
+    `hidden` are ids of checkpoints that cannot be chosen; `unseen` is how many of them the draft has. `owners` is
+    whether the owner is a field of the form.
     """
     form = _Draft(given)
     form.unseen = unseen
@@ -48,7 +49,7 @@ def _plain(value: Any) -> Any:
 
 
 def _of(name: str, **more: Any) -> Any:
-    """Return the form field that the model defines."""
+    """Return the form field that Django derives from the model's field `name`."""
     field: Any = Plan._meta.get_field(name)
     return field.formfield(validators=field.validators, **more)
 

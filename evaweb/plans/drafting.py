@@ -29,17 +29,17 @@ Roles = tuple[int | None, int | None]
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """Draft after an edit: its values, and the fields not written because another user changed them."""
+    """Draft after an edit: its values now, and the fields not written because another user had changed them."""
 
     now: Values
     conflicts: tuple[str, ...]
 
 
 def values_of(plan: Plan, sight: Visibility = FULL_VISIBILITY) -> Values:
-    """Return the values of the draft that its pages edit, without hidden ones.
+    """Return the values of the draft that its pages edit, without hidden checkpoints.
 
-    `control` is the checkpoint with which others are compared; `challenger` the one compared with it, if there are more
-    than two checkpoints (with two it is the other one).
+    `control` is the checkpoint with which others are compared. `challenger` is the checkpoint compared with it if the
+    plan has more than two; with two it is None, because it is the remaining one.
     """
     chosen = set(plan.checkpoints.values_list("pk", flat=True))
     control, challenger = _roles(plan)
@@ -77,7 +77,7 @@ def merged(
 
 
 def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
-    """Set the draft's fields to `values`; only positions, stations and checkpoints are saved."""
+    """Set the draft's fields to `values`; of these, only positions, stations and checkpoints are saved here."""
     roles = _roles(plan)  # read before the change: their meaning depends on `comparing`
     for name in values.keys() & set(_PLAIN):
         setattr(plan, name, values[name])
@@ -91,7 +91,10 @@ def apply(plan: Plan, values: Values, hidden: Collection[int] = ()) -> None:
 
 
 def _compare(plan: Plan, values: Values, chosen: set[int], roles: Roles) -> None:
-    """Set the comparison's first and second from control and challenger; `roles` are those before the change."""
+    """Set the comparison's first and second checkpoint from control and challenger.
+
+    `roles` are control and challenger before the change; they apply to those that are hidden from the user.
+    """
     control, challenger = roles
     control = control if values["control"] == HIDDEN else _number(values["control"])
     challenger = challenger if values["challenger"] == HIDDEN else _number(values["challenger"])

@@ -102,7 +102,7 @@ def _design(plan: Plan, document: dict[str, Any], key: bytes) -> dict[str, Any]:
 
 
 class UnevenError(EvaError):
-    """A random order whose numbers of trials do not fit the design; another key draws another order."""
+    """Error for a random order whose numbers of trials do not fit the design; another key draws another order."""
 
 
 def _check_counts(made: tuple[int, int], *, bounded: bool) -> None:

@@ -57,7 +57,7 @@ class Comparing(models.TextChoices):
 
 
 class CountsAs(models.TextChoices):
-    """How a run that ended prematurely counts."""
+    """Choice of how a run that ended prematurely counts."""
 
     JUDGED = "judged", "judged: the operator scores it, or has it repeated"
     FAILURE = "failure", "a failure of its checkpoint"
@@ -65,7 +65,7 @@ class CountsAs(models.TextChoices):
 
 
 class TimeCountsAs(models.TextChoices):
-    """How a run that ended at its time limit counts; such a run is complete."""
+    """Choice of how a run that ended at its time limit counts; such a run is complete."""
 
     JUDGED = "judged", "judged: by what was reached"
     FAILURE = "failure", "a failure of its checkpoint"
@@ -271,12 +271,12 @@ class Plan(models.Model):
 
     @property
     def stored_at(self) -> datetime | None:
-        """When the result was stored: at the reveal, or at the close of an open plan; None before."""
+        """Time at which the result was stored: at the reveal, or at the close of an open plan; None before."""
         return datetime.fromisoformat(self.at_reveal["at"]) if self.at_reveal else self.revealed_at
 
     @property
     def sealed(self) -> bool:
-        """Whether the checkpoints of its trials are still secret."""
+        """Whether the checkpoints of the plan's trials are still secret."""
         return self.blind and self.state in (PlanState.FROZEN, PlanState.CLOSED)
 
 
@@ -375,7 +375,7 @@ class PlanEvent(models.Model):
 
 
 class Reference(models.Model):
-    """Reference picture of a camera: of a position as laid out, or without a position of the camera's view.
+    """Reference picture of a camera: it shows a position as laid out or, without a position, the camera's view.
 
     The newest per camera and position counts. `picture` names a file: see evaweb.plans.image_store. `regions` are
     around objects: see evaweb.plans.region_matching; changed regions are a new row with the same picture.

@@ -177,7 +177,7 @@ def _text(content: bytes, name: str) -> str:
 
 
 def import_references(rows: Sequence[Mapping[str, Any]], found: Mapping[str, bytes], user: User) -> list[str]:
-    """Store the pictures, and make them references if this lab has none; return a message per scene."""
+    """Store the pictures, and make each a reference unless this lab has one there; return a message per scene."""
     told: dict[str, Counter[str]] = {}
     for row in rows:
         told.setdefault(row["scene"], Counter())[_taken(row, found, user)] += 1

@@ -187,7 +187,7 @@ def _spread(values: _Pixels) -> float:
 
 
 def _box(region: Region, picture: _Pixels) -> tuple[int, int, int, int]:
-    """Return first row and column, and the ones after the last."""
+    """Return the region's first row, first column, last row + 1 and last column + 1 in the picture."""
     height, width = picture.shape[:2]
     return (
         round(region.y * height),

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class RevealLine(Line):
-    """Reveal of a plan, with the result that counts from then on."""
+    """Journal line of a plan's reveal, with the result that counts from then on."""
 
     kind: Literal["reveal"] = "reveal"
     name: str
@@ -41,15 +41,15 @@ REVEALS: Journal[RevealLine] = Journal("reveals", RevealLine)
 
 
 def first_reveal(plan: Plan) -> RevealLine | None:
-    """Return the first reveal of a frozen plan, whichever database wrote it; None before it."""
+    """Return the first reveal of a frozen plan, whichever database wrote it; None if it was never revealed."""
     lines = REVEALS.read(_file(plan), log.warning)
     return next((line for line in lines if line.digest == plan.digest), None)
 
 
 def write_reveal(plan: Plan, user: User, at: datetime) -> None:
-    """Write a reveal, or the close of an open plan, before its row is saved, and complete its `at_reveal`.
+    """Write a reveal, or the close of an open plan, and complete its `at_reveal`.
 
-    Raises: NotWritten.
+    Call it before the row is saved. Raises: NotWritten.
     """
     by = user.get_username()
     if plan.at_reveal is not None:

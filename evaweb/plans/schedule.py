@@ -113,7 +113,7 @@ class _Coins:
         self._ahead: dict[Condition, int] = {}
 
     def next(self, condition: Condition) -> str:
-        """Return the checkpoint of the next trial at a condition."""
+        """Return the checkpoint of the next trial at a condition, drawn by a coin unless one is too far behind."""
         ahead = self._ahead.get(condition, 0)  # lead of the first checkpoint
         second = ahead == IMBALANCE or (ahead > -IMBALANCE and self._chance.below(2) == 1)
         self._ahead[condition] = ahead + (-1 if second else 1)
@@ -138,7 +138,9 @@ def _orders(checkpoints: list[str], chance: SeededDraws) -> Iterator[list[str]]:
 
 
 def foretold(checkpoints: int, allocation: str) -> str:
-    """Return which trials an operator who recognises every checkpoint can predict, in spite of blinding."""
+    """Return as text how many and which trials an operator who recognises every checkpoint can predict despite
+    blinding.
+    """
     share = checkpoints if allocation == PAIRED else 2 * IMBALANCE
     which = (
         "the last trial of each block"

@@ -35,7 +35,10 @@ def plan_list(*, user: Any) -> QuerySet[Plan]:
 
 
 def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
-    """Return that version, or the newest that is not a draft. Raises: NotFound, which lists the existing plans."""
+    """Return version `version` of the plan, or its newest version that is not a draft.
+
+    Raises: NotFound, which lists the existing plans.
+    """
     rows = plan_list(user=user).filter(name=name).order_by("-version")
     frozen = rows.exclude(state=PlanState.DRAFT)
     found = rows.filter(version=version).first() if version is not None else frozen.first() or rows.first()
@@ -46,9 +49,10 @@ def plan_get(*, name: str, version: int | None = None, user: Any) -> Plan:
 
 
 def overlapping_plans(plan: Plan) -> QuerySet[Plan]:
-    """Return frozen plans by another name that share at least two checkpoints: their results reveal the same.
+    """Return frozen plans with another name that share at least two checkpoints: their results reveal the same.
 
-    A copy of a checkpoint counts as the same: equal weights (or, without digest, the same server) and strategy.
+    A copy of a checkpoint counts as the same checkpoint: equal weights (or, without digest, the same server) and
+    strategy.
     """
     rows = Checkpoint.objects.values_list("pk", "digest", "policy", "strategy")
     what = {
@@ -72,13 +76,13 @@ def plans_open(*, station: Station) -> list[Plan]:
 
 
 def remaining(plan: Plan, dropped: Mapping[str, int] | None = None) -> int:
-    """Return the number of slots that do not count yet, without those of `dropped` checkpoints."""
+    """Return the number of slots that do not count yet, except the slots of `dropped` checkpoints."""
     counted = plan.handouts.filter(trial__status=TrialStatus.SCORED).values("slot")
     return without_dropped(plan.slots.exclude(pk__in=counted), dropped or {}).count()
 
 
 def without_dropped(slots: QuerySet[Slot], dropped: Mapping[str, int]) -> QuerySet[Slot]:
-    """Exclude slots of dropped checkpoints from the block on at which they were dropped."""
+    """Exclude the slots of each dropped checkpoint, from the block on at which it was dropped."""
     for name, at in dropped.items():
         slots = slots.exclude(checkpoint__name=name, block__gte=at)
     return slots

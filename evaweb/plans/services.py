@@ -137,7 +137,7 @@ _COPIED = (
 def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> Plan:
     """Create a draft owned by the user, with a name derived from the title; administrators only.
 
-    `design`: values of further fields. Raises: EvaError, which names an invalid field.
+    `design` are values of further fields. Raises: EvaError, which names an invalid field.
     """
     require_drafter(user)
     plan = Plan(name=_free_name(title), title=title.strip(), question=question.strip(), owner=user, **design)
@@ -147,7 +147,10 @@ def plan_draft(*, user: User, title: str, question: str = "", **design: Any) -> 
 
 
 def require_drafter(user: User) -> None:
-    """Raise NotAllowed unless the user may create plans: a frozen blind plan hides its checkpoints from all."""
+    """Raise NotAllowed unless the user may create plans.
+
+    Only administrators may, because a frozen blind plan hides its checkpoints from all users.
+    """
     if role_of(user) is not Role.ADMIN:
         raise NotAllowed(_ADMINISTRATORS_MAKE_PLANS)
 
@@ -164,7 +167,8 @@ def require_editor(plan: Plan, user: User) -> None:
 def plan_change(
     *, user: User, plan: Plan, was: Mapping[str, Any], wanted: Values, keep: Collection[str] = ()
 ) -> Changed:
-    """Write a user's edits of a draft: fields whose `wanted` value differs from the one the user `was` shown.
+    """Write a user's edits of a draft: the fields whose `wanted` value differs from the value shown to the user
+    (`was`).
 
     Fields that another user changed meanwhile stay unchanged and are reported, unless they are in `keep`.
     """
@@ -231,7 +235,7 @@ def _no_draft(plan: Plan) -> Conflict:
 
 
 def _drawn(plan: Plan) -> bytes:
-    """Return a key whose random order fits the plan's design."""
+    """Return a key whose random order fits the plan's design. Raises: UnevenError after too many draws."""
     for _ in range(_DRAWS):
         key = new_key()
         with suppress(UnevenError):
@@ -371,7 +375,7 @@ def _revealed(user: User, plan: Plan, ready: tuple[Hashable, dict[str, Any] | No
 def end_plan_if_decided(*, user: User, plan: Plan, asked: bool = False) -> None:
     """Close a running plan whose design has ended, if no trial of it is unfinished and no void is requested.
 
-    With trials left, it ends only when the next one is requested (`asked`): until then a mistyped score can be
+    If trials are left, it ends only when the next one is requested (`asked`): until then a mistyped score can be
     corrected, and switching a score back and forth does not reveal which trial is of which checkpoint. A crossed
     boundary found at a request is recorded whatever is corrected later; otherwise each request would reveal the effect
     of a correction. The reason states that a boundary was crossed or all pairs are made, never for which checkpoint.

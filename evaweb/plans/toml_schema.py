@@ -1,4 +1,6 @@
-"""Format of a TOML file with scenes, checkpoints, plans and references; see `exchange` for import and export."""
+"""Format of a TOML file with scenes, checkpoints, plans and references; `toml_exchange` imports and exports such
+files.
+"""
 
 from __future__ import annotations
 
@@ -113,7 +115,7 @@ class ReferenceTable(Table):
 
 
 class File(Table):
-    """Whole file."""
+    """Content of a whole file."""
 
     scene: list[SceneTable] = []
     checkpoint: list[CheckpointTable] = []

@@ -23,7 +23,7 @@ admin.site.unregister(Checkpoint)
 
 @admin.register(Checkpoint)
 class PreflightedCheckpointAdmin(CheckpointAdmin):
-    """Trained policies, with the preflight of their servers."""
+    """Admin page of checkpoints, with the preflight of their servers."""
 
     change_form_template = "preflights/checkpoint.html"
 
@@ -61,7 +61,7 @@ class PreflightedCheckpointAdmin(CheckpointAdmin):
 
 @admin.register(Preflight)
 class PreflightAdmin(admin.ModelAdmin):
-    """All preflights; they may be deleted, alone or with their checkpoint."""
+    """Admin page of all preflights; they may be deleted, alone or with their checkpoint."""
 
     list_display = ("asked_at", "checkpoint", "station", "by", "status", "verdict", "user")
     list_filter = ("status", "checkpoint", "station", "by")

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class PreflightsConfig(AppConfig):
-    """Preflights of checkpoints."""
+    """Configuration of the app for preflights of checkpoints."""
 
     name = "evaweb.preflights"
     default_auto_field = "django.db.models.BigAutoField"

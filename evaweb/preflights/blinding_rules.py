@@ -37,7 +37,7 @@ def visible_preflight(row: Preflight, user: Any) -> VisiblePreflight:
 
 
 def hidden_reason(checkpoint: Checkpoint, user: Any) -> str:
-    """Return why the user sees only the outcome, "" if everything."""
+    """Return the reason why this user sees only the outcome of a preflight; "" if they see everything."""
     if role_of(user) is Role.VIEWER:
         return "addresses and times are shown to operators"
     seen = visibility_for_user(user)

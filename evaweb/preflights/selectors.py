@@ -21,7 +21,10 @@ _PREFLIGHT_DOES_NOT_EXIST = Pattern(
 def preflight_list(
     *, checkpoint: Checkpoint | None = None, sight: Visibility = FULL_VISIBILITY
 ) -> QuerySet[Preflight]:
-    """Return the preflights of one checkpoint or of all, newest first, without those of hidden checkpoints."""
+    """Return the preflights of one checkpoint, or of all, newest first.
+
+    Those of checkpoints hidden from the user are left out.
+    """
     rows: QuerySet[Preflight] = sight.filter_visible(
         Preflight.objects.select_related("checkpoint", "station", "user")
     )

@@ -114,7 +114,7 @@ def refresh_preflights(*, station: Station) -> int:
 
 
 def finish_preflight(*, row: Preflight, report: dict[str, Any] | None = None, reason: str = "") -> Preflight:
-    """Store the report, or the reason why there is none; only the first result counts."""
+    """Store the report, or the reason for which there is no report; only the first result counts."""
     status = PreflightStatus.LOST if report is None else PreflightStatus.DONE
     facts = {
         "status": status,

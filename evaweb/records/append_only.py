@@ -78,7 +78,7 @@ class TriggerSpec:
         return {event: f"{self.table}_{name}" for event, name in names.items()}
 
     def refused(self, different: str) -> Mapping[str, str]:
-        """Return by event the SQL condition about OLD and NEW under which it is refused.
+        """Return by SQL event (UPDATE, DELETE, INSERT) the condition about OLD and NEW under which it is refused.
 
         Args:
             different: The NULL-safe inequality operator of the database.
@@ -103,9 +103,10 @@ def install(connection: Any, guards: Iterable[TriggerSpec]) -> None:
 
 
 def triggers_suspended(apps: Any, editor: Any) -> None:
-    """Drop all triggers during a migration on SQLite, which cannot rebuild a table that another's trigger names.
+    """Drop all triggers during a migration on SQLite.
 
-    They are installed again after the migration.
+    SQLite cannot rebuild a table that is named in a trigger of another table. The triggers are installed again after
+    the migration.
     """
     if editor.connection.vendor != "sqlite":
         return

@@ -48,7 +48,7 @@ _NOT_KEPT = Pattern("web.journal.not_kept", "not kept: {strerror} ({path}); {don
 
 
 class NotWritten(EvaError):
-    """The disk refused the line, and so the database was not changed either."""
+    """Error if the disk refused the line; the database was not changed either."""
 
     status = 507
 
@@ -68,7 +68,10 @@ def clean_text(name: str, given: str, longest: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class RowPath:
-    """Query path to the row attribute that a field of a line holds, such as `rater__username`; "" for its own name."""
+    """Query path to the row's attribute that a field of a line holds, such as `rater__username`.
+
+    "" stands for the field's own name.
+    """
 
     path: str
 
@@ -161,7 +164,7 @@ def resolve_path(row: Any, path: str) -> Any:
 
 
 def to_json_value(value: Any) -> Any:
-    """Return a time, enumeration or UUID as JSON value; others unchanged."""
+    """Return a time, enumeration or UUID as a JSON value; any other value is returned unchanged."""
     if isinstance(value, datetime):
         return value.isoformat()
     if isinstance(value, Enum):
@@ -173,9 +176,9 @@ AnyLine = TypeVar("AnyLine", bound=Line)
 
 
 def missing_rows(model: type[Model], lines: Sequence[AnyLine], **owner: Model) -> list[AnyLine]:
-    """Return the lines without a database row; of lines with the same uuid only the last.
+    """Return the lines without a database row; if several lines have the same uuid, only the last of them.
 
-    Raises: EvaError if such a row belongs to another owner.
+    Raises: EvaError if a row with the uuid of a line belongs to another owner.
     """
     ((belongs, whose),) = owner.items()
     last = {line.uuid: line for line in lines}  # type: ignore[attr-defined]
@@ -272,7 +275,10 @@ def append_line(path: Path, line: Mapping[str, Any]) -> None:
 
 
 def read_numbered_lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yield the non-empty lines with their numbers from 1; none if absent. Raises: RecordingError if unreadable."""
+    """Yield the non-empty lines with their numbers from 1; nothing if the file does not exist.
+
+    Raises: RecordingError if it cannot be read.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:

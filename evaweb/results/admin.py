@@ -36,12 +36,12 @@ class AutomaticJudgeAdmin(admin.ModelAdmin):
 
     @admin.action(description="Allow the address: pictures are sent there")
     def allow(self, request: HttpRequest, rows: QuerySet[AutomaticJudge]) -> None:
-        """Allow the addresses; the judge's history records by whom."""
+        """Allow the addresses of the selected judges; each judge's history records who allowed it."""
         self._each(request, rows, judge_allow, "allowed its address")
 
     @admin.action(description="Allow the address no longer")
     def forbid(self, request: HttpRequest, rows: QuerySet[AutomaticJudge]) -> None:
-        """Withdraw the permission: nothing more is sent to these addresses."""
+        """Withdraw the permission of the selected judges: nothing more is sent to their addresses."""
         self._each(request, rows, judge_forbid, "allowed its address no longer")
 
     def _each(

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class ResultsConfig(AppConfig):
-    """Results of the trials of plans, second ratings, and preferences between two trials."""
+    """Configuration of the app for results of trials, second ratings, and preferences between two trials."""
 
     name = "evaweb.results"
     default_auto_field = "django.db.models.BigAutoField"

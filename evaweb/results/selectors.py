@@ -47,7 +47,11 @@ _ORDER = Case(
 
 @dataclass(frozen=True, slots=True)
 class PlanRow:
-    """Plan with its progress: planned trials, trials that count, attempts, and the period of the attempts."""
+    """Plan with its progress.
+
+    `foreseen` are the planned trials, `counted` those that count, `attempts` all attempts; `since` and `until` are the
+    period of the attempts.
+    """
 
     plan: Plan
     foreseen: int
@@ -123,7 +127,7 @@ def plan_at_reveal(digest: str) -> Plan:
 
 
 def plan_get(*, name: str, version: int | None = None) -> Plan:
-    """Return that version of the plan, or its newest.
+    """Return version `version` of the plan, or without it the newest version.
 
     Raises:
         NotFound: If it does not exist; the message names the versions.
@@ -142,7 +146,13 @@ def plan_get(*, name: str, version: int | None = None) -> Plan:
 
 
 def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
-    """Return running plans, then ended ones, then drafts, newest first."""
+    """Return running plans, then ended ones, then drafts, newest first.
+
+    If given, `state` is the only state, and `words` are part of title or name.
+
+    Raises:
+        EvaError: If there is no such state.
+    """
     rows = Plan.objects.select_related("owner").defer("document", "key").order_by(_ORDER, "-frozen_at", "-pk")
     if state and state not in PlanState.values:
         raise EvaError(_STATE_ALLOWED(state=state, values=", ".join(PlanState.values)))
@@ -151,7 +161,10 @@ def plan_list(state: str = "", words: str = "") -> QuerySet[Plan]:
 
 
 def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
-    """Return the plans with their progress, in two queries; independent of checkpoints, so that it reveals nothing."""
+    """Return the plans with their progress, in two queries.
+
+    The progress does not depend on checkpoints, so that it reveals nothing.
+    """
     given = list(plans)
     slots = Slot.objects.filter(plan__in=given).order_by().values_list("plan").annotate(n=Count("pk"))
     foreseen: dict[int, int] = dict(slots)

@@ -10,7 +10,7 @@ from evaweb.reviews.models import Review, Segment, SegmentLabel, Standing
 
 
 class _ReadOnlyAdmin(admin.ModelAdmin):
-    """Base of read-only records."""
+    """Base of admin pages of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -24,7 +24,7 @@ class _ReadOnlyAdmin(admin.ModelAdmin):
 
 @admin.register(Review)
 class ReviewAdmin(_ReadOnlyAdmin):
-    """Verdicts and notes on episodes."""
+    """Admin page of verdicts and notes on episodes."""
 
     list_display = ("episode", "verdict", "note", "reviewer", "at")
     list_filter = ("verdict", "reviewer")
@@ -34,7 +34,7 @@ class ReviewAdmin(_ReadOnlyAdmin):
 
 @admin.register(Segment)
 class SegmentAdmin(_ReadOnlyAdmin):
-    """Annotated segments."""
+    """Admin page of annotated segments."""
 
     list_display = ("episode", "first", "last", "label", "milestone", "annotator", "at")
     list_filter = ("annotator",)
@@ -44,7 +44,7 @@ class SegmentAdmin(_ReadOnlyAdmin):
 
 @admin.register(Standing)
 class StandingAdmin(_ReadOnlyAdmin):
-    """Results of the checks, and the verdict that counts."""
+    """Admin page of check results, and of the verdict that counts for each episode."""
 
     list_display = ("episode", "worst", "flags", "checked_at", "review")
     list_filter = ("worst", "clean")
@@ -54,7 +54,7 @@ class StandingAdmin(_ReadOnlyAdmin):
 
 @admin.register(SegmentLabel)
 class SegmentLabelAdmin(LabelledRows, admin.ModelAdmin):
-    """Vocabulary of segments, offered in Replay in this order."""
+    """Admin page of the vocabulary of segments, which Replay offers in this order."""
 
     list_display = ("words", "colour", "key", "order", "active")
     list_editable = ("colour", "key", "order", "active")

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class ReviewsConfig(AppConfig):
-    """Quality reports, verdicts and annotations of episodes."""
+    """Configuration of the app for quality reports, verdicts and annotations of episodes."""
 
     name = "evaweb.reviews"
     default_auto_field = "django.db.models.BigAutoField"

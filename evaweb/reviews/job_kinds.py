@@ -52,7 +52,7 @@ def quality(work: JobContext) -> Mapping[str, Any]:
 def _inspected(episode: Episode, settings: QualitySettings) -> Report:
     """Return the quality report of an episode.
 
-    An imported one is checked in its dataset: its folder has other times, and re-encoded images.
+    An imported episode is checked in its dataset: its own folder has other times, and re-encoded images.
     """
     from runtime.datasets.episode_uuids import uuids_of
     from runtime.quality.inspection import check_dataset_episode, check_episode

@@ -33,7 +33,7 @@ _Frame = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class ReviewLine(Line):
-    """Verdict or note."""
+    """Journal line of a verdict or a note."""
 
     kind: Literal["review"] = "review"
     uuid: UUID
@@ -45,7 +45,7 @@ class ReviewLine(Line):
 
 
 class SegmentLine(Line):
-    """Segment as it is from then on."""
+    """Journal line of a segment, as it is from then on."""
 
     kind: Literal["segment"] = "segment"
     uuid: UUID
@@ -65,7 +65,7 @@ class SegmentLine(Line):
 
 
 class RemovalLine(Line):
-    """Removal of a segment."""
+    """Journal line of the removal of a segment."""
 
     kind: Literal["segment_removed"] = "segment_removed"
     uuid: UUID
@@ -74,7 +74,7 @@ class RemovalLine(Line):
 
 
 class TagLine(Line):
-    """Tag added to the episode."""
+    """Journal line of a tag added to the episode."""
 
     kind: Literal["tag"] = "tag"
     uuid: UUID
@@ -84,7 +84,7 @@ class TagLine(Line):
 
 
 class UntagLine(Line):
-    """Removal of a tag."""
+    """Journal line of the removal of a tag."""
 
     kind: Literal["tag_removed"] = "tag_removed"
     uuid: UUID
@@ -97,7 +97,7 @@ REVIEWS: Journal[AnyReview] = Journal("reviews", ReviewLine, SegmentLine, Remova
 
 
 def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
-    """Return the tags after all lines; of two with the same words the first."""
+    """Return the tags that are left after all lines; of two tags with the same words the first."""
     found: dict[UUID, TagLine] = {}
     for line in lines:
         if isinstance(line, TagLine):
@@ -108,7 +108,7 @@ def tags_of(lines: Sequence[AnyReview]) -> list[TagLine]:
 
 
 def segments_of(lines: Sequence[AnyReview]) -> list[SegmentLine]:
-    """Return the segments after all lines, sorted by frames."""
+    """Return the segments that are left after all lines, sorted by frames."""
     found: dict[UUID, SegmentLine] = {}
     for line in lines:
         if isinstance(line, SegmentLine):

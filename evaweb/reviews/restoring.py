@@ -61,9 +61,9 @@ def _reviews(episode: Episode, lines: Sequence[ReviewLine]) -> int:
 
 
 def _segments(episode: Episode, lines: Sequence[AnyReview], *, whole: bool) -> int:
-    """Update the rows from the lines; a segment is as its newest line.
+    """Update the rows from the lines; each segment becomes as in its newest line.
 
-    If lines were skipped (not `whole`), rows are only added, because the missing lines may have changed others.
+    If lines were skipped (not `whole`), rows are only added, because the missing lines may have changed other rows.
     """
     wanted = {line.uuid: line for line in segments_of(lines)}
     changed = 0

@@ -57,7 +57,7 @@ def report_get(*, uuid: UUID) -> Mapping[str, Any]:
 def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list[Review], list[Segment], int]:
     """Return the reviews and segments that this user may see, and the number of hidden ones.
 
-    Opinions of others are hidden from users who may still have to judge its trial.
+    Opinions of others are hidden from users who may still have to judge the episode's trial.
     """
     reviews, segments = list(reviews_of(episode=episode)), list(segments_of(episode=episode))
     if not sight.hides_episode(episode) and not any(judges(user, episode) for judges in _judges):
@@ -68,7 +68,10 @@ def opinions_of(*, user: Any, episode: Episode, sight: Visibility) -> tuple[list
 
 
 def still_judges(judges: Judges) -> Judges:
-    """Register a function of higher layers that returns whether a user still has to judge an episode blind."""
+    """Register a function that returns whether a user still has to judge an episode blind; return the function.
+
+    Apps of higher layers use it as a decorator.
+    """
     _judges.append(judges)
     return judges
 
@@ -96,9 +99,9 @@ def unreviewed_episodes() -> QuerySet[Episode]:
 
 
 def unreviewed_next(*, after: UUID | None) -> tuple[Episode | None, int]:
-    """Return the next unreviewed episode after `after` in the list, wrapping around, and the number of all.
+    """Return the next unreviewed episode after `after` in the list, wrapping around, and the number of unreviewed ones.
 
-    Without `after` the first. The episode itself is never returned.
+    Without `after` it is the first. The episode `after` itself is never returned.
     """
     waiting = unreviewed_episodes()
     count = waiting.count()

@@ -163,7 +163,7 @@ def _own(user: Any, episode: Episode, uuid: UUID) -> Segment:
 
 @dataclass(frozen=True, slots=True)
 class Tagged:
-    """Tags actually added and removed, without those that were so already."""
+    """Tags that were actually added and removed."""
 
     added: tuple[str, ...]
     removed: tuple[str, ...]
@@ -239,9 +239,9 @@ def record_quality(*, episode: Episode, document: Mapping[str, Any], at: datetim
 
 
 def touch_standing(*, episode: Episode, review: Review | None = None) -> None:
-    """Mark that the episode's reviews have changed; `review` becomes the one that counts, None keeps the current.
+    """Record that the episode's reviews have changed; `review`, if given, becomes the one that counts.
 
-    Uses the database's time, because it is compared with publications by workers with clocks of their own.
+    The time is the database's, because it is compared with publications by workers with clocks of their own.
     """
     facts: dict[str, Any] = {"changed_at": Now()}
     if review is not None:

@@ -55,7 +55,10 @@ _LOST = fixed("web.computing.lost", "the computing process has ended: try again;
 
 
 class Busy(EvaError):
-    """The result is not ready, or the user may not compute now; `retry_after_s` is the delay before a retry [s]."""
+    """Error if the result is not ready, or the user may not compute now.
+
+    `retry_after_s` is the delay before a retry [s].
+    """
 
     status = 503
 
@@ -65,7 +68,7 @@ class Busy(EvaError):
 
 
 class StillRunning(Busy):
-    """The computation is running."""
+    """Error if the computation is still running."""
 
 
 class ComputeProcess:
@@ -138,10 +141,11 @@ class Questions:
         """Return the result of `work(*given)`, cached or computed.
 
         Args:
+            person: User on whose CPU budget it is computed.
             soon: Wait only briefly, for a page that asks again by itself.
 
         Raises:
-            UnderWay: The result is not ready in time; it continues to be computed.
+            StillRunning: The result is not ready in time; it continues to be computed.
             Busy: The user's budget is spent, another computation of theirs is running, or too many wait.
         """
         question = (work, given)

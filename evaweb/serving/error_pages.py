@@ -37,7 +37,10 @@ _FAILED = fixed("web.failed", "this failed; see the log of the web")
 
 
 class LoginMiddleware(LoginRequiredMiddleware):
-    """Login middleware that skips the user lookup for views without login; Django's own queries the user for all."""
+    """Login middleware that does not look up the user for views without login.
+
+    Django's own middleware queries the user for all views.
+    """
 
     def process_view(self, request: HttpRequest, view: Any, *given: Any) -> HttpResponseBase | None:
         if not getattr(view, "login_required", True):
@@ -47,7 +50,10 @@ class LoginMiddleware(LoginRequiredMiddleware):
 
 
 class RefusalMiddleware(MiddlewareMixin):
-    """Error responses: a page with the message for a browser that navigates, JSON (`errors.refusal`) otherwise."""
+    """Middleware that gives every error response a message.
+
+    A browser that navigates gets a page, any other client JSON (`errors.refusal`).
+    """
 
     def process_view(self, request: HttpRequest, *given: Any) -> HttpResponse | None:
         # REST parses its body itself, checked by evaweb.api.request_validation.
@@ -60,7 +66,10 @@ class RefusalMiddleware(MiddlewareMixin):
         return None
 
     def process_response(self, request: HttpRequest, response: HttpResponseBase) -> HttpResponseBase:
-        """Replace an error response without a message, or in HTML to a program, by the common form."""
+        """Return the response, or the common form of an error response instead.
+
+        That replaces an error response without a message, and one in HTML to a program.
+        """
         status = response.status_code
         spoken = response.headers.get("Content-Type", "").startswith("application/json")
         if status < 400 or spoken or not (_of_programs(request) or status == 405):
@@ -128,7 +137,10 @@ def bad_request(request: HttpRequest, exception: Exception) -> HttpResponse:
 
 
 def server_error(request: HttpRequest) -> HttpResponse:
-    """Respond to an exception: storage faults with a message, others as an internal error (Django's handler500)."""
+    """Respond to an exception (Django's handler500).
+
+    Storage faults have a message; any other exception is reported as an internal error.
+    """
     fault = sys.exc_info()[1]
     refused = storage_error_response(fault)
     if refused is not None:

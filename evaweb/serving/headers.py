@@ -47,7 +47,7 @@ _POLICY: dict[str, Any] = {
 
 
 def content_security_policy(videos: str = "") -> dict[str, Any]:
-    """Return the policy of pages; `videos` is a further origin of videos, "" for none."""
+    """Return the policy of pages; `videos` is a further origin of videos, "" if there is none."""
     directives = dict(_POLICY["DIRECTIVES"])
     return {"DIRECTIVES": directives | ({"media-src": [SELF, videos]} if videos else {})}
 

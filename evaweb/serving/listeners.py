@@ -10,11 +10,14 @@ _BACKLOG = 4096  # beyond it a client's connection attempt is repeated after a s
 
 
 class PortInUseError(EvaError):
-    """The address cannot be listened on, usually because the port is in use."""
+    """Error if it is impossible to listen on the address, usually because the port is in use."""
 
 
 def open_listener(host: str, port: int) -> socket.socket:
-    """Return a non-blocking listening TCP socket; port 0 picks a free port. Raises: PortTaken with advice."""
+    """Return a non-blocking listening TCP socket; port 0 picks a free port.
+
+    Raises: PortInUseError with advice.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

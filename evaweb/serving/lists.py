@@ -169,7 +169,7 @@ class Listing:
     # --- its rows ----------------------------------------------------------------------------------------------
 
     def ordered(self, rows: QuerySet[Any]) -> QuerySet[Any]:
-        """Return `rows` in the chosen order with NULL last; in their own order if none is chosen."""
+        """Return `rows` in the chosen order with NULL last; unchanged if no order is chosen."""
         if not self.sort:
             return rows
         down = self.sort.startswith("-")

@@ -41,7 +41,10 @@ class ManyNames:
     """Authentication backend that refuses addresses from which passwords of many names are guessed."""
 
     def authenticate(self, request: HttpRequest | None, **given: Any) -> None:
-        """Raise PermissionDenied for such an address; the axes middleware then responds with `lockout_response`."""
+        """Raise PermissionDenied for an address from which passwords of many names are guessed.
+
+        The axes middleware then responds with `lockout_response`.
+        """
         if request is not None and _many_names_until(request) is not None:
             request.axes_locked_out = True  # type: ignore[attr-defined]
             raise PermissionDenied
@@ -63,7 +66,7 @@ def lockout_response(request: HttpRequest, *given: Any) -> HttpResponse:
 
 
 def _name_until(request: HttpRequest) -> datetime:
-    """Return when the newest failure of the name expires."""
+    """Return when the lock of the user name at this address ends."""
     username = (getattr(request, "axes_credentials", None) or {}).get("username")
     attempts = AccessAttempt.objects.filter(username=username, ip_address=lockable_of(request))
     newest: datetime = attempts.aggregate(at=Max("attempt_time"))["at"] or timezone.now()
@@ -71,7 +74,7 @@ def _name_until(request: HttpRequest) -> datetime:
 
 
 def _many_names_until(request: HttpRequest) -> datetime | None:
-    """Return when fewer than MOST_NAMES names have recent failures from this address; None if that is so now."""
+    """Return when this address will have failures of fewer than MOST_NAMES names; None if that is so now."""
     since = timezone.now() - settings.AXES_COOLOFF_TIME
     attempts = AccessAttempt.objects.filter(ip_address=lockable_of(request), attempt_time__gt=since)
     newest = attempts.values("username").annotate(at=Max("attempt_time")).order_by("-at")

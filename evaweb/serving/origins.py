@@ -16,7 +16,7 @@ _PORT = re.compile(r":([0-9]{1,5})$")
 def is_own_origin(origin: str, host: str, scheme: str, web_port: int | None = None) -> bool:
     """Return True if pages of `origin` belong to the lab, for a request with Host `host` over `scheme`.
 
-    They do for the same scheme and host, and for CSRF_TRUSTED_ORIGINS (without wildcards). For a server next to the
+    That is so for the same scheme and host, and for CSRF_TRUSTED_ORIGINS (without wildcards). For a server next to the
     web, `web_port` on that host over plain HTTP counts too; behind a proxy all share one origin.
     """
     try:

@@ -4,6 +4,6 @@ from django.apps import AppConfig
 
 
 class SetupConfig(AppConfig):
-    """Setting up a lab."""
+    """Configuration of the app for setting up a lab."""
 
     name = "evaweb.setup"

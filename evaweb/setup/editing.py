@@ -123,7 +123,10 @@ def _references(scene: Scene) -> dict[int, list[dict[str, str]]]:
 
 
 def operators_view(request: HttpRequest, given: Any, position: Any) -> str:
-    """Return the set-up and score cards of the position at that index, rendered by the Eval page's templates."""
+    """Return the set-up and score cards of one position of a scene, rendered by the Eval page's templates.
+
+    `given` is the scene, `position` the index of the position in it.
+    """
     wanted = table_of(given)
     scene = Scene(**wanted.model_dump(exclude={"positions", "milestones"}))
     milestones = [

@@ -23,7 +23,10 @@ from evaweb.trials.selectors import checkpoint_list, scene_list
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Missing thing: a sentence, and the address of the form that adds it, for administrators or for operators too."""
+    """Message about something that is missing: a sentence, and the address of the form that adds it.
+
+    `for_operators`: operators may use the form too, not only administrators.
+    """
 
     text: str
     address: str
@@ -32,7 +35,7 @@ class Missing:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Kind of thing: description, count, newest item, addresses of list and form, and what is missing."""
+    """Card of one kind of thing: description, count, newest item, addresses of list and form, and what is missing."""
 
     title: str
     what: str

@@ -1,4 +1,4 @@
-"""The backend's connection: its name is what Django looks for."""
+"""Connection of the database backend; the module's name is the one that Django looks for."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from django.db.backends.sqlite3 import base
 
 
 class DatabaseWrapper(base.DatabaseWrapper):
-    """A connection that closes the cursor of a transaction that could not begin.
+    """Connection that closes the cursor of a transaction that could not begin.
 
-    The error that says so refers to itself by its traceback, and keeps the cursor until some thread collects garbage.
-    That would reset the cursor's statement, which waits for as long as its connection waits for the database: a
-    thread that has the database locked would wait for those that wait for it.
+    The exception refers to itself by its traceback, and so keeps the cursor alive until some thread collects garbage.
+    That thread would then reset the cursor's statement, which waits as long as the cursor's connection waits for the
+    database. If that thread itself has locked the database, both would wait for each other.
     """
 
     def _start_transaction_under_autocommit(self) -> None:

@@ -31,7 +31,7 @@ class StationForm(forms.ModelForm):
 
 @admin.register(Station)
 class StationAdmin(admin.ModelAdmin):
-    """Stations, which are deactivated instead of deleted, because records refer to them."""
+    """Admin page of stations, which are deactivated instead of deleted, because records refer to them."""
 
     form = StationForm
     change_form_template = "stations/admin_station.html"
@@ -74,7 +74,7 @@ class StationAdmin(admin.ModelAdmin):
 
 
 class RecordAdmin(admin.ModelAdmin):
-    """Base of read-only records."""
+    """Base of admin pages of read-only records."""
 
     def has_add_permission(self, request: HttpRequest) -> bool:
         return False
@@ -88,7 +88,7 @@ class RecordAdmin(admin.ModelAdmin):
 
 @admin.register(StationKey)
 class StationKeyAdmin(RecordAdmin):
-    """Keys of computers, current and withdrawn."""
+    """Admin page of the keys of computers, current and withdrawn."""
 
     list_display = ("station", "computer", "enrolled_at", "enrolled_by", "withdrawn_at", "withdrawn")
     list_filter = ("station",)
@@ -105,7 +105,7 @@ class StationKeyAdmin(RecordAdmin):
 
 @admin.register(Lease)
 class LeaseAdmin(RecordAdmin):
-    """Leases of stations."""
+    """Admin page of leases of stations."""
 
     list_display = ("station", "holder", "epoch", "granted_at", "ended_at", "end_reason")
     list_filter = ("station",)
@@ -116,7 +116,7 @@ class LeaseAdmin(RecordAdmin):
 
 @admin.register(LeaseRequest)
 class LeaseRequestAdmin(RecordAdmin):
-    """Requests for stations."""
+    """Admin page of requests for stations."""
 
     list_display = ("station", "user", "asked_at", "answer", "answered_at")
     list_filter = ("station", "answer")
@@ -125,7 +125,7 @@ class LeaseRequestAdmin(RecordAdmin):
 
 @admin.register(Command)
 class CommandAdmin(RecordAdmin):
-    """Commands and their results."""
+    """Admin page of commands and their results."""
 
     list_display = ("issued_at", "station", "kind", "user", "status", "reason")
     list_filter = ("station", "kind", "status")

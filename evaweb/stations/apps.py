@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class StationsConfig(AppConfig):
-    """Stations: robots with their computers, leases and commands."""
+    """Configuration of the app for stations: robots with their computers, leases and commands."""
 
     name = "evaweb.stations"
     default_auto_field = "django.db.models.BigAutoField"

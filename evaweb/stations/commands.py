@@ -82,7 +82,7 @@ _LONG_AGO = 0.0  # expiry on the runtime's clock: the command must not be carrie
 
 
 class NotSent(EvaError):
-    """The command was not sent, because its row could not be written."""
+    """Error if a command was not sent, because its row could not be written."""
 
     status = 503
 
@@ -110,17 +110,17 @@ def issue_command(
     uuid: UUID | str | None = None,
     vouched: Sequence[str] = (),
 ) -> Command:
-    """Send a command and return its row with the answer; a repeated uuid returns the first row.
+    """Send a command and return its row with the answer; if the uuid was used before, return the first row.
 
     Args:
-        boot, sequence: Those of the snapshot that the page showed.
+        boot, sequence: Boot id and number of the snapshot that the page showed.
         vouched: Arguments that come from an administrator's table or the lab's records instead of the user.
 
     Never call it within a transaction: other processes could not write until the station has answered.
 
     Raises:
         NotAllowed: The user lacks the role.
-        Conflict: The uuid is that of another command.
+        Conflict: The uuid belongs to another command.
         NotSent: The database did not accept the row.
     """
     row = Command(
@@ -199,9 +199,9 @@ def record_stop(
 def resolve_unknown_outcome(*, row: Command) -> Command:
     """Determine the outcome of a command whose answer was lost; leave the row unchanged if it is still unknown.
 
-    The command is sent again, already expired. A runtime that knows its uuid repeats the first answer. One that does
-    not refuses it as too late and remembers the refusal, so it can never be carried out any more. Stopping commands
-    never expire, and are therefore not sent again.
+    The command is sent again, already expired. If the runtime knows its uuid, it repeats the first answer. If not, it
+    refuses the command as too late and remembers the refusal, so that the command can never be carried out any more.
+    Stopping commands never expire, and are therefore not sent again.
     """
     age = timezone.now() - row.issued_at
     if row.kind in STOPPING or row.status not in _UNANSWERED or age < timedelta(seconds=_patience_s()):
@@ -372,7 +372,7 @@ notes = StopRecorder(lambda row: unwritten.store(row), journal=unwritten.prepare
 
 
 def _find_first(row: Command) -> Command | None:
-    """Return the existing row with this uuid. Raises: Conflict if it is another command."""
+    """Return the existing row with this uuid, None if there is none. Raises: Conflict if it is another command."""
     first = Command.objects.select_related("station", "user").filter(uuid=row.uuid).first()
     if first is None:
         return None
@@ -405,7 +405,10 @@ def _update(row: Command) -> None:
 def _message(
     row: Command, role: str = "", vouched: Sequence[str] = (), valid_until: float = float("inf")
 ) -> messages.Command:
-    """Return the command as sent; `role` is the user's, "" for stops, which need none and wait for no database."""
+    """Return the command as sent.
+
+    `role` is the user's; it is "" for stops, which need no role and wait for no database.
+    """
     return messages.Command(
         str(row.uuid),
         row.kind,
@@ -422,5 +425,5 @@ def _message(
 
 
 def _patience_s() -> float:
-    """Return the time after which no caller waits for an answer any more [s]."""
+    """Return the time [s] after which no caller waits for an answer any more."""
     return settings.EVA_COMMAND_TIMEOUT_S + 1.0

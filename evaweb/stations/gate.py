@@ -37,11 +37,11 @@ _TURN_S = 0.001  # switch interval of the interpreter: bounds the delay of a sto
 
 
 class GateError(EvaError):
-    """The gate cannot start or continue; the message states the reason."""
+    """Error if the gate cannot start or continue; the message states the reason."""
 
 
 class Keys:
-    """Admitted keys, read from the database twice a second; the last result counts while the database is away.
+    """Admitted keys, read from the database twice a second; while it does not answer, the last result counts.
 
     The result is also stored in a file: linked stations can be stopped even if the gate starts without the database.
     """

@@ -266,7 +266,7 @@ def _record(station: Station, holder: str, epoch: int, boot: str, end_reason: st
 
 
 def _just_ended(lease: Lease) -> bool:
-    """Whether the lease ended so recently that a report of it may be older than its end."""
+    """Return True if the lease ended so recently that a report of it may be older than its end."""
     return lease.ended_at is not None and timezone.now() - lease.ended_at < _ECHO
 
 

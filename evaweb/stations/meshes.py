@@ -32,7 +32,7 @@ def mesh_in(file: Path) -> Mesh:
 
 
 def mesh_content(*, robot: str, digest: str) -> bytes:
-    """Return the mesh with that digest. Raises: NotFound unless a visual of the robot uses such a file."""
+    """Return the mesh with that digest. Raises: NotFound unless a visual of the robot uses a file with that digest."""
     files = {visual.file for visual in drawn_robot(robot).scene.visuals if visual.file is not None}
     for file in sorted(files):
         if _digest(file) == digest:

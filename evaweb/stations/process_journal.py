@@ -65,10 +65,11 @@ class ProcessJournal:
 
 
 def recover_journals(folder: Path, take: Callable[[Sequence[bytes]], bool]) -> bool:
-    """Pass the lines of each dead process's journal to `take`; return True if a file must wait for the disk.
+    """Pass the lines of each dead process's journal to `take`.
 
     The file is removed if `take` returns True (all lines were valid); else it is renamed to .refused, as is anything
     that is not a regular file.
+    Returns: True if a file could not be read or removed yet because of the disk.
     """
     waits = False
     for path in sorted(folder.glob(f"*{_SUFFIX}")):

@@ -90,7 +90,10 @@ def redact_state(snapshot: Mapping[str, Any], sight: Visibility) -> dict[str, An
 
 
 def _reason(text: object, said: object, sight: Visibility, covered: str) -> str:
-    """Return the reason for the station's state as it may be shown, else `covered`; `said` has id and arguments."""
+    """Return the reason for the station's state as it may be shown, else `covered`.
+
+    `said` holds the id and the arguments of the reason as a sentence.
+    """
     return sight.redact_text(
         _sentence({"text": str(text or ""), **(said if isinstance(said, Mapping) else {})}), covered
     )
@@ -107,7 +110,10 @@ def _sentence(said: object) -> str:
 
 
 def _sentences(snapshot: Mapping[str, Any], shown: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ids and arguments of the unchanged texts whose arguments contain nothing beyond the visible text."""
+    """Return ids and arguments of the sentences whose text is shown unchanged.
+
+    A sentence is left out if its arguments contain anything beyond that text.
+    """
     before, now = texts(snapshot), texts(shown)
     return {
         path: one
@@ -127,7 +133,7 @@ def _identity(row: Mapping[str, Any], text: str) -> dict[str, Any]:
 def redact_events(
     rows: Iterable[Mapping[str, Any]], sight: Visibility, last: int = 0
 ) -> list[dict[str, Any]]:
-    """Return the events that reveal no policy, without the times and the number of the others.
+    """Return the events that reveal no policy, without the times and the number of the hidden ones.
 
     Events are renumbered by their times [us], increasing from `last`: gaps would reveal how many are hidden.
     """

@@ -1,7 +1,8 @@
 """Coalescing of concurrent requests to stations: a repeated request is not sent again.
 
 Each pending request has its own thread, so that a hanging station does not delay others. Requests with the same key
-that arrive meanwhile share one further request, sent when the first is over: a flood costs two.
+that arrive meanwhile share one further request, sent when the pending one is over: any number of simultaneous requests
+causes only two.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ T = TypeVar("T")
 
 
 class TooManyRequests(Exception):
-    """One station has the allowed number of pending requests."""
+    """Error if a station already has the allowed number of pending requests."""
 
 
 @dataclass(slots=True)
@@ -58,10 +59,11 @@ class RequestCoalescer(Generic[T]):
         identity: Hashable,
         shared: bool = False,
     ) -> Future[T]:
-        """Start `work` or join an equal pending request; return the future of the answer.
+        """Start `work` or join a pending request with the same `key`; return the future of the answer.
 
-        The same `identity` shares the answer. Another identity with the same `key` gets the answer of one further
-        request, sent after this call; if `shared`, that of the pending one, and the further request is sent regardless.
+        A call with the same `identity` as the pending request shares its answer. A call with another identity causes
+        one further request, sent after this call, and gets its answer; with `shared` it gets the pending request's
+        answer, and the further request is sent regardless.
         Raises: TooManyRequests.
         """
         place, flight = (station, key), _PendingRequest(identity, work)

@@ -40,9 +40,10 @@ class DrawnRobot:
         self._links.add_done_callback(_compiled)
 
     def poses(self, q: NDArray[Any]) -> NDArray[np.float32]:
-        """Return world <- part for joints [..., D] as float32 [..., P, 16], each matrix column-major.
+        """Return the transform from each part to the world for joints [..., D].
 
-        If any joint of a row is not finite, the whole row is NaN.
+        It is float32 [..., P, 16], each matrix in column-major order. If any joint of a row is not finite, the whole
+        row is NaN.
         """
         joints = np.asarray(q, np.float64)
         found = self._links.result().poses(joints) if self.compiled else self._placed(joints)
@@ -127,7 +128,7 @@ def groups_of(joint_names: Iterable[str]) -> tuple[str, ...]:
 
 
 def describe_robot(robot: str) -> dict[str, Any]:
-    """Return the facts of a robot; if its description is unreadable, empty ones with `error`.
+    """Return the facts of a robot; if its description is unreadable, they are empty, and `error` is the reason.
 
     The page must open nevertheless, because it has the stop buttons.
     """

@@ -57,7 +57,7 @@ _CLOCK_KNOWN_S = 60.0  # validity of a measured clock offset
 
 
 class NoAnswer(StationGone):
-    """The request may have arrived and may have been carried out: its outcome is unknown."""
+    """Error if a request may have arrived and may have been carried out: its outcome is unknown."""
 
     status = 504
 
@@ -81,8 +81,8 @@ class StationConnection:
     def request(self, command: Command, *, timeout: float | None = None, expires: bool = False) -> Ack:
         """Return the coordinator's answer; one request at a time over a persistent connection.
 
-        With `expires` the command becomes void when this call gives up: it is never carried out after its user was
-        told that it was lost.
+        With `expires` the command becomes void when this call gives up: it is never carried out after its user has been
+        informed that it was lost.
 
         Raises:
             StationGone: The command was not sent.

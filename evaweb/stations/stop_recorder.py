@@ -1,7 +1,7 @@
 """Recorder of stops on their way to disk and database: a stop waits for neither.
 
-A thread hands each row on: first into a file of `unwritten`, then into the database. Repeated presses are written once
-a second with a count; until then each has a line in the process journal, which survives a kill.
+A thread passes each row on: first to a file (see unwritten_commands), then to the database. Repeated presses are
+written once a second with a count; until then each has a line in the process journal, which survives a kill.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _Journal = Callable[[Sequence[Command]], object]
 
 
 class StopRecorder:
-    """Queue of rows that a thread passes to `keep`, which may wait for the disk.
+    """Queue of rows, which a thread passes to `keep`; that function may wait for the disk.
 
-    `journal` is called with the rows that have to wait, and with none when all have been passed on.
+    `journal` is called with the rows that have to wait, and with an empty sequence when all have been passed on.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class StopRecorder:
             self._run_soon()
 
     def _drop_one(self) -> None:
-        """Drop the oldest failed stop, as for an unknown station; if there is none, the oldest."""
+        """Drop the oldest failed stop, for example of an unknown station; if no stop failed, the oldest of all."""
         failed = (key for key, (row, _) in self._waiting.items() if row.status == CommandStatus.FAILED)
         key = next(failed, None)
         lost = self._waiting.pop(key or next(iter(self._waiting)))
@@ -76,7 +76,7 @@ class StopRecorder:
             )
 
     def write_due(self, *, all_of_them: bool = False) -> float | None:
-        """Pass on all rows that are due; return the delay until the next one [s], None if none is waiting."""
+        """Pass on all rows that are due; return the delay until the next row [s], None if no row is waiting."""
         now = self._clock()
         with self._news:
             self._written = {key: at for key, at in self._written.items() if now - at < _APART_S}
@@ -154,7 +154,7 @@ def merge_key(row: Command) -> _Key:
 
 
 def _has_station(row: Command) -> bool:
-    """Return True if the station exists or the disk does not tell: an extra record is better than a lost one."""
+    """Return True if the station exists, or if the disk fails: an extra record is better than a lost one."""
     if row.station.pk is not None:
         return True
     try:

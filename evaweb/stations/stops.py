@@ -78,13 +78,19 @@ _stops: RequestCoalescer[Answer] = RequestCoalescer("stop", _MOST_STOPS)
 
 
 def press_estop(*, station: str, username: str, why: str, uuid: UUID | str) -> Future[Answer]:
-    """Press the e-stop. During another press its answer is shared, and this press is sent nevertheless."""
+    """Press the e-stop of a station and return the future of the answer.
+
+    During another press the answer is that press's, but this press is sent nevertheless.
+    """
     work = partial(send_estop, station=station, username=username, why=why, uuid=uuid)
     return _presses.submit(station, work, identity=str(uuid), shared=True)
 
 
 def request_stop(command: messages.Command, station: str) -> Future[Answer]:
-    """Send a stop or halt. During an equal one of the same lease, one further request is sent for all later calls."""
+    """Send a stop or halt and return the future of the answer.
+
+    During an equal request of the same lease, all later calls share one further request.
+    """
     key = (command.kind, command.holder, command.epoch)
     try:
         return _stops.submit(station, partial(send_stop, command, station), key=key, identity=command.uuid)

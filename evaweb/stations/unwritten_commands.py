@@ -1,8 +1,8 @@
 """Stops that were carried out but are not in the database yet: they wait as files in DATA/unwritten.
 
-One file per command and process, so that a restart loses none, any process may write any of them, and none overwrites
-or removes the answer that another process received. If the disk is full too, this process holds the newest in memory.
-What a killed process had not stored yet is in its journal.
+There is one file per command and process, so that a restart loses no command, any process may write any of them to the
+database, and no process overwrites or removes the answer that another process received. If the disk is full too, this
+process holds the newest commands in memory. Commands that a killed process had not stored yet are in its journal.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class UnwrittenCommands:
     def _adopt(self, lines: Sequence[bytes]) -> bool:
         """Store the journaled commands of a killed process: one per merge key, with a count.
 
-        Returns: Whether all lines were commands; others are logged.
+        Returns: Whether all lines were commands; other lines are logged.
         """
         counted: dict[tuple[str, ...], list[Command]] = {}
         whole = True

@@ -10,7 +10,7 @@ LEVEL = 0.95
 
 
 class StatisticsError(ValueError):
-    """Invalid data, or data from which a method cannot estimate anything."""
+    """Error for invalid data, and for data from which a method cannot estimate anything."""
 
 
 @dataclass(frozen=True, slots=True)

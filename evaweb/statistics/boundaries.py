@@ -359,7 +359,10 @@ def _least_extreme(
     spent: NDArray[np.float64],
     most: float,
 ) -> tuple[tuple[int, int] | None, NDArray[np.float64]]:
-    """Return the least extreme table that may stop (None if none may), and the error at each rate including it."""
+    """Return the least extreme table that may stop (None if no table may), and the error at each rate.
+
+    The error includes the stop at this look.
+    """
     import numpy as np
 
     degree = _degrees(*look, null.margin)
@@ -402,10 +405,11 @@ def _within(
     spent: NDArray[np.float64],
     most: float,
 ) -> tuple[int, NDArray[np.float64]]:
-    """Return how many tables may stop, ending at one of `ends`, and the error at each rate with them (equal rates).
+    """Return how many tables may stop, and the error at each rate if they do; for a design that tests equal rates.
 
-    `numbers` are the total successes of the tables, `even` their probabilities at rates of 0.5. The error grows with
-    the number of tables at every rate, so the number is found by bisection.
+    The last of them is at one of the indices in `ends`. `numbers` are the total successes of the tables, `even` their
+    probabilities at rates of 0.5. The error grows with the number of tables at every rate, so the number is found by
+    bisection.
     """
     import numpy as np
 
@@ -429,7 +433,7 @@ def _least(
     look: tuple[int, int],
     margin: float | None,
 ) -> tuple[int, int]:
-    """Return the exactly least extreme of the tables in `order` that equal the last one up to rounding."""
+    """Return the least extreme table in `order`, decided exactly among those that equal the last one up to rounding."""
     import numpy as np
 
     alike = order[levels[: len(order)] <= levels[len(order) - 1] * (1 + _TIE)]
@@ -467,7 +471,7 @@ def _region(look: StoppingTable, margin: float | None) -> NDArray[np.bool_]:
 
 
 def _degrees(n: int, m: int, margin: float | None) -> NDArray[np.float64]:
-    """Return `extremeness_of` all tables of a look: float64 [n + 1, m + 1]."""
+    """Return the extremeness (see `extremeness_of`) of every table of a look: float64 [n + 1, m + 1]."""
     import numpy as np
 
     a: NDArray[np.float64] = np.arange(n + 1.0)[:, None]

@@ -18,8 +18,9 @@ _EDGES = [k / BINS for k in range(1, BINS)]
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Predictions from `low` to below `high` (the last bin includes it): their number, mean, and number of true
-    outcomes.
+    """Predictions from `low` to below `high`: their number, mean, and number of true outcomes.
+
+    The last bin includes its upper end.
     """
 
     low: float

@@ -44,7 +44,7 @@ def confidence_sequence(differences: Sequence[float], alpha: float = ALPHA) -> I
 
 
 def _lower_bound(differences: Sequence[float], alpha: float) -> float:
-    """Return the largest mean that the bet on a higher one has refuted, -1 if there is none."""
+    """Return the largest mean that the bet on a higher mean has refuted, -1 if it has refuted none."""
     import numpy as np
     from scipy.optimize import brentq
 

@@ -92,10 +92,10 @@ def pairs_needed(
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Comparison of all designs, each tuple in the order of RULES.
+    """Comparison of all designs; each tuple is in the order of RULES.
 
-    `needs`: design that reaches the power; `chances`: operating characteristics with the given pairs; `powers`: one
-    tuple per gain.
+    `needs`: design that reaches the wanted power; `chances`: power and number of pairs with the given pairs; `powers`:
+    one tuple of powers per gain.
     """
 
     needs: tuple[DesignPower | None, ...]

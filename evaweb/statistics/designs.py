@@ -91,7 +91,9 @@ class Conclusion:
 
     @property
     def ended(self) -> str:
-        """ "" while it continues, "full" if all blocks are made, "boundary" if it ended before that."""
+        """How the comparison ended: "full" if all blocks are made, "boundary" if it ended before; "" while it
+        continues.
+        """
         return (
             ""
             if self.ended_at_pair is None
@@ -118,7 +120,7 @@ class Findings:
 
     @property
     def ended(self) -> str:
-        """`Conclusion.ended` of the last comparison to end; "" while any continues."""
+        """Value of `Conclusion.ended` of the comparison that ended last; "" while any continues."""
         return "" if self.at is None else next(one.ended for one in self.each if one.ended_at_pair == self.at)
 
 

@@ -42,7 +42,10 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class ExactTest:
-    """Statistic, and the two-sided probability of one at least as extreme if the arms are equal."""
+    """Statistic of an exact test, and its two-sided p-value.
+
+    The p-value is the probability of a statistic at least as extreme if the arms are equal.
+    """
 
     statistic: float
     p: float

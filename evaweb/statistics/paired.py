@@ -17,7 +17,10 @@ from evaweb.statistics.difference import Difference
 
 @dataclass(frozen=True, slots=True)
 class McNemar:
-    """Numbers of pairs in which only the first and only the second succeeded, and the two-sided exact probability."""
+    """Result of McNemar's test: number of pairs in which only the first arm succeeded, only the second, and p.
+
+    p is the two-sided exact probability.
+    """
 
     first_only: int
     second_only: int

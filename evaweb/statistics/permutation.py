@@ -20,7 +20,7 @@ _MOST = 10_000_000  # greatest product of sums and differences
 
 @dataclass(frozen=True, slots=True)
 class SignFlipTest:
-    """Mean difference of `pairs`, and the two-sided probability of one as far from 0 by chance."""
+    """Mean difference of `pairs`, and the two-sided probability that chance gives a mean at least as far from 0."""
 
     pairs: int
     value: float
@@ -33,7 +33,7 @@ def sign_flip_test(differences: Sequence[float], widest: float = 1.0) -> SignFli
     Exact: all 2^n combinations of signs are counted.
 
     Raises:
-        StatisticsError: If there is no difference, or one lies outside.
+        StatisticsError: If there is no difference, or one is outside -widest to widest.
     """
     if not differences:
         raise StatisticsError("no pair: a permutation test needs at least one")

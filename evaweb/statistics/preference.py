@@ -27,10 +27,10 @@ _ROUNDED = 1e-13  # relative rounding error of a likelihood
 
 
 class NotIdentifiedError(StatisticsError):
-    """The comparisons determine no common ranking; `components` are sets of policies that can be ranked among
-    themselves.
+    """Error if the comparisons determine no common ranking.
 
-    They are ordered such that no later set was ever preferred to an earlier one, if such an order exists.
+    `components` are sets of policies that can be ranked among themselves. They are ordered such that no policy was ever
+    preferred to one of an earlier set, if such an order exists.
     """
 
     def __init__(self, text: str, components: Sequence[Sequence[str]]) -> None:
@@ -210,8 +210,9 @@ class _Design:
             )
 
     def components(self) -> list[list[str]]:
-        """Return the sets of policies that are mutually reachable by wins, sets that were never beaten from outside
-        first.
+        """Return the sets of policies that are connected by wins in both directions.
+
+        Sets that no policy outside has beaten come first.
         """
         reach = {name: {name} | {other for (w, other) in self.wins if w == name} for name in self.names}
         for via in self.names:

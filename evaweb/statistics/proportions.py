@@ -116,8 +116,9 @@ def summary(
     durations: Sequence[float],
     smoothness: Sequence[float] = (),
 ) -> Summary:
-    """Return the summary of the scored trials of one cell: success, score (0 to 1), duration [s] and SPARC, as far as
-    known.
+    """Return the summary of the scored trials of one cell.
+
+    It has success, score (0 to 1), duration [s] and SPARC, as far as they are known.
     """
     return Summary(
         proportion(sum(map(bool, outcomes)), len(outcomes)),

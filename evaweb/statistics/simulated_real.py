@@ -44,8 +44,10 @@ def rank_correlation(simulated: Sequence[float], real: Sequence[float]) -> float
 
 
 def rank_violation(simulated: Sequence[float], real: Sequence[float]) -> float:
-    """Return the mean over checkpoints of the largest real difference to a checkpoint that simulation orders
-    differently.
+    """Return the mean rank violation over the checkpoints.
+
+    That of a checkpoint is its largest real difference to a checkpoint with which simulation has it in a different
+    order.
     """
     _check(simulated, real)
     numbers = range(len(real))
@@ -98,7 +100,9 @@ def _powered(arm: Powered) -> tuple[float, float]:
 
 
 def _covariance(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return the sum of products of both deviations from their means."""
+    """Return the sum of the products of both deviations from their means, which is not divided by the number of
+    values.
+    """
     mean, of_other = math.fsum(one) / len(one), math.fsum(other) / len(other)
     return math.fsum((a - mean) * (b - of_other) for a, b in zip(one, other, strict=True))
 

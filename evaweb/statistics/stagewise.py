@@ -53,8 +53,9 @@ def stagewise(found: Boundary, first: int, n: int, second: int, m: int, level: f
     tail = (1 - level) / 2
 
     def at(wanted: float, more: Callable[[float, float], float]) -> float:
-        """Return the difference at which `more`, applied to the probabilities of higher and equal ranks, equals
-        `wanted`.
+        """Return the difference of rates at which `more` equals `wanted`, by bisection.
+
+        `more` is a function of the probabilities of outcomes with a higher and with the same rank.
         """
         low, high = -1.0 + _EDGE, 1.0 - _EDGE
         for _ in range(_HALVED):

@@ -35,7 +35,7 @@ class StratumTable:
 
     @property
     def ways(self) -> dict[int, int]:
-        """Number of combinations for each number of the first arm's successes that these margins allow."""
+        """Number of combinations by the first arm's number of successes, for each number that the margins allow."""
         successes = self.x1 + self.x2
         lowest, highest = max(0, successes - self.n2), min(self.n1, successes)
         return {
@@ -127,7 +127,10 @@ def interaction(tables: Sequence[StratumTable]) -> float | None:
 
 
 def _fillings(tables: Sequence[dict[int, int]], left: int) -> Iterator[int]:
-    """Yield the number of combinations of each filling in which the first arm's successes add up to `left`."""
+    """Yield a number of combinations for each choice of successes of the first arm in every stratum.
+
+    Only choices whose sum is `left` are considered.
+    """
     first, *rest = tables
     if not rest:
         if left in first:

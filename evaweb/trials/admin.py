@@ -81,7 +81,7 @@ class PositionForm(forms.ModelForm):
 
 
 class PositionInline(admin.StackedInline):
-    """Initial positions of a scene."""
+    """Table of a scene's initial positions on its admin page."""
 
     model = Position
     form = PositionForm
@@ -112,7 +112,7 @@ class MilestoneFormSet(forms.BaseInlineFormSet):
 
 
 class MilestoneInline(admin.TabularInline):
-    """Milestones of a scene."""
+    """Table of a scene's milestones on its admin page."""
 
     model = Milestone
     formset = MilestoneFormSet
@@ -158,7 +158,7 @@ def _readable(policy: Any) -> Any:
 
 
 class ActiveActions:
-    """Actions that activate or deactivate the selected rows."""
+    """Mixin of a ModelAdmin with actions that activate or deactivate the selected rows."""
 
     actions = ("switch_on", "switch_off")
 
@@ -186,7 +186,7 @@ def _trials(n: int) -> str:
 
 @admin.register(Scene)
 class SceneAdmin(ActiveActions, LogsValues):
-    """Tasks on a bench, with positions and milestones."""
+    """Admin page of scenes, with their positions and milestones."""
 
     def table_of(self, row: Scene) -> dict[str, Any]:
         """Return the scene in the form of the scene editor."""
@@ -255,7 +255,7 @@ class SceneAdmin(ActiveActions, LogsValues):
 
 @admin.register(FailureTerm)
 class FailureTermAdmin(LabelledRows, ActiveActions, admin.ModelAdmin):
-    """Taxonomy of failures; scores store the words and are unaffected by changes here."""
+    """Admin page of the taxonomy of failures; scores store the words and are unaffected by changes here."""
 
     list_display = ("words", "level", "shortcut", "order", "active")
     list_editable = ("order",)
@@ -285,7 +285,7 @@ class FailureTermAdmin(LabelledRows, ActiveActions, admin.ModelAdmin):
 
 
 class CheckpointForm(forms.ModelForm):
-    """Form of a policy and its connection."""
+    """Form of a checkpoint: its policy, and the connection to it."""
 
     policy = Table(
         required=False,
@@ -324,18 +324,18 @@ class CheckpointForm(forms.ModelForm):
         )
 
     def clean_policy(self) -> dict[str, Any]:
-        """Return {} for an empty field: everything as in the deployment."""
+        """Return the policy's table; {} for an empty field: then everything is as in the deployment."""
         given = self.cleaned_data["policy"]
         return {} if given is None else given
 
     def clean_strategy(self) -> Any:
-        """Return None for an empty field: the strategy of plan or station."""
+        """Return the strategy's table; None for an empty field: then that of the plan or station applies."""
         return self.cleaned_data["strategy"] or None
 
 
 @admin.register(Checkpoint)
 class CheckpointAdmin(ActiveActions, LogsValues):
-    """Trained policies."""
+    """Admin page of checkpoints."""
 
     def table_of(self, row: Checkpoint) -> dict[str, Any]:
         """Return all fields of the form, with the policy's table reduced to what readers of results may see."""
@@ -407,24 +407,24 @@ class CheckpointAdmin(ActiveActions, LogsValues):
 
 
 class ReadOnly:
-    """Mixin of read-only records."""
+    """Mixin of admin pages of read-only records."""
 
     def has_add_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Return False."""
+        """Return False: records cannot be added here."""
         return False
 
     def has_change_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Return False."""
+        """Return False: records cannot be changed."""
         return False
 
     def has_delete_permission(self, request: HttpRequest, obj: Any = None) -> bool:
-        """Return False."""
+        """Return False: records cannot be deleted."""
         return False
 
 
 @admin.register(Evaluation)
 class EvaluationAdmin(ReadOnly, admin.ModelAdmin):
-    """Evaluations; a station's open bench is created automatically."""
+    """Admin page of evaluations; a station's open bench is created automatically."""
 
     list_display = ("name", "version", "kind", "station", "created_at")
     list_filter = ("kind", "station")
@@ -432,7 +432,7 @@ class EvaluationAdmin(ReadOnly, admin.ModelAdmin):
 
 
 class ScoreInline(ReadOnly, admin.TabularInline):
-    """All scores of a trial; the last counts."""
+    """Table of all scores of a trial on its admin page; the last counts."""
 
     model = Score
     fk_name = "trial"
@@ -443,7 +443,10 @@ class ScoreInline(ReadOnly, admin.TabularInline):
 
 @admin.register(Trial)
 class TrialAdmin(ReadOnly, admin.ModelAdmin):
-    """Trials, read-only: scoring, correcting and voiding are on their result page, which asks for the reason."""
+    """Read-only admin page of trials.
+
+    Scoring, correcting and voiding are on a trial's result page, which asks for the reason.
+    """
 
     list_display = (
         "id",
@@ -474,7 +477,7 @@ class TrialAdmin(ReadOnly, admin.ModelAdmin):
 
 
 class OutcomeInline(ReadOnly, admin.TabularInline):
-    """Milestones as they were at scoring time."""
+    """Table of a score's milestones as they were at scoring time."""
 
     model = MilestoneOutcome
     extra = 0
@@ -484,7 +487,7 @@ class OutcomeInline(ReadOnly, admin.TabularInline):
 
 @admin.register(Score)
 class ScoreAdmin(ReadOnly, admin.ModelAdmin):
-    """All scores, including corrected ones."""
+    """Admin page of all scores, including corrected ones."""
 
     list_display = ("scored_at", "trial", "rater", "source", "success", "score", "why", "reason")
     list_filter = ("success", "source", "trial__scene", "trial__checkpoint")

@@ -4,7 +4,7 @@ from django.apps import AppConfig
 
 
 class TrialsConfig(AppConfig):
-    """Scenes, milestones, checkpoints, trials and their scores."""
+    """Configuration of the app for scenes, milestones, checkpoints, trials and their scores."""
 
     name = "evaweb.trials"
     default_auto_field = "django.db.models.BigAutoField"

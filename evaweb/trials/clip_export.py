@@ -68,7 +68,7 @@ def _clip(trial: Trial) -> tuple[bytes, dict[str, Any]]:
 
 
 class _Written(io.RawIOBase):
-    """Write-only sequential file whose content is removed by `taken`."""
+    """Write-only sequential file; `taken` returns and removes the content written so far."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []

@@ -15,9 +15,10 @@ LASTS_S = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Clip:
-    """Part of the first camera's video from `begin` to `end` [s]; `missed` is the first milestone not reached.
+    """Part of the first camera's video from `begin` to `end` [s] in which a trial failed.
 
-    `after` is the last milestone before it with a known time; "": the clip is the end of the recording.
+    `missed` is the first milestone that was not reached. `after` is the last milestone before it with a known time; if
+    "", the clip is the end of the recording.
     """
 
     video: str
@@ -29,14 +30,14 @@ class Clip:
 
     @property
     def description(self) -> str:
-        """Description of the part."""
+        """Description of the part of the video."""
         return f"after “{self.after}”" if self.after else f"the last {self.end - self.begin:.0f} s"
 
 
 def clip_of(trial: Trial) -> Clip | None:
     """Return the clip of a scored trial; None without a recording with images.
 
-    A missed milestone has no time: the clip begins just before the previous one was reached.
+    A missed milestone has no time, so the clip begins just before the last reached one was reached.
     """
     episode = trial.episode
     if episode is None or trial.verdict is None or not (episode.cameras and episode.frames and episode.fps):

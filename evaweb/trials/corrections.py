@@ -43,7 +43,8 @@ def trial_failure(
     Success, points and milestones are copied from the current score, not evaluated with the scene as it is now. Without
     a `reason`, the old and new terms are recorded as the reason. An identical request adds nothing.
 
-    Raises: Conflict if the trial has no counting score, or another one than `score`, the uuid that the user saw.
+    Raises: Conflict if the trial has no score that counts, or if `score`, the uuid of the score that the user saw, is
+    not that score.
     """
     require_role(user, Role.OPERATOR)
     with transaction.atomic():
@@ -74,7 +75,10 @@ def trial_failure(
 
 
 def _reworded(user: User, held: Trial, seen: Score, words: Mapping[str, str], reason: str) -> Score:
-    """Add a copy of the score `seen` with another failure, whatever became of the scene's milestones since."""
+    """Add a copy of the score `seen` with other words for the failure.
+
+    Its milestones are copied too, even if the scene's milestones have changed since.
+    """
     for what in ("scored", "reworded"):
         run_checks(what, held, user)
     require_scorable(held, reason)

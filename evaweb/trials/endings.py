@@ -11,7 +11,10 @@ _TIMEOUT = re.compile(r"the run's [\d.e+]+ s are over")
 
 
 def ending_of(interrupted: bool, reason: str) -> str:
-    """Return one of `ENDINGS` by the station's reason; "" if the run ended by itself or the operator stopped it."""
+    """Return the cause that ended the run, one of `ENDINGS`, from the reason that the station gave.
+
+    "" if the run ended by itself or the operator stopped it.
+    """
     if interrupted:
         return ESTOP if _ESTOP.search(reason) else INTERRUPTION
     return TIMEOUT if _TIMEOUT.search(reason) else ""

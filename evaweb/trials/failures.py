@@ -53,9 +53,10 @@ class Level:
 
 
 def failure_choices(said: Mapping[str, str] | None = None) -> tuple[Level, ...]:
-    """Return the active phases, then causes; a term in `said` is included even if retired or deleted.
+    """Return the active phases, then the active causes, as a form offers them.
 
-    A level without terms is omitted.
+    `said` maps each field to the selected term, which is included even if it is retired or deleted. A level without
+    terms is omitted.
     """
     terms, found = list(FailureTerm.objects.filter(active=True)), []
     for field, level in FIELDS.items():
@@ -80,7 +81,7 @@ def ordered_terms() -> Mapping[str, tuple[str, ...]]:
 
 
 def clean_failure(*, failure_phase: str, failure: str) -> dict[str, str]:
-    """Return phase and cause as stored. Raises: EvaError if they cannot be."""
+    """Return phase and cause in the form in which they are stored. Raises: EvaError if they cannot be stored."""
     found = {
         "failure": clean_text("failure", failure, LONGEST_FAILURE),
         "failure_phase": clean_text("failure_phase", failure_phase, LONGEST_FAILURE),
@@ -99,10 +100,11 @@ def check_failure(
     by_person: bool = True,
     said: Mapping[str, str] | None = None,
 ) -> None:
-    """Raise EvaError if a score must not have these `words` (by field); terms of the previous score, `said`, may stay.
+    """Raise EvaError if a score must not have these `words` (by field).
 
-    A phase must be one of the lab's. So must a cause given with a phase, or if the scene requires both from human
-    raters; a cause alone may be any text, as programs send it.
+    `said` are the words of the previous score, which may stay. A phase must be one of the lab's. A cause must be one
+    too if it is given with a phase, or if the scene requires both from human raters; a cause alone may be any text, as
+    programs send it.
     """
     for field in FIELDS if success else ():
         if words[field]:

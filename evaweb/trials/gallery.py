@@ -44,7 +44,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class FailureFilters:
-    """Selection of failed trials, "" for any, and `group`, one of GROUPS.
+    """Selection of failed trials ("" matches any), and how they are grouped (`group`, one of GROUPS).
 
     `position` is "SCENE/NUMBER"; phase and cause may be "not specified".
     """
@@ -112,9 +112,9 @@ def failure_groups(filters: FailureFilters, sight: Visibility) -> list[Group]:
 
 
 def failures_of(keys: Sequence[int], filters: FailureFilters, sight: Visibility) -> list[Trial]:
-    """Return the trials of `failed_list` with these ids, in its order, with related rows loaded.
+    """Return the trials with these ids, in the order of `failed_list`, with related rows loaded.
 
-    With this, only ids need sorting when there are very many trials.
+    A caller with very many trials can so sort the ids alone and load the rows in parts.
     """
     rows = failed_list(filters, sight).filter(pk__in=keys).select_related("episode", *NAMED)
     return list(rows.prefetch_related("verdict__outcomes"))

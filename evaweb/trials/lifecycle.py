@@ -15,7 +15,7 @@ _TRIAL_CANNOT = Pattern(
 
 
 class Transition(StrEnum):
-    """Transition of a trial; the value is its participle for messages."""
+    """Transition of a trial; the value is a participle for messages, such as "paused"."""
 
     RUN = "run"
     PAUSE = "paused"

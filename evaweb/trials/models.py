@@ -253,7 +253,7 @@ class Checkpoint(models.Model):
 
 
 class Evaluation(models.Model):
-    """A set of trials; the open bench of a station has those outside any plan."""
+    """Set of trials: those of a plan or, for the open bench of a station, its trials outside any plan."""
 
     class Kind(models.TextChoices):
         OPEN_BENCH = "open_bench", "open bench"
@@ -456,7 +456,7 @@ class Trial(models.Model):
 
 
 class VoidRequest(models.Model):
-    """Request of an operator to void a scored trial of a blind plan, which a second one agrees to or refuses."""
+    """Request of an operator to void a scored trial of a blind plan; a second operator agrees to it or refuses it."""
 
     class Answer(models.TextChoices):
         AGREED = "agreed", "agreed to"
@@ -539,7 +539,7 @@ class Score(models.Model):
 
 
 class MilestoneOutcome(models.Model):
-    """Whether a milestone was reached, with its text and points as they were at scoring time."""
+    """Outcome of one milestone: whether it was reached, with its text and points as they were at scoring time."""
 
     score = models.ForeignKey(Score, on_delete=models.CASCADE, related_name="outcomes")
     milestone = models.ForeignKey(Milestone, null=True, on_delete=models.SET_NULL, related_name="outcomes")

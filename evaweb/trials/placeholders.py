@@ -19,7 +19,10 @@ def station(facts: TrialRecord) -> Station:
 
 
 def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
-    """Return the trial's evaluation; a station's open bench serves all versions."""
+    """Return the trial's evaluation.
+
+    The station's open bench has one row for all versions; its version is raised to the trial's.
+    """
     if facts.evaluation_kind == Evaluation.Kind.PLAN:
         found, _ = Evaluation.objects.get_or_create(
             name=facts.evaluation, version=facts.version, defaults={"description": PLACEHOLDER_NOTE}
@@ -33,7 +36,7 @@ def evaluation(facts: TrialRecord, station: Station) -> Evaluation:
 
 
 def checkpoint(facts: TrialRecord) -> Checkpoint:
-    """Return the checkpoint of that name."""
+    """Return the trial's checkpoint, found by name; a created one is inactive."""
     words = f"{PLACEHOLDER_NOTE} Say again how it is reached, then switch it on."
     found, _ = Checkpoint.objects.get_or_create(
         name=facts.checkpoint, defaults={"description": words, "active": False}
@@ -42,7 +45,7 @@ def checkpoint(facts: TrialRecord) -> Checkpoint:
 
 
 def scene(facts: TrialRecord) -> Scene:
-    """Return the scene of that name; a created one gets its milestones from the first restored score."""
+    """Return the trial's scene, found by name; a created one gets its milestones from the first restored score."""
     words = f"{PLACEHOLDER_NOTE} Write down again what counts as success, then switch it on."
     found, _ = Scene.objects.get_or_create(
         name=facts.scene,
@@ -58,7 +61,7 @@ def scene(facts: TrialRecord) -> Scene:
 
 
 def position(scene: Scene, number: int) -> Position:
-    """Return the position of that number."""
+    """Return the scene's position of that number."""
     words = f"{PLACEHOLDER_NOTE} Write down again where things stand."
     found, _ = Position.objects.get_or_create(scene=scene, number=number, defaults={"description": words})
     return found

@@ -43,7 +43,7 @@ class SceneFigure:
 
 
 def rate_bar(found: Proportion) -> Bar | None:
-    """Return the bar of a proportion; None if it is unknown."""
+    """Return the bar of a proportion; None if its rate is unknown."""
     if found.rate is None or found.interval is None:
         return None
     words = f"{format_percent(found.rate)} of {found.n}, 95 % interval {format_interval(found)}"

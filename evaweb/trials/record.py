@@ -36,7 +36,7 @@ _Seconds = Annotated[float, Field(ge=0, le=1e9)]
 
 @dataclass(frozen=True, slots=True)
 class Column(RowPath):
-    """Declaration of one column: `path` is the query path from a trial, "" for the field's own name.
+    """Declaration of one column; `path` is its query path from a trial, or "" if that is the field's own name.
 
     While a trial's checkpoint is hidden from a user, a column is hidden too, unless it is `always_visible` or has a
     `masked_value`.
@@ -54,7 +54,7 @@ class Column(RowPath):
     label: str = ""  # label on the trial's page; "" if it is shown elsewhere or not at all
 
     def shown(self, name: str, hint: Any, trial: Trial, sight: Visibility) -> Any:
-        """Return the value as this user may see it."""
+        """Return the column's value for a trial, as this user may see it."""
         if self.masked_value is not None:
             return self.masked_value(sight, trial)
         if self.always_visible or not sight.hides(trial):
@@ -63,7 +63,10 @@ class Column(RowPath):
 
 
 class TrialRecord(Line):
-    """Record of a trial, with columns in display order; columns that are not written are None or "" when read."""
+    """Record of a trial, with columns in display order.
+
+    Columns that are never written to files are None or "" in a record read from one.
+    """
 
     id: Annotated[
         Annotated[int, Field(gt=0, lt=2**53)] | None, Column("pk", always_visible=True, type=int)
@@ -181,7 +184,10 @@ HINTS: Mapping[str, Any] = {
 
 
 def api_columns(where: Literal["list", "detail"]) -> dict[str, Any]:
-    """Return the columns with types of a trial in a list, or those that only a single trial's response adds."""
+    """Return the REST columns with their types.
+
+    "list" are those in lists of trials, "detail" those that only the response for a single trial adds.
+    """
     return {name: HINTS[name] for name, column in COLUMNS.items() if column.api == where}
 
 
@@ -201,7 +207,7 @@ def visible_labels(trial: Trial, sight: Visibility) -> Iterator[tuple[str, Any]]
 
 
 class OutcomeLine(Line):
-    """Milestone as it was at scoring time."""
+    """Milestone in a score's journal line, as it was at scoring time."""
 
     order: _Small
     text: Annotated[str, Field(max_length=200)]
@@ -212,7 +218,7 @@ class OutcomeLine(Line):
 
 
 class ScoreLine(Line):
-    """Score of a trial."""
+    """Journal line of a score of a trial."""
 
     kind: Literal["score"] = "score"
     uuid: UUID
@@ -237,7 +243,7 @@ class ScoreLine(Line):
 
 
 class VoidLine(Line):
-    """Void of a trial."""
+    """Journal line of a void of a trial."""
 
     kind: Literal["void"] = "void"
     trial: TrialRecord
@@ -252,7 +258,7 @@ class VoidLine(Line):
 
 
 class VoidRequestLine(Line):
-    """Request of an operator to void a trial."""
+    """Journal line of an operator's request to void a trial."""
 
     kind: Literal["void_request"] = "void_request"
     uuid: UUID
@@ -263,7 +269,10 @@ class VoidRequestLine(Line):
 
 
 class VoidAnswerLine(Line):
-    """Answer to a void request; `at` is when it was answered, or lapsed through a user's action."""
+    """Journal line of the answer to a void request.
+
+    `at` is when it was answered, or when it lapsed through a user's action.
+    """
 
     ELSEWHERE = frozenset({"kind", "uuid"})
     kind: Literal["void_answer"] = "void_answer"

@@ -95,10 +95,10 @@ def _never_ran_reason(trial: Trial) -> str:
 
 
 def _judgements(kept: RestorableRun, asked: Mapping[str, Any]) -> list[Judgement]:
-    """Return the lines of the run; of several lines with one score's uuid, the last.
+    """Return the lines of the run's scores file that belong to its trial, the last one for each score's uuid.
 
-    A score written twice had failed in the database. Lines of another trial than the recording's, from a copied file,
-    are reported and skipped.
+    A score was written twice if its first write to the database failed. Lines of another trial than the recording's,
+    from a copied file, are reported and skipped.
     """
     lines = [line for line in kept.lines if isinstance(line, Judgement)]
     own = asked.get("uuid", "")
@@ -181,7 +181,10 @@ def _create(facts: TrialRecord, episode: Episode | None) -> Trial:
 
 
 def _numbered(facts: TrialRecord, key: Mapping[str, Any], reason: str) -> dict[str, Any]:
-    """Return number and attempt; the next number, with a note in the reason, if another trial has them now."""
+    """Return number, attempt and reason of a trial to be created.
+
+    If another trial has this number and attempt now, it gets the next free number, with a note in the reason.
+    """
     same = Trial.objects.filter(**key)
     if not same.filter(number=facts.number, attempt=facts.attempt).exists():
         return {"number": facts.number, "attempt": facts.attempt}
@@ -233,9 +236,9 @@ def _scores(trial: Trial, lines: Sequence[ScoreLine]) -> int:
 
 
 def _newest(trial: Trial, lines: Sequence[ScoreLine]) -> Score:
-    """Return the score that counts: that of the last line, unless a later one is in another file.
+    """Return the score that counts: normally that of the last line.
 
-    A trial has two files if its episode was found late.
+    A trial has two files if its episode was found late. If a later score is in the other file, that one counts.
     """
     newest, known = Score.objects.get(uuid=lines[-1].uuid), trial.verdict
     elsewhere = known is not None and known.uuid not in [line.uuid for line in lines]
@@ -252,7 +255,10 @@ def _score(trial: Trial, line: ScoreLine) -> None:
 
 
 def _milestones(scene: Scene, outcomes: Sequence[OutcomeLine]) -> dict[tuple[int, str], Milestone]:
-    """Return the scene's milestones by order and text; a placeholder scene gets those of the first score with any."""
+    """Return the scene's milestones by order and text.
+
+    A placeholder scene gets the milestones of the first score that has any.
+    """
     if (
         not scene.active
         and scene.criterion.startswith(placeholders.PLACEHOLDER_NOTE)

@@ -37,7 +37,7 @@ class _Table(BaseModel):
 
 
 class PositionTable(_Table):
-    """Position; `id` is None for a new one."""
+    """Position of a scene; `id` is None for a new position."""
 
     id: int | None = None
     number: int = Field(ge=0, lt=2**15)
@@ -47,7 +47,7 @@ class PositionTable(_Table):
 
 
 class MilestoneTable(_Table):
-    """Milestone at its place in the list; `id` is None for a new one."""
+    """Milestone of a scene, at its place in the list; `id` is None for a new milestone."""
 
     id: int | None = None
     text: _Text = ""
@@ -58,7 +58,7 @@ class MilestoneTable(_Table):
 
 
 class SceneTable(_Table):
-    """Scene as it is to be written."""
+    """Scene with its positions and milestones, as it is to be written."""
 
     name: _Text = ""
     title: _Text = ""

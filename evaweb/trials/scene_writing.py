@@ -62,7 +62,7 @@ class Fault:
 
 
 class SceneRefused(EvaError):
-    """The scene is invalid; `faults` lists all places."""
+    """Error for an invalid scene; `faults` lists all invalid places."""
 
     def __init__(self, faults: Sequence[Fault]) -> None:
         super().__init__("; ".join(fault.text for fault in faults))
@@ -70,7 +70,10 @@ class SceneRefused(EvaError):
 
 
 class ChangedMeanwhile(Conflict):
-    """The scene has changed since the editor loaded it; `seen` identifies the current version for overwriting."""
+    """Error for a scene that has changed since the editor loaded it.
+
+    `seen` is the digest of the current version, with which it can be overwritten.
+    """
 
     def __init__(self, scene: Scene, seen: str) -> None:
         last = LogEntry.objects.filter(object_id=str(scene.pk), content_type__model="scene").first()
@@ -86,8 +89,8 @@ def scene_write(
 ) -> tuple[Scene, list[str]]:
     """Write the scene called `name` (None: a new one); return it and remarks on the consequences of the change.
 
-    `seen` is the result of `seen_of` when the editor read it. If the content is already identical, the request is a
-    repetition whose answer was lost, and nothing is written.
+    `seen` is the result of `scene_digest` when the editor read the scene. If the content is already identical, the
+    request is a repetition whose answer was lost, and nothing is written.
 
     Raises:
         NotAllowed: The user is not an administrator.
@@ -122,7 +125,7 @@ def scene_write(
 
 
 def _equals(scene: Scene, wanted: SceneTable) -> bool:
-    """Return True if the scene already equals `wanted`; new rows have no id there."""
+    """Return True if the scene already equals `wanted`, in which new rows have no id."""
     there = SceneTable.model_validate(scene_table(scene))
     pairs = (
         zip(there.positions, wanted.positions, strict=False),
@@ -238,7 +241,10 @@ def _write_milestones(scene: Scene, wanted: Sequence[MilestoneTable]) -> list[Fa
 
 
 def _make_room(scene: Scene, n: int) -> None:
-    """Move rows that are not in the first `n` places out of them, so that the order stays unique at all times."""
+    """Move all milestones of the scene to places above the first `n`, so that these are free.
+
+    The order so stays unique while the milestones are then moved to their new places one by one.
+    """
     taken = set(scene.milestones.values_list("order", flat=True))
     free = (place for place in count(n + 1) if place not in taken)
     for row in scene.milestones.all():
@@ -254,7 +260,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _strangers(wanted: Sequence[Any], rows: Mapping[int, Any], kind: str) -> list[Fault]:
-    """Report rows whose ids are not of this scene, or repeated."""
+    """Return a fault for each id in `wanted` that is not a row of this scene, or occurs twice."""
     ids = [one.id for one in wanted if one.id is not None]
     wrong = [id for id in ids if id not in rows or ids.count(id) > 1]
     return [
@@ -272,7 +278,7 @@ def _twice(wanted: Sequence[PositionTable]) -> list[Fault]:
 
 
 def _pictured(row: Position) -> str:
-    """Return the reason to keep a position with reference pictures, which evaweb.plans attaches."""
+    """Return "reference pictures", a reason to keep the position, if it has any; else ""."""
     return "reference pictures" if row.references.exists() else ""  # type: ignore[attr-defined]
 
 

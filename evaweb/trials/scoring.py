@@ -82,7 +82,7 @@ def score_outcome(
 ) -> ScoredOutcome:
     """Return the outcome of one trial from `ticks`: milestone id -> reached, for each of the scene's milestones.
 
-    A trial is a success if all required milestones are reached. If none is required, `success` must be given.
+    A trial is a success if all required milestones are reached. If no milestone is required, `success` must be given.
 
     Args:
         times: Milestone id -> time of reaching it [s after the start of the run], if known. A milestone reached
@@ -108,7 +108,7 @@ def score_outcome(
 
 
 def reached_in_truth(truth: Mapping[str, Any], milestone: Milestone) -> bool | None:
-    """Return whether the ground truth reports the milestone as reached in time; None if it does not cover it."""
+    """Return whether the ground truth reports the milestone as reached in time; None if it does not report on it."""
     known = truth.get("milestones", {}).get(milestone.truth)
     at, limit = truth.get("reached", {}).get(milestone.truth), milestone.time_limit_s
     late = at is not None and limit is not None and at > limit

@@ -64,7 +64,10 @@ def scene_get(*, name: str | int) -> Scene:
 
 
 def checkpoint_get(*, name: str | int, sight: Visibility = FULL_VISIBILITY) -> Checkpoint:
-    """Return the checkpoint of that name or id. Raises: NotFound, also for a hidden one; lists the visible ones."""
+    """Return the checkpoint of that name or id.
+
+    Raises: NotFound if it does not exist or is hidden from the user; the message lists the visible checkpoints.
+    """
     return _by_name(_checkpoints(sight), "checkpoint", name)
 
 
@@ -191,7 +194,7 @@ class TrialFilters:
 
 
 def trial_list(filters: TrialFilters | None = None, sight: Visibility = FULL_VISIBILITY) -> QuerySet[Trial]:
-    """Return the matching trials, newest first, with the rows that name them."""
+    """Return the matching trials, newest first, with the related rows that lists of trials name."""
     rows = Trial.objects.select_related(*_NAMED, "verdict__rater").order_by("-prepared_at", "-pk")
     return (filters or TrialFilters()).apply(rows, sight)
 
@@ -218,7 +221,7 @@ def attempts_of(*, trial: Trial) -> QuerySet[Trial]:
 
 
 def commands_of(*, trial: Trial) -> QuerySet[Command]:
-    """Return the commands sent to its station from its preparation to its end, oldest first."""
+    """Return the commands sent to the trial's station between its preparation and its end, oldest first."""
     until = trial.ended_at or (None if trial.status in UNFINISHED else trial.changed_at)
     asked = Command.objects.filter(station=trial.station, issued_at__gte=trial.prepared_at)
     asked = asked.filter(issued_at__lte=until) if until else asked
@@ -298,7 +301,10 @@ def _cells(trials: QuerySet[Trial]) -> dict[_Cell, Summary]:
 
 
 def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
-    """Recompute only the cells with trials that have changed since."""
+    """Return the summaries with the changes since `before`.
+
+    Only the cells with trials that have changed are recomputed.
+    """
     since = before.newest - _LATE if before and before.newest else None
     rows = Trial.objects.order_by("-changed_at", "-pk")
     named = rows.values_list("pk", "changed_at", "scene_id", "checkpoint_id")
@@ -317,7 +323,10 @@ def _brought_up(before: _Known | None, trials: QuerySet[Trial]) -> _Known:
 
 
 def _same(before: Collection[_Row], seen: Collection[_Row]) -> bool:
-    """Return False if a known trial is gone or replaced: the database was lost or its clock set back."""
+    """Return True if all trials in `before` are still in `seen`, with the same scene and checkpoint.
+
+    Otherwise the database was lost or its clock was set back.
+    """
     return {(pk, scene, checkpoint) for pk, _, scene, checkpoint in before} <= {
         (pk, scene, checkpoint) for pk, _, scene, checkpoint in seen
     }

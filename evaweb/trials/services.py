@@ -1,4 +1,4 @@
-"""Services for trials: prepare, score, abandon. `voids` has those that void."""
+"""Services for trials: prepare, score, abandon. Voiding is in the module `voids`."""
 
 from __future__ import annotations
 
@@ -134,11 +134,12 @@ _TRIES = 5  # attempts to get a number in spite of concurrent users
 
 
 def register_check(check: Check) -> None:
-    """Register a check that runs before an action on a trial, with action, trial and user; it may raise EvaError.
+    """Register a check that is called before an action on a trial, with action, trial and user; it may raise EvaError.
 
-    Actions are "prepared", "run", "scored", "voided", "void agreed" and "void answered"; "judged", with the trial
-    locked, whenever a score uses the scene's definition of success; "judged success" or "judged failure" once the
-    outcome is known. A correction that leaves success and milestones unchanged also runs "reworded" after "scored".
+    Actions are "prepared", "run", "scored", "voided", "void agreed" and "void answered". Whenever a score uses the
+    scene's definition of success, "judged" is called with the trial locked, and "judged success" or "judged failure"
+    once the outcome is known. For a correction that leaves success and milestones unchanged, "reworded" follows
+    "scored".
     """
     _checks.append(check)
 
@@ -152,12 +153,15 @@ def register_settled(told: Callable[[Trial, Any], None]) -> None:
 
 
 def declare_failing(rule: Callable[[Trial], str]) -> None:
-    """Register a rule that returns why a trial is a failure whatever was reached, "" if it is not."""
+    """Register a rule that returns the reason for which a trial is a failure by itself, "" if it is not.
+
+    Such a trial is a failure whatever milestones were reached.
+    """
     _failing.append(rule)
 
 
 def failing(trial: Trial) -> str:
-    """Return why the trial is a failure whatever was reached; "" if its milestones decide."""
+    """Return the reason for which the trial is a failure by itself; "" if its milestones decide."""
     return next((why for rule in _failing if (why := rule(trial))), "")
 
 
@@ -261,7 +265,7 @@ def create_trial(
     seed: int | None = None,
     strategy: Mapping[str, Any] | None = None,
 ) -> Trial:
-    """Create exactly this trial, prepared; call within a transaction, if it is known to be the next one.
+    """Create exactly this trial, prepared; call within a transaction, after finding that it is the next one.
 
     Raises:
         Conflict: The station has an unfinished trial; the message has advice.
@@ -435,14 +439,16 @@ def lock_trial(trial: Trial) -> Trial:
 
 
 def _reject_repeat(trial: Trial, said: Mapping[str, Any], found: ScoredOutcome) -> None:
-    """Raise Conflict if this equals an earlier score of the rater, as it may be a late copy of a corrected one."""
+    """Raise Conflict if this equals an earlier score of the rater: it may be a late copy of a score that was
+    corrected.
+    """
     before = trial.scores.filter(rater=said["rater"]).prefetch_related("outcomes")
     if any(_is_same_score(score, said, found) for score in before):
         raise Conflict(_SAID_BEFORE(trial=trial.pk))
 
 
 def _require_truth(trial: Trial, found: ScoredOutcome) -> None:
-    """Raise EvaError unless the ground truth agrees, because the score is recorded in its name."""
+    """Raise EvaError unless the bench's ground truth agrees with the score, which is recorded as given by the bench."""
     if trial.truth is None:
         raise EvaError(_BENCH_SAYS_NOTHING(trial=trial.pk))
     for milestone, reached, _ in found.reached:

@@ -79,7 +79,7 @@ def trial_command(
     uuid: UUID | str | None = None,
     args: Mapping[str, Any] | None = None,
 ) -> Command:
-    """Send a command for a trial; `setup` and `run` get their arguments from the trial, others use `args`.
+    """Send a command for a trial; `setup` and `run` get their arguments from the trial, other commands from `args`.
 
     Never call it within a transaction. After an accepted run the trial is running and its episode has a row.
     Raises: Conflict if the trial is not prepared, or the station was last set up for something else.
@@ -106,9 +106,9 @@ def trial_command(
 def checkpoint_command(
     *, user: User, checkpoint: Checkpoint, kind: str, args: Mapping[str, Any] | None = None, **given: Any
 ) -> Command:
-    """Set a station up for a checkpoint without a trial; `given` as in `issue_command`.
+    """Set a station up for a checkpoint without a trial; the other arguments are those of `issue_command`.
 
-    Raises: EvaError for other commands.
+    Raises: EvaError if `kind` is not "setup".
     """
     require_role(user, Role.OPERATOR)
     if kind != "setup":
@@ -255,7 +255,7 @@ def _require_loaded(trial: Trial, user: User) -> dict[str, float] | None:
 
 
 def _require_same(first: Command, trial: Trial, same: bool) -> None:
-    """Raise Conflict if the uuid was used for another trial; a repeated one returns its first answer."""
+    """Raise Conflict unless the command that already has this uuid is the `same` command for this trial."""
     if not same:
         raise Conflict(_UUID_OF_ANOTHER(uuid=first.pk, first=first, trial=trial.pk))
 

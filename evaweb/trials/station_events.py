@@ -149,9 +149,10 @@ def _state_entered(station: Station, event: Mapping[str, Any], boot: str) -> Tri
 
 
 def _transition_for(state: str, unbegun: Mapping[str, Any]) -> Transition:
-    """Return the transition for a state of the station.
+    """Return the transition of a trial whose station is now in `state`.
 
-    A run that never began is not an attempt: the trial is prepared again if no recording was opened, else repeated.
+    `unbegun` is the station's report of a run that never began, {} otherwise. Such a run is not an attempt if no
+    recording was opened: the trial is prepared again. Otherwise the trial is interrupted and has to be repeated.
     """
     if unbegun:
         return Transition.GIVE_BACK if unbegun.get("unopened") else Transition.INTERRUPT
@@ -210,7 +211,10 @@ def _record_truth(station: Station, event: Mapping[str, Any]) -> Trial | None:
 
 
 def _episode_closed(station: Station, event: Mapping[str, Any]) -> Trial | None:
-    """Apply the closing of a recording: it has the exact duration; an incomplete one interrupts the trial."""
+    """Apply the closing of a recording to its trial, and return the trial.
+
+    The trial gets the exact duration of the recording; an incomplete recording interrupts it.
+    """
     data = event.get("data") or {}
     trial = _lock_latest(station=station, episode_id=_uuid(data.get("uuid")))
     if trial is None or data.get("waits"):  # waits for disk space: the event is repeated when it is closed
@@ -237,7 +241,10 @@ def _closed_as(trial: Trial, status: str, reason: str, time: float | None) -> No
 
 
 def _lock_latest(**key: Any) -> Trial | None:
-    """Return the newest such trial with its row locked until the transaction ends."""
+    """Return the newest trial that matches these conditions, with its row locked until the transaction ends.
+
+    None if there is none, or if a uuid or episode id among the conditions is None.
+    """
     if any(value is None for name, value in key.items() if name in ("uuid", "episode_id")):
         return None
     return Trial.objects.select_for_update().filter(**key).order_by("-pk").first()

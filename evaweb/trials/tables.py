@@ -23,7 +23,7 @@ _OBJECT = ("x", "y", "yaw in degrees", "width", "depth")
 
 
 def check_policy(given: object) -> None:
-    """Raise ValidationError unless `given` can override the [policy] table of a deployment, for some kind."""
+    """Raise ValidationError unless `given` can override the [policy] table of a deployment with any kind of policy."""
     _check_kinds(given, _kinds(), '{"url": "ws://127.0.0.1:8000"}')
 
 
@@ -130,7 +130,10 @@ def _is_number(value: object) -> bool:
 
 
 def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> list[str]:
-    """Return the errors of `given` as a table of that kind; missing keys come from the deployment."""
+    """Return the errors of `given` as a table of this kind.
+
+    Missing keys are no errors: they come from the deployment.
+    """
     kind = config.model_fields["kind"].default
     try:
         config.model_validate({**given, "kind": kind})
@@ -141,7 +144,10 @@ def _problems(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> lis
 
 
 def _matching_keys(given: Mapping[str, Any], config: type[pydantic.BaseModel]) -> tuple[int, int]:
-    """Return the number of keys that (nearly) belong to this kind, and its size to break ties."""
+    """Return how many keys of `given` resemble keys of this kind of table, and the number of the kind's keys.
+
+    The second number breaks ties.
+    """
     near = [key for key in given if get_close_matches(str(key), config.model_fields, n=1)]
     return len(near), len(config.model_fields)
 
@@ -157,7 +163,7 @@ def _problem(error: Any, config: type[pydantic.BaseModel], kind: str) -> str:
 
 
 def _table(config: type[pydantic.BaseModel], way: tuple[str | int, ...]) -> type[pydantic.BaseModel]:
-    """Return the nested model that the keys of `way` lead to."""
+    """Return the model of the nested table at the path `way` of keys."""
     for key in way:
         field = config.model_fields.get(str(key))
         parts = (field.annotation, *get_args(field.annotation)) if field else ()

@@ -175,7 +175,7 @@ def bench_images(trial: Trial) -> list[Any]:
 
 
 def _is_checked(trial: Trial, milestone: int, typed: Mapping[str, Any] | None) -> bool:
-    """Whether the milestone's box is ticked: as typed, else as last scored."""
+    """Return True if the milestone's box is ticked: as typed, else as last scored."""
     if typed and "milestones" in typed:
         return bool(typed["milestones"].get(milestone))
     outcomes = trial.scores.all()[0].outcomes.all() if trial.verdict_id else ()
@@ -212,7 +212,10 @@ def _filters(sight: Visibility) -> list[Filter]:
 
 
 def _columns(sight: Visibility) -> list[Column]:
-    """Return the columns; sorting by checkpoint is offered only if none is hidden, as the order would reveal it."""
+    """Return the columns of the list of trials.
+
+    Sorting by checkpoint is offered only if no checkpoint is hidden, because the order would reveal it.
+    """
     return [
         Column("trial", "Trial", ("pk",), down=True),
         Column("prepared", "Prepared", ("prepared_at",), down=True),

@@ -63,12 +63,12 @@ def register_two_person_rule(rule: Callable[[Trial], bool]) -> None:
 
 
 def needs_two_people(trial: Trial) -> bool:
-    """Whether voiding the trial needs the agreement of a second operator."""
+    """Return True if voiding the trial needs the agreement of a second operator."""
     return trial.verdict_id is not None and any(rule(trial) for rule in _rules)
 
 
 def can_answer_void(trial: Trial, user: User) -> bool:
-    """Whether the trial has an open void request that this user may answer."""
+    """Return True if the trial has an open void request that this user may answer."""
     asked = trial.void_requests.filter(answer="").first()
     return asked is not None and _why_not(asked, user) is None
 
@@ -125,9 +125,9 @@ def open_void_requests(trials: QuerySet[Trial]) -> QuerySet[VoidRequest]:
 
 
 def lapse_void_requests(trials: QuerySet[Trial], *, user: User, now: bool = False) -> None:
-    """Restore trials whose void request was not answered in time, or all with `now`; call within a transaction.
+    """Restore trials whose void request was not answered in time, or with `now` all with an open request.
 
-    Those with an open repetition wait for its end.
+    Trials with an unfinished repetition wait for its end. Call within a transaction.
     """
     asked = open_void_requests(trials)
     if not now:

@@ -50,7 +50,7 @@ register = template.Library()
 
 @register.inclusion_tag("console/tabs.html", takes_context=True)
 def tab_bar(context: template.Context) -> dict[str, Any]:
-    """Render the tabs, with the one that this address belongs to."""
+    """Render the tabs; the one to which this address belongs is marked as current."""
     return {"tabs": page_tabs(context["request"]), "request": context["request"]}
 
 

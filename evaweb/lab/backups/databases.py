@@ -22,7 +22,7 @@ Rows = Mapping[str, int]
 
 
 class Database(Protocol):
-    """Database of the settings."""
+    """Interface of a kind of database: dump, check and restore."""
 
     engine: str
     file: str  # name in a backup

@@ -6,4 +6,4 @@ from evaweb.core.errors import EvaError
 
 
 class BackupError(EvaError):
-    """A backup cannot be created, read or restored."""
+    """Error if a backup cannot be created, read or restored."""

@@ -90,7 +90,10 @@ class FileCopies:
                     yield from self._steady(f"{top.name}/{entry.name}")
 
     def _steady(self, unit: str) -> list[Listed]:
-        """Copy a folder in a consistent state, if it does not change during one of several attempts."""
+        """Copy a folder and return its files.
+
+        The copy is repeated until the folder did not change meanwhile; after the last try it is added to `changing`.
+        """
         for _ in range(_TRIES):
             names = list(self._walk(unit))
             signs = self._signs(names)
@@ -101,8 +104,9 @@ class FileCopies:
         return listed
 
     def _walk(self, unit: str) -> Iterator[str]:
-        """Return its files, with the seal of a recording first: once that exists, the other files do not
-        change any more.
+        """Yield the paths of a folder's files, with the seal of a recording first.
+
+        Once the seal exists, the recording's other files do not change any more.
         """
         found = []
         for folder, folders, files in os.walk(self._data / unit, onerror=_unless_gone):

@@ -1,6 +1,4 @@
-"""Writer of a bundle: all parts through the scrubber, the ends of logs, and a summary of what is included and
-omitted.
-"""
+"""Writer of a bundle: all parts without secrets, the ends of logs, and a summary of its contents and omissions."""
 
 from __future__ import annotations
 
@@ -115,7 +113,7 @@ def _guarded(what: str, parts: Iterator[Named], notes: list[str]) -> Iterator[Na
 
 
 def _logs(sight: Visibility, notes: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield names and ends of logs; none for blind readers, because logs name checkpoints and servers."""
+    """Yield names and ends of logs; no logs for blind readers, because logs name checkpoints and servers."""
     if not sight.hides_nothing:
         return
     room = LONGEST_LOGS

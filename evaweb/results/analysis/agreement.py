@@ -61,7 +61,7 @@ def agreement(pairs: list[tuple[bool, bool]]) -> dict[str, Any]:
 
 
 def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
+    """Return a dict from each milestone's text to its value; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:
         label, n = text, 1
@@ -73,8 +73,9 @@ def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _score_at(rating: Rating | Judgement) -> Score:
-    """Return the score that was current when the rating was made; the first score if a clock set back puts
-    all of them later.
+    """Return the score that was current when the rating or judgement was made.
+
+    If the clock was set back so that all scores seem later, it is the first score.
     """
     scores = list(rating.trial.scores.all())
     return next((score for score in reversed(scores) if score.scored_at <= rating.at), scores[0])
@@ -146,16 +147,19 @@ def _on_milestone(said: list[tuple[bool, bool | None, float | None]]) -> dict[st
 
 
 def _calibration(said: list[tuple[bool, bool | None, float | None]]) -> dict[str, Any] | None:
-    """Return the calibration of the probabilities that milestones were reached against the scores, None without any."""
+    """Return the calibration of a judge's probabilities against the scores; None if it gave no probability.
+
+    `said` has a triple per milestone: whether the score counts it as reached, the judge's verdict, its probability.
+    """
     given = [(probability, scored) for scored, _, probability in said if probability is not None]
     return asdict(calibration(given)) if given else None
 
 
 def preference_comparisons(plan: Plan) -> list[Comparison]:
-    """Return the preferences by checkpoint; all preferences about the same two trials together have weight 1.
+    """Return the plan's preferences as comparisons of two checkpoints.
 
-    With random order, two trials of a block may have the same checkpoint: raters are asked about them as well, but
-    they are left out here.
+    All preferences about the same two trials together have weight 1. With random order, two trials of a block may have
+    the same checkpoint: raters are asked about them as well, but such preferences are left out here.
     """
     same = Q(first__checkpoint=F("second__checkpoint"))
     rows = Preference.objects.filter(~same, plan=plan).order_by("pk")

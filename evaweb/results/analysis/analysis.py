@@ -97,22 +97,23 @@ def analyse(
 ) -> Analysis:
     """Return the complete analysis of these outcomes.
 
-    The design alone decides planned comparisons: letters separate what it separated, and while it is undecided there
-    are neither letters nor anything else that could pass for a decision.
+    Only the design decides planned comparisons: checkpoints that it separated share no letter. While it is undecided
+    there are neither letters nor anything else that could pass for a decision.
 
     Args:
         outcomes: Trials that count.
         interruptions: Interrupted runs; they only count for the rate of interventions.
         alpha: Error probability of all comparisons together.
-        planned: Verdicts by planned comparison, in their direction; for others the better checkpoint is first.
-        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there are
-            no pairs.
+        planned: Verdicts by planned comparison, in its direction; in unplanned ones the better checkpoint is
+            first.
+        in_pairs: False for random order: a block then has trials of the checkpoints that were drawn, and there
+            are no pairs.
         limits: Time limits [s] of the scenes that have one. The smallest is the horizon of times to success;
             without any, the longest run.
         checkpoints: All checkpoints of the evaluation in the order of their colours, whichever were selected.
         whole: Whether these are all trials of a plan, with blocks numbered from 0. Evidence then ends before the
-            first incomplete block, as in the plan's design: otherwise the choice of the next trial could influence
-            it.
+            first incomplete block, as in the plan's design: otherwise the choice of the next trial could
+            influence it.
         recipes: Recipe of each checkpoint that is one of its training runs.
     """
     by_design = planned or {}
@@ -165,7 +166,7 @@ _FEWEST_RUNS = 3  # runs of a recipe for an interval
 
 
 def _recipes(arms: Mapping[str, Sequence[Outcome]], recipes: Mapping[str, str]) -> Iterator[Recipe]:
-    """Yield the recipes of which several runs were tried."""
+    """Yield each recipe of which at least two training runs have trials."""
     runs: dict[str, dict[str, float]] = defaultdict(dict)
     for name in sorted(arms):
         if recipes.get(name):
@@ -197,8 +198,9 @@ def _share(
     planned: Collection[tuple[str, str]],
     couple: tuple[str, str],
 ) -> float:
-    """Return alpha of one comparison: planned comparisons share all of it; each other one has an equal share
-    among all.
+    """Return alpha of one comparison.
+
+    Planned comparisons share alpha equally. For any other comparison it is divided by the number of all comparisons.
     """
     return alpha / (len(planned) if couple in planned else len(couples))
 

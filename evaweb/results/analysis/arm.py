@@ -1,4 +1,4 @@
-"""Statistics of one checkpoint, each declared by one row of `Arm`."""
+"""Statistics of one checkpoint; each field of `Arm` declares one."""
 
 # ruff: noqa: RUF009 - calls in the body of `Arm` declare its fields
 from __future__ import annotations
@@ -58,7 +58,7 @@ class FailureMode:
 
     @property
     def words(self) -> str:
-        """Text for display."""
+        """Failure mode as text for display."""
         return failure_text(self.phase, self.cause) or UNSPECIFIED
 
 
@@ -72,7 +72,7 @@ class ArmTrials:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Successes and trials."""
+        """Number of successes and number of trials."""
         return count_successes(self.all)
 
     @property
@@ -163,7 +163,7 @@ def _write_times(arm: Arm) -> dict[str, Any]:
 
 
 def _write_failures(arm: Arm) -> dict[str, Any]:
-    """Return the number of failures by specified cause, over all phases, and all modes."""
+    """Return the number of failures by cause, summed over all phases, and the list of all failure modes."""
     by_cause: Counter[str] = Counter()
     for mode in arm.failures:
         if mode.cause:

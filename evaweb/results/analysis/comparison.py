@@ -1,4 +1,4 @@
-"""Statistics of two checkpoints, each declared by one row of `Comparison`."""
+"""Statistics of two checkpoints; each field of `Comparison` declares one."""
 
 # ruff: noqa: RUF009 - calls in the body of `Comparison` declare its fields
 from __future__ import annotations
@@ -58,10 +58,11 @@ class Within:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Result of a planned comparison by its design: whether it has ended, and whether it separated the two.
+    """Result of a planned comparison by its design.
 
-    `apart` is None if the question is not whether they differ (non-inferiority), or if it has not ended. `evidence` is
-    the outcome ("success", "score") whose e-process is the design, "" for any other design.
+    `ended`: whether the design has reached its end. `apart`: whether it separated the two checkpoints; None if it has
+    not ended, or if it does not test whether they differ (non-inferiority). `evidence`: the outcome ("success",
+    "score") whose e-process is the design, "" for any other design.
     """
 
     ended: bool = False
@@ -79,7 +80,10 @@ class Standing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AnswerContext:
-    """What answers depend on beside the comparison: whether n was fixed beforehand, whether there are several."""
+    """Context on which answers depend.
+
+    `fixed`: the number of trials was fixed beforehand; `several`: there are several comparisons.
+    """
 
     fixed: bool
     several: bool
@@ -107,31 +111,31 @@ class ComparedTrials:
 
     @cached_property
     def pairs(self) -> list[Pair]:
-        """Pairs by block."""
+        """Pairs of the two checkpoints' trials in the same block; [] for random order."""
         return pair_by_block(self.first, self.second) if self.in_pairs else []
 
     @cached_property
     def evidence(self) -> list[Pair]:
-        """Pairs that are evidence."""
+        """Pairs that count as evidence: in a whole plan only those before the first incomplete block."""
         return unbroken(self.pairs) if self.whole else self.pairs
 
     @property
     def counts(self) -> tuple[int, int, int, int]:
-        """Successes and trials of both."""
+        """Successes and trials of the first checkpoint, then of the second."""
         return (*count_successes(self.first), *count_successes(self.second))
 
     @property
     def successes(self) -> list[tuple[bool, bool]]:
-        """Success of both, by pair that is evidence."""
+        """Success of the first and of the second checkpoint, for each pair in `evidence`."""
         return [(pair.first.success, pair.second.success) for pair in self.evidence]
 
     @property
     def scores(self) -> list[tuple[float, float]]:
-        """Score of both, by pair that is evidence."""
+        """Score of the first and of the second checkpoint, for each pair in `evidence`."""
         return [(pair.first.score, pair.second.score) for pair in self.evidence]
 
     def tables(self, stratum: str) -> dict[str, StratumTable]:
-        """Return the tables of the strata in which both were tried."""
+        """Return successes and trials of both checkpoints for each value of `stratum` at which both were tried."""
         ours, theirs = (grouped(trials, STRATA[stratum]) for trials in (self.first, self.second))
         return {
             name: StratumTable(*count_successes(ours[name]), *count_successes(theirs[name]))
@@ -141,7 +145,7 @@ class ComparedTrials:
 
     @property
     def scenes(self) -> dict[str, StratumTable]:
-        """Tables of the scenes if several are shared, else {}."""
+        """Table of successes and trials by scene; {} unless both checkpoints were tried in several scenes."""
         tables = self.tables("scene")
         return tables if len(tables) > 1 else {}
 
@@ -234,17 +238,17 @@ class Comparison:
         standing: Whether the comparison is planned, and decided.
         alpha: This comparison's share of alpha.
         test: Barnard's test, for a number of trials fixed beforehand.
-        corrected: Its probability after Holm's correction for all pairs of the evaluation.
-        better: Posterior probability that the first is better.
+        corrected: p-value of `test` after Holm's correction for all pairs of the evaluation.
+        better: Posterior probability that the first checkpoint has the higher success rate.
         scored: Sign-flip test of the pairs' scores, for a number of trials fixed beforehand.
         within: Exact tests within conditions, scenes, operators and stations, if several strata are informative.
         scenes: Difference in each scene, if there are several.
         interaction: Probability of scenes differing this much if the odds ratio is the same in all.
         evidence: Anytime-valid evidence on success; may be examined at any time.
-        score_evidence: The same on the scores.
+        score_evidence: Anytime-valid evidence on the scores.
         anytime: Confidence sequence of the mean difference of successes at 1 - alpha; None if no difference fits
             all pairs.
-        score_anytime: The same for the scores.
+        score_anytime: Confidence sequence of the mean difference of scores.
         time_test: Sign-flip test of times to success [s] by pair, with failures counted as the horizon.
     """
 
@@ -387,7 +391,7 @@ _OF_DESIGN = {"success": "evidence", "score": "score_evidence"}  # statistic tha
 
 
 def compare(names: tuple[str, str], trials: ComparedTrials, verdict: Verdict | None) -> Comparison:
-    """Return the comparison of two checkpoints, planned if there is a verdict of its design."""
+    """Return the comparison of two checkpoints; it is a planned one if its design has a `verdict` on it."""
     notes = _later(len(trials.pairs) - len(trials.evidence))
     found = compute_all(Comparison, trials, notes)
     notes += _unpaired(trials) if trials.in_pairs else [_RANDOM]
@@ -397,7 +401,10 @@ def compare(names: tuple[str, str], trials: ComparedTrials, verdict: Verdict | N
 
 
 def _described(found: Comparison, evidence: str) -> Comparison:
-    """Return an open comparison without inference; only descriptions, and the evidence that is its design, remain."""
+    """Return an open comparison with its descriptions only: statistics that infer are emptied.
+
+    The statistic of `evidence`, if that is the design, also remains.
+    """
     left = (
         name
         for name, row in statistics_of(Comparison).items()

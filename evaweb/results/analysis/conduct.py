@@ -46,8 +46,8 @@ _delays: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 class AttemptRecord:
     """Attempt in the order of allocation; delays in s, None if unknown.
 
-    `match` is the smallest match of its bench at the last check before the run, `override` the reason for which a low
-    one was accepted.
+    `match` is the smallest agreement of a camera's image with its reference at the last bench check before the run;
+    `override` is the reason for which a low match was accepted.
     """
 
     number: int
@@ -113,8 +113,9 @@ def plan_conduct(plan: Plan, runs: Sequence[AttemptRecord], looks: Iterable[Benc
 
 
 def looked_behind(plan: Plan) -> list[dict[str, Any]]:
-    """Return the unblindings of this version, earlier versions and related plans; `before`: this plan was
-    frozen later.
+    """Return the recorded unblindings of the plan, its earlier versions and related plans.
+
+    Those after the end of the plan are left out. `own`: it was this version; `before`: it preceded this plan's freeze.
     """
     of_the_same = Q(plan__name=plan.name, plan__version__lte=plan.version) | Q(
         plan__in=overlapping_plans(plan)
@@ -160,10 +161,10 @@ def all_attempts(plan: Plan, looks: Iterable[BenchImage]) -> list[AttemptRecord]
 
 @dataclass(frozen=True, slots=True)
 class BenchImage:
-    """Camera image of the bench before a run: smallest match (None without a reference), and why a low one was
-    accepted.
+    """Check of one camera's image of the bench before a run.
 
-    If the reference has regions, their matches count instead of the whole image: they are what the match gate uses.
+    `match` is its agreement with the reference, None without one; `override` is the reason for which a low match was
+    accepted. If the reference has regions, their matches count instead of the whole image's: the match gate uses them.
     """
 
     trial: int
@@ -197,7 +198,7 @@ def bench_images(plan: Plan) -> list[BenchImage]:
 
 
 def _accepted(looks: Iterable[BenchImage]) -> dict[int, tuple[float | None, str]]:
-    """Return by trial the smallest match of its last look at the bench, and why it was accepted."""
+    """Return by trial the smallest match of its last bench check, and the reason for which a low match was accepted."""
     newest: dict[int, dict[str, BenchImage]] = defaultdict(dict)
     for look in looks:
         newest[look.trial][look.camera] = look
@@ -211,10 +212,10 @@ def _accepted(looks: Iterable[BenchImage]) -> dict[int, tuple[float | None, str]
 
 
 def balance(runs: Iterable[AttemptRecord], name: str) -> dict[str, Any]:
-    """Return the trials that count by operator or station and checkpoint.
+    """Return the trials that count by checkpoint, for each operator or each station; `name` selects which.
 
-    `uneven` is the largest number of trials by which one of them differs from its proportional share of a checkpoint's
-    trials. Dropped checkpoints and random order alone do not increase it.
+    `uneven` is the largest number of trials by which an operator or station differs from its proportional share of a
+    checkpoint's trials. Dropped checkpoints and random order alone do not increase it.
     """
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     counted = [run for run in runs if run.counts]
@@ -341,7 +342,7 @@ def _amendments(plan: Plan) -> list[dict[str, Any]]:
 def _edits(plan: Plan) -> list[dict[str, Any]]:
     """Return changes of the plan's scenes and checkpoints between freezing and reveal, including reverted ones.
 
-    Source is the log of the administration and the scene editor.
+    The source is the log of the administration and the scene editor.
     """
     if plan.frozen_at is None:
         return []
@@ -371,7 +372,11 @@ def _edits(plan: Plan) -> list[dict[str, Any]]:
 
 
 def _deviations(runs: Sequence[AttemptRecord], given_back: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return deviations from the schedule: differences within blocks, and the order of trials."""
+    """Return deviations from the schedule.
+
+    They are blocks split between stations or operators, trials out of order, time spans of blocks, and the slots that
+    stations gave back (`given_back`).
+    """
     blocks: dict[int, list[AttemptRecord]] = defaultdict(list)
     for run in runs:
         if run.status != TrialStatus.ABANDONED:
@@ -540,7 +545,7 @@ def _tested(
 
 
 def _test(names: Names, blocks: Iterable[dict[str, float]]) -> dict[str, Any]:
-    """Return the test of first minus second, over the blocks that have both."""
+    """Return the sign-flip test of the first checkpoint's values minus the second's, over the blocks that have both."""
     first, second = names
     pairs = [found[first] - found[second] for found in blocks if first in found and second in found]
     widest = max(map(abs, pairs), default=0.0)

@@ -78,7 +78,10 @@ def _same_scenes(one: Plan, other: Plan) -> set[str]:
 
 
 def _tried(name: str, plan: Plan, scenes: set[str]) -> list[_Tried]:
-    """Return the checkpoint's trials that count, in order of allocation; as judged at a reveal."""
+    """Return the checkpoint's trials that count in these scenes, in order of allocation.
+
+    Of a revealed plan they have the scores at its reveal.
+    """
     return [
         _Tried(plan, (each.station, each.scene, each.position), each.success)
         for each in load_plan_outcomes(plan)
@@ -101,7 +104,10 @@ def _by_plan(rows: Iterable[_Tried]) -> Iterator[dict[str, Any]]:
 
 
 def _differ(before: Sequence[_Tried], since: Sequence[_Tried]) -> float | None:
-    """Return the exact two-sided probability, stratified by condition; None if no condition has both."""
+    """Return the exact two-sided p-value of a difference between the two groups of trials, stratified by condition.
+
+    None if no condition has trials of both groups.
+    """
     conditions = sorted({each.condition for each in (*before, *since)})
     tables = []
     for condition in conditions:

@@ -40,7 +40,7 @@ class TrialFilter:
 
 
 def parse_filter(given: Mapping[str, str], runs: Iterable[Outcome]) -> TrialFilter:
-    """Return the filter of an address.
+    """Return the filter that the query of an address (`given`) describes.
 
     Raises:
         EvaError: If it names a value that the trials do not have.

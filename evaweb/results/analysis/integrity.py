@@ -20,12 +20,13 @@ or only the note.
 
 @dataclass
 class CheckpointChanges:
-    """Attempts of one checkpoint, and those that do not count.
+    """Numbers of attempts of one checkpoint, and of those that do not count or were changed.
 
-    Voided trials are counted by their previous score (`voided_unscored`: there was none); for `asked` the void waits
-    for a second operator. `to_success` and `to_failure` are corrected scores; `late` are corrections after the reveal,
-    except those of a failure's category alone. `estop`, `interruption` and `timeout` are runs that ended so;
-    `declared` are trials that count as failures by the plan's rules, whatever was reached.
+    `voided_successes` and `voided_failures` are voided trials by their last score, `voided_unscored` those without a
+    score; `asked` are void requests that wait for a second operator. `to_success` and `to_failure` are corrected
+    scores; `late` are corrections after the reveal, except those that changed only the category of a failure. `estop`,
+    `interruption` and `timeout` are runs by how they ended; `declared` are trials that count as failures by the plan's
+    rules, whatever was reached.
     """
 
     checkpoint: str
@@ -90,11 +91,11 @@ def checkpoint_changes(plan: Plan) -> list[CheckpointChanges]:
 
 
 def with_changes(scores: QuerySet[Score], **named: F) -> list[dict[str, Any]]:
-    """Return the scores in the order in which they were given, with the fields in `named`.
+    """Return the scores as dicts in the order in which they were given, with the additional fields `named`.
 
-    The queryset must contain all scores of each trial. `earlier` is the row of the trial's previous score, None for a
-    first score; `changed` is the kind of change, VERDICT for a first score. One query, and one more if a score repeats
-    success and points of the previous one.
+    The queryset must contain all scores of each trial. `earlier` is the dict of the trial's previous score, None for a
+    first score; `changed` is the kind of change, VERDICT for a first score. Takes one query, and one more if a score
+    has the same success and points as the previous one.
     """
     fields = ("pk", "trial_id", "success", "score", "failure_phase", "failure")
     rows = list(scores.order_by("pk").values(*fields, **named))

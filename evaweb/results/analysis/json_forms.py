@@ -18,7 +18,7 @@ from evaweb.statistics.sequential import Evidence
 
 
 def write_interval(found: Interval | None) -> list[float] | None:
-    """Return both ends."""
+    """Return the interval as [low, high]."""
     return None if found is None else [found.low, found.high]
 
 
@@ -33,27 +33,27 @@ def write_proportion(found: Proportion) -> dict[str, Any]:
 
 
 def write_proportions(found: Mapping[str, Proportion]) -> dict[str, Any]:
-    """Return several by name."""
+    """Return a dict of proportions as JSON, with the same keys."""
     return {name: write_proportion(one) for name, one in found.items()}
 
 
 def write_gaffke(found: BoundedMean | Difference) -> dict[str, Any]:
-    """Return a mean of bounded values."""
+    """Return the mean of bounded values, or difference of such means, with its interval by Gaffke's method."""
     return {"value": found.value, "gaffke": write_interval(found.interval)}
 
 
 def write_newcombe(found: Difference) -> dict[str, Any]:
-    """Return a difference of rates."""
+    """Return a difference of success rates with Newcombe's interval."""
     return {"value": found.value, "newcombe": write_interval(found.interval)}
 
 
 def write_average(found: Average) -> dict[str, Any]:
-    """Return a mean with Student's interval."""
+    """Return a mean with its number of values and Student's interval."""
     return {"n": found.n, "mean": found.value, "student": write_interval(found.interval)}
 
 
 def write_rate(found: Rate) -> dict[str, Any]:
-    """Return a rate per hour."""
+    """Return a rate per hour with its number of events, time of exposure [s] and Garwood's interval."""
     return {
         "events": found.events,
         "exposure_s": found.exposure,
@@ -63,7 +63,7 @@ def write_rate(found: Rate) -> dict[str, Any]:
 
 
 def write_evidence(found: Evidence) -> dict[str, Any]:
-    """Return the paths of both directions, and where they end."""
+    """Return the evidence: log e of both directions after each pair, their last p-values, and where it stops."""
     return {
         "pairs": found.pairs,
         "log_e_first": list(found.first),

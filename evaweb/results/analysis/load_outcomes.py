@@ -35,8 +35,8 @@ _FIELDS = _RUN | {
 def load_plan_outcomes(plan: Plan, *, corrected: bool = False) -> list[Outcome]:
     """Return the outcomes of a plan that count, in order of allocation.
 
-    For a revealed plan they are as judged at the reveal, or as of now with `corrected`. Causes of failure are always
-    the current ones, because no comparison uses them.
+    If the plan is revealed, they have the scores at its reveal; with `corrected` the current ones. Causes of failure
+    are always the current ones, because no comparison uses them.
     """
     trials = Trial.objects.filter(handout__plan=plan)
     blocks = dict(plan.handouts.values_list("trial_id", "slot__block"))
@@ -55,7 +55,10 @@ def load_plan_interruptions(plan: Plan) -> list[Interruption]:
 def _outcomes(
     trials: QuerySet[Trial], blocks: dict[int, str], order: dict[int, int], until: datetime | None
 ) -> list[Outcome]:
-    """Return the outcomes; with `until` by the newest scores given by then, without trials that had none."""
+    """Return the outcomes of the scored trials in order of starting.
+
+    With `until`, each has its newest score given by then, and trials without one are left out.
+    """
     scored = trials.filter(status=TrialStatus.SCORED).order_by("started_at", "pk")
     rows = list(scored.values_list("verdict_id", "number", *_FIELDS.values()))
     earlier = {} if until is None else _scores_before(until, trials)
@@ -84,7 +87,7 @@ def _outcomes(
 
 
 def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[int, dict[str, Any]]]:
-    """Return by trial the newest score given before `until`: its key and its values."""
+    """Return for each trial the key and values of its newest score given at or before `until`."""
     given = Score.objects.filter(trial__in=trials, scored_at__lte=until).order_by("pk")
     return {
         trial: (key, dict(zip(_JUDGED, said, strict=True)))
@@ -95,7 +98,10 @@ def _scores_before(until: datetime, trials: QuerySet[Trial]) -> dict[int, tuple[
 def _milestones(
     trials: QuerySet[Trial], earlier: dict[int, tuple[int, dict[str, Any]]]
 ) -> dict[int, list[tuple[str, bool]]]:
-    """Return the milestones of each score that counts, in order; of all scores if earlier ones count."""
+    """Return by score its milestones in order, each with whether it was reached.
+
+    The scores are those that count now; all scores of the trials if `earlier` is not empty.
+    """
     counting = (
         MilestoneOutcome.objects.filter(score__trial__in=trials)
         if earlier

@@ -78,7 +78,8 @@ class Pair:
 def pair_by_block(first: Sequence[Outcome], second: Sequence[Outcome]) -> list[Pair]:
     """Return the pairs of both checkpoints' trials by block: as scheduled for a plan, else in the order of completion.
 
-    A block without one of them is skipped. Of several trials in one block only the last counts.
+    A block in which one of the checkpoints has no trial is skipped. Of several trials in one block only the last
+    counts.
     """
     others = {outcome.block: outcome for outcome in sorted(second, key=lambda o: o.order)}
     ours = {outcome.block: outcome for outcome in sorted(first, key=lambda o: o.order)}
@@ -114,7 +115,10 @@ def grouped(trials: Iterable[Outcome], key: Callable[[Outcome], str]) -> dict[st
 
 @dataclass(frozen=True, slots=True)
 class TimeHorizon:
-    """Horizon of times to success [s], 0 without any duration, and the time limits of scenes [s]."""
+    """Horizon of times to success, `until` [s], and time limits of scenes, `limits` [s].
+
+    The horizon is 0 if no trial has a known duration.
+    """
 
     until: float
     limits: Mapping[str, float]

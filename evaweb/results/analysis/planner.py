@@ -112,11 +112,11 @@ def question_of(given: Mapping[str, str], *, alike: bool = False) -> Question:
 def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, Any]:
     """Return what each design needs for the input, what the available time can detect, and power by gain.
 
-    Computed on behalf of `person`, who has a limited share of the computation.
+    It is computed on behalf of `person`, who has a limited share of the computation.
 
     Raises:
-        Busy: If the person's share is used up.
-        UnderWay: If the result is not ready in time; with `soon` after a short wait.
+        Busy: If the share of `person` is used up.
+        StillRunning: If the result is not ready in time; with `soon` after a short wait.
     """
     comparisons = COMPARISONS[Comparing(q.comparing)](q.checkpoints)
     alpha = q.alpha / comparisons
@@ -145,8 +145,10 @@ def table_of(q: Question, person: Hashable, *, soon: bool = False) -> dict[str, 
 
 
 def design_for_power(q: Question, rule: str, found: DesignPower | None, *, alone: bool) -> dict[str, Any]:
-    """Return a design that reaches the power, with its trials and robot hours at most and on average; without
-    one, `pairs` is None.
+    """Return a design by `rule` that reaches the power, with its trials and robot hours at most and on average.
+
+    `found` is its power and number of pairs; if None, no such design exists and `pairs` is None. Averages are given
+    only if a single pair of checkpoints is compared (`alone`).
     """
     if found is None:
         return {"rule": rule, "pairs": None}

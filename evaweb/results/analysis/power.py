@@ -33,10 +33,11 @@ _KEPT = 64
 
 @dataclass(frozen=True, slots=True)
 class PowerRequest:
-    """Request for the power of a design with `pairs` pairs, at each comparison's share of alpha and at assumed rates.
+    """Request for the power of a design with `pairs` pairs at assumed rates.
 
-    `question` has rates, wanted power and times; its weaker rate is that of the control. `alone`: the plan has a
-    single comparison. With `scores` these are compared, and the rates are their means.
+    `alpha` is that of each comparison. `question` has rates, wanted power and times; its weaker rate is that of the
+    control. `alone`: the plan has a single comparison. With `scores` the scores are compared, and the rates are their
+    means.
     """
 
     rule: str
@@ -64,7 +65,9 @@ class PowerRequest:
         return sorted(found | ({self.pairs} if 2 <= self.pairs <= MOST else set()))
 
     def at(self, rule: str, pairs: int) -> DesignPower:
-        """Return the power of a design with `pairs` pairs, its looks at the same shares of the trials."""
+        """Return the power of a design with `pairs` pairs, whose looks are at the same shares of its trials as
+        requested.
+        """
         if self.scores is not None:
             return _computed(score_course, rule, pairs, self.scores, self.alpha)
         looks = self.looks if rule == self.rule else ()
@@ -75,7 +78,11 @@ class PowerRequest:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Results so far: power by design in ascending numbers of pairs, and what each design needs."""
+    """Power and needs of the designs, as far as they are computed.
+
+    `curves` has the power by design in ascending numbers of pairs, `needs` the trials that each design needs for the
+    wanted power.
+    """
 
     curves: dict[str, tuple[DesignPower, ...]] = field(default_factory=dict)
     needs: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -95,7 +102,10 @@ class Figures:
 
 
 def _computed(work: Callable[..., Any], *given: Any) -> Any:
-    """Compute outside the web process; all drafts have one share, because they are computed one after the other."""
+    """Run `work(*given)` outside the web process and return its result.
+
+    All drafts together have one person's share of the computation, because they are computed one after the other.
+    """
     return computations.questions.compute("drafts", work, *given)
 
 
@@ -103,7 +113,11 @@ _Step = Callable[[Figures], Figures]
 
 
 def _steps(asked: PowerRequest) -> Iterator[_Step]:
-    """Yield the steps in order of display: selected design, planned number of all designs, needs, remaining points."""
+    """Yield the computation's steps in the order of their importance for the page.
+
+    That order is: the selected design, the other designs at the planned number, what each design needs, and the other
+    designs' remaining points.
+    """
     planned = [asked.pairs] if asked.pairs in asked.numbers else []
     yield from (_point(asked, asked.rule, number) for number in [*planned, *asked.numbers])
     others = asked.rules[1:]
@@ -136,7 +150,7 @@ def _need(asked: PowerRequest, rule: str) -> _Step:
 
 
 class _Desk:
-    """Queue of requests; only the newest of each person is computed, earlier ones are abandoned."""
+    """Queue of requests; of each person only the newest request is computed."""
 
     def __init__(self) -> None:
         self._changed = Condition()

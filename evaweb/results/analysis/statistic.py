@@ -1,6 +1,6 @@
-"""Declaration of a statistic: one row says how it is computed, written as JSON, and shown by pages and reports.
+"""Declarations of statistics: each says how it is computed, written as JSON, and shown on pages and in reports.
 
-The rows are the fields of `Arm` and `Comparison`, in whose order all of it comes out (docs/contributing.md).
+They are the fields of `Arm` and `Comparison`; output is in the order of these fields (docs/contributing.md).
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ _ROW = "statistic"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Column of the table of checkpoints, on the page and in the report, whose program checks it.
+    """Column of the table of checkpoints, on the page and in the report.
+
+    The report's program checks its cells.
 
     Attributes:
         head: Heading.
-        cell: Text from value and arm.
+        cell: Function from a statistic's value and its arm to the text.
     """
 
     head: str
@@ -40,13 +42,15 @@ class Statistic:
     """Declaration of one statistic of an arm or a comparison.
 
     Attributes:
-        compute: Value from the trials; None, or StatisticsError, if they do not give it.
-        key: Its name in JSON, from which REST and reports have it; "" if another row writes it.
-        form: Its value there.
-        write: Instead of both, a part of the JSON object from the whole arm or comparison.
-        answers: Answers from comparison, value and context.
-        rank: Answers are shown by rank, and within one in the order of the rows.
-        none_too: Whether None is an answer.
+        compute: Function from the trials to the value; it returns None or raises StatisticsError if they do not
+            determine it.
+        key: Name in JSON, also used by REST and reports; "" if another declaration writes the value.
+        form: Function from the value to its JSON.
+        write: Used instead of `key` and `form`: function from the whole arm or comparison to a part of its JSON
+            object.
+        answers: Function from comparison, value and context to the answers.
+        rank: Order of the answers; within one rank they are in the order of declarations.
+        none_too: Whether `answers` is also called with the value None.
         describes: Whether it is shown while the design of its comparison has not ended.
         column: Column of the table of checkpoints.
     """
@@ -63,17 +67,23 @@ class Statistic:
 
 
 def statistic(*declared: Any, **more: Any) -> Any:
-    """Return the field of a dataclass that is a `Statistic`."""
+    """Return a dataclass field that declares a `Statistic` with these arguments."""
     return field(metadata={_ROW: Statistic(*declared, **more)})
 
 
 def statistics_of(kind: Any) -> dict[str, Statistic]:
-    """Return the rows of `Arm` or `Comparison` by the name of their field."""
+    """Return the declarations in `Arm` or `Comparison` by the name of their field."""
     return {each.name: each.metadata[_ROW] for each in fields(kind) if _ROW in each.metadata}
 
 
 def compute_all(kind: Any, trials: Any, notes: list[str] | None = None) -> dict[str, Any]:
-    """Return every statistic by its name; with `notes`, one that cannot be computed is None, with its reason there."""
+    """Return the values of all statistics of `kind` by name.
+
+    With `notes`, a statistic that cannot be computed is None, and the reason is appended to `notes`.
+
+    Raises:
+        StatisticsError: If one cannot be computed and there are no `notes`.
+    """
     found: dict[str, Any] = {}
     for name, row in statistics_of(kind).items():
         try:
@@ -99,7 +109,7 @@ def write_all(found: Any) -> dict[str, Any]:
 
 
 def answer_all(found: Any, context: Any) -> Iterator[tuple[str, Answer]]:
-    """Yield the answers of a comparison, each with the name of its statistic."""
+    """Yield the answers of a comparison by rank, each with the name of its statistic."""
     for name, row in sorted(statistics_of(type(found)).items(), key=lambda item: item[1].rank):
         value = getattr(found, name)
         if value is not None or row.none_too:

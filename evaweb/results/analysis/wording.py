@@ -10,34 +10,37 @@ from evaweb.statistics.sequential import Evidence
 
 
 def rate_words(found: Proportion) -> str:
-    """Return for example "46/50, 92 % [81, 97]"; a percentage is never shown without n and interval."""
+    """Return the rate as text, for example "46/50, 92 % [81, 97]".
+
+    A percentage is never shown without n and interval.
+    """
     if found.rate is None or found.interval is None:
         return "no trial"
     return f"{found.successes}/{found.n}, {100 * found.rate:.0f} % [{format_interval(found.interval)}]"
 
 
 def format_interval(interval: Interval, factor: float = 100) -> str:
-    """Return both ends in percent."""
+    """Return both ends as signed numbers, multiplied by `factor`; by default in percent."""
     return f"{_signed(factor * interval.low)}, {_signed(factor * interval.high)}"
 
 
 def format_points(found: Difference) -> str:
-    """Return for example "36 points [19, 51]"."""
+    """Return a difference as text, for example "36 points [19, 51]"."""
     return f"{_signed(100 * found.value)} points [{format_interval(found.interval)}]"
 
 
 def signed_points(share: float) -> str:
-    """Return for example "+36 points"."""
+    """Return a share as text, for example "+36 points"."""
     return f"{100 * share:+.0f} points".replace("-", "−")
 
 
 def probability(p: float) -> str:
-    """Return a probability in the format of papers."""
+    """Return a probability as papers print it, for example "0.03" or "< 0.001"."""
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def p_words(p: float) -> str:
-    """Return "p = 0.03" or "p < 0.001"."""
+    """Return a p-value as text, for example "p = 0.03" or "p < 0.001"."""
     return f"p {said}" if (said := probability(p)).startswith("<") else f"p = {said}"
 
 
@@ -57,7 +60,7 @@ def undetectable_gain_sentence(n: int, rate: float | None, alpha: float) -> str:
 
 
 def evidence_text(found: Evidence) -> str:
-    """Return the state of the evidence as text, and whether it suffices."""
+    """Return as text whether the evidence suffices, and since when or how strong it is."""
     if found.stop is not None:
         return f"suffices since pair {found.stop}"
     if not found.pairs:
@@ -67,7 +70,7 @@ def evidence_text(found: Evidence) -> str:
 
 
 def anytime_text(found: Interval | None, pairs: int) -> str:
-    """Return for example "[−3, 55] points, of 40 pairs"."""
+    """Return a confidence sequence as text, for example "[−3, 55] points, of 40 pairs"."""
     return (
         f"[{format_interval(found)}] points, of {pairs} pairs"
         if found

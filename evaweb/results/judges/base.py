@@ -14,12 +14,15 @@ PATIENCE_S = 120.0  # time limit for one trial
 
 
 class NoVerdict(Exception):
-    """The judge gave no usable verdict, with the reason as text. The trial is not shown to it again."""
+    """Error of a judge that gave no usable verdict; its text is the reason. The trial is not shown to it again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """Set-up of a judge by an administrator; with `plain`, http to another machine is allowed."""
+    """Set-up of a judge by an administrator.
+
+    If `plain` is set, unencrypted http to another machine is allowed.
+    """
 
     address: str = ""
     model: str = ""
@@ -86,11 +89,11 @@ class CaseJudgement:
 
 
 class Judge(Protocol):
-    """Judge of whether a trial's milestones were reached; called once per trial."""
+    """Automatic judge of whether a trial's milestones were reached; it is called once per trial."""
 
     @property
     def version(self) -> str:
-        """Version; it changes whenever the same case could be judged differently."""
+        """Version of the judge; it changes whenever the same case could be judged differently."""
 
     def prompt_text(self, case: TrialCase) -> str:
         """Return the complete text of the prompt, "" if there is none."""

@@ -160,7 +160,7 @@ class ChatJudge:
 
     @property
     def version(self) -> str:
-        """Version with the name of the model."""
+        """Version of the judge, with the name of the model."""
         return f"chat 1, {self._setup.model}"
 
     def prompt_text(self, case: TrialCase) -> str:
@@ -239,7 +239,11 @@ class _Deadline:
             self._socket.close()
 
     def connected(self, at: Endpoint) -> socket.socket:
-        """Return a connection to the endpoint, with its certificate verified."""
+        """Return a connection to the endpoint `at`; a secure endpoint's certificate is verified.
+
+        Raises:
+            TimeoutError: If the deadline is over.
+        """
         made = socket.create_connection((at.host, at.port), min(self.wait, _CONNECT_S))
         made.settimeout(self.wait)
         self._socket = made

@@ -33,7 +33,11 @@ class UsableJudge:
     served: bool
 
     def prompt_text(self, case: TrialCase) -> str:
-        """Return the complete text of the prompt; EvaError names the judge."""
+        """Return the complete text of the prompt for a case.
+
+        Raises:
+            EvaError: If the judge's code fails; the message names the judge.
+        """
         with _named(self.name):
             return self.judge.prompt_text(case)
 
@@ -72,7 +76,7 @@ def build_judge(name: str, kind: str, setup: Setup) -> UsableJudge:
 
 @contextmanager
 def _named(name: str, *through: type[Exception]) -> Iterator[None]:
-    """Convert exceptions of a judge's code, except `through`, to an EvaError that names the judge."""
+    """Convert exceptions of a judge's code to an EvaError that names the judge; those in `through` pass unchanged."""
     try:
         yield
     except through:

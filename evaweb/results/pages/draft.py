@@ -44,8 +44,9 @@ _EXAMPLE = bytes(KEY_BYTES)  # fixed, so that the example stays the same; freezi
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Step of the page; if it is not `done`, `words` name what is missing and `blocks` is whether that
-    prevents a freeze.
+    """Step of the page.
+
+    Unless it is `done`, `words` is what is missing, and `blocks` is whether that prevents a freeze.
     """
 
     name: str
@@ -209,7 +210,7 @@ def _preview(plan: Plan, size: Size) -> dict[str, Any]:
 
 
 def choices_page(plan: Plan, sight: Visibility, values: Values) -> dict[str, Any]:
-    """Return the available choices, and which of them are selected."""
+    """Return the checkpoints, positions, stations and owners that the page offers, and the selected `values`."""
     chosen = set(values["checkpoints"])
     offered = list(checkpoint_list(all_of_them=True, sight=sight))
     positions = Position.objects.select_related("scene").order_by("scene__title", "number")
@@ -316,7 +317,7 @@ def question_for(plan: Plan, given: Question) -> Question:
 
 
 def power_page(plan: Plan, asked: PowerRequest, found: Figures) -> dict[str, Any]:
-    """Return the figure and the table of designs, as far as computed."""
+    """Return the figure of power and the table of designs, with the values computed so far."""
     size, question = Size.of(plan), asked.question
     at = found.planned(asked)
     curves = [

@@ -137,7 +137,7 @@ class PairView:
 
 
 def pair_view(given: Mapping[str, str]) -> PairView:
-    """Return the display options of an address.
+    """Return the display options that the query of an address (`given`) requests.
 
     Raises:
         EvaError: If a value is not allowed.

@@ -104,7 +104,7 @@ def evidence(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def trials(request: HttpRequest, name: str, version: int) -> HttpResponseBase:
-    """Render the trials behind a number."""
+    """Render the list of the plan's trials that the filters in the address select."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -149,7 +149,7 @@ def report(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def integrity(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render how the trials were made, and the headline under each reason for doubt."""
+    """Render how the trials were made, and the alternative headlines."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -183,7 +183,7 @@ def simulated(request: HttpRequest, name: str, version: int) -> HttpResponse:
 
 @require_GET
 def cite(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render the citation; that of a revealed plan is at its permanent address."""
+    """Render the citation of a plan; redirect to the permanent address of its result if it is revealed."""
     found = _get_plan(name, version)
     sealed = _sealed_page(request, found)
     if sealed:
@@ -293,7 +293,7 @@ def _plan_page(
 def _sealed_page(
     request: HttpRequest, found: Plan, fault: EvaError | None = None, typed: str = ""
 ) -> HttpResponse | None:
-    """Return the page shown if results are sealed for this user or do not exist yet, else None."""
+    """Return the page that replaces the results if they are sealed for this user or do not exist yet; else None."""
     why = sealed_reason(found, request.user, visibility_for_request(request)) if has_results(found) else ""
     if has_results(found) and not why:
         return None

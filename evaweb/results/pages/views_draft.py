@@ -57,7 +57,10 @@ _CARRIED = ("rate", "better", "power", "cycle_s")  # assumptions of the calculat
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def new(request: HttpRequest) -> HttpResponse:
-    """Create a draft from a title and a question; an address from the calculator brings its numbers."""
+    """Create a draft from a title and a question, or render the form for them.
+
+    A query of the calculator presets the draft's numbers.
+    """
     user: Any = request.user
     require_drafter(user)
     given = request.POST if request.method == "POST" else request.GET
@@ -96,8 +99,9 @@ def _design(numbers: dict[str, str], assumed: Question) -> dict[str, Any]:
 
 @require_http_methods(["GET", "HEAD", "POST"])
 def edit(request: HttpRequest, name: str, version: int) -> HttpResponse:
-    """Render all steps of a draft; posted changes are saved as far as they are valid, and answered with their
-    effects.
+    """Render all steps of a draft.
+
+    A POST saves the valid ones of the changed fields and is answered with the effects of the change.
     """
     plan = plan_get(name=name, version=version, user=request.user)
     if request.method == "POST":
@@ -169,7 +173,10 @@ def _was(request: HttpRequest) -> dict[str, Any]:
 
 
 def _shown(now: Values, seen: Values, faults: dict[str, str]) -> dict[str, Any]:
-    """Return the values with which the next change is compared, and the digest by which the draft is frozen."""
+    """Return the state of the shown page: its values, with which its next change is compared, and a digest.
+
+    The digest of the saved values (`now`) is sent with a freeze.
+    """
     return {"was": json.dumps(seen), "seen": digest_of(now), "faults": faults}
 
 

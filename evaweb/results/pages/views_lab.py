@@ -39,7 +39,7 @@ def wall(request: HttpRequest) -> HttpResponse:
 
 @require_GET
 def planner(request: HttpRequest) -> HttpResponse:
-    """Render the calculator of trials and robot hours for a difference, and of what cannot be detected."""
+    """Render the calculator of the trials and robot hours that a difference needs, and of what the time can detect."""
     fault = table = None
     waiting = False
     question = Question()

@@ -15,7 +15,7 @@ from evaweb.results.selectors import TrialQuery
 
 
 def trials_address(plan: Plan, only: TrialFilter, **more: str) -> str:
-    """Return the address of the list of these trials."""
+    """Return the address of the list of the trials that the filter `only` selects."""
     question = TrialQuery(
         scene=only.scene, position=only.position, station=only.station, operator=only.operator
     )

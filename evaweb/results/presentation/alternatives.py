@@ -37,13 +37,13 @@ _kept: FingerprintCache[list[dict[str, Any]]] = FingerprintCache()
 
 
 def headline_alternatives(plan: Plan, matches: Mapping[int, float]) -> list[dict[str, Any]]:
-    """Return the headline as decided, then each alternative: description, pairs left, sentence, and whether the
-    conclusion is the same.
+    """Return the headline as decided, then each alternative, as dicts; [] for a plan without a comparison.
 
-    [] without a comparison. Parts are left out by whole blocks. The remaining blocks are judged by the design's rule,
-    each comparison on its own, as if it had been planned for this many (at its step of Holm's procedure, if used);
-    with checkpoints in random order by one test of all. If the design has not ended, nothing is left out, because
-    nothing was concluded. `matches` is the smallest bench match by trial, if known.
+    Each has a description, the pairs left, the sentence, and whether the conclusion is the same. Trials are left out by
+    whole blocks. The remaining blocks are judged by the design's rule, each comparison on its own, as if it had been
+    planned for this many (at its step of Holm's procedure, if used); with checkpoints in random order by one test of
+    all. If the design has not ended, nothing is left out, because nothing was concluded. `matches` is the smallest
+    bench match by trial, if known.
     """
     found = frozen_design(plan.document) if plan.document else None
     if found is None:
@@ -136,7 +136,7 @@ def _concluded(each: Iterable[Conclusion]) -> list[tuple[str | None, bool]]:
 def _of_these(
     found: Design, pair: tuple[int, int], left: Sequence[int], base: Sequence[Block]
 ) -> tuple[Design, list[Block]]:
-    """Return the design of one comparison as if planned for these blocks alone, and its blocks."""
+    """Return the design of one comparison as if planned for only the blocks at the indices `left`, and these blocks."""
     blocks = [base[at] for at in left]
     if found.counts is None:
         single, both = alone(found, pair, blocks)
@@ -158,8 +158,9 @@ _Left = list[tuple[Design, list[Block]]]  # by comparison: its own design, and t
 
 
 def _stepped(found: Design, left: _Left) -> _Left:
-    """Return the designs at their shares of alpha; with Holm at the share of their step, counting empty
-    comparisons too.
+    """Return the designs with their shares of alpha by Holm's procedure; unchanged if the plan does not use it.
+
+    Comparisons without blocks count as steps too.
     """
     if not found.holm:
         return left

@@ -76,7 +76,10 @@ class CitedRow:
 
 @dataclass(frozen=True)
 class Citation:
-    """Result of a plan: `kept` is the record of its reveal, or the current one; `digest` is "" without a reveal."""
+    """Result of a plan for citing.
+
+    `kept` is the record of its reveal, or of the current state without a reveal; `digest` is "" without a reveal.
+    """
 
     plan: Plan
     found: Design
@@ -85,14 +88,17 @@ class Citation:
 
     @property
     def address(self) -> str:
-        """Path of its page, permanent after a reveal; without a host, because a lab may have several names."""
+        """Path of the citation's page, permanent after a reveal.
+
+        It has no host, because a lab may have several names.
+        """
         if self.digest:
             return reverse("result-frozen", args=[self.digest])
         return reverse("result-cite", args=[self.plan.name, self.plan.version])
 
     @property
     def commitment(self) -> str:
-        """Commitment of the reveal; reveals that did not record it use the plan's, as do key and account."""
+        """Commitment of the reveal; if the reveal did not record it, that of the plan."""
         return str(self.kept.get("commitment") or self.plan.commitment)
 
     @property
@@ -190,7 +196,7 @@ class Citation:
 
     @cached_property
     def known(self) -> list[tuple[str, Proportion]]:
-        """Rows of the figure."""
+        """Name and success of each checkpoint with a recorded success: the rows of the figure."""
         return [(row.checkpoint, row.success) for row in self.rows if row.success is not None]
 
     @property
@@ -304,7 +310,7 @@ def citation(plan: Plan) -> Citation:
 
 
 def _declared(document: Mapping[str, Any]) -> str:
-    """Return what runs with an abnormal end count as, for those ends that the plan decides in advance."""
+    """Return the plan's rules on runs with an abnormal end as text: what each kind of end counts as."""
     counts = {"failure": "a failure", "repeated": "no trial, and is repeated"}
     said = document.get("counts_as", {})
     return "".join(f"; {ENDS[name]} makes {counts[said[name]]}" for name in ENDS if said.get(name) in counts)

@@ -20,7 +20,10 @@ from evaweb.results.presentation.plan_result import PlanResult
 
 @dataclass(frozen=True, slots=True)
 class ComparisonFact:
-    """Question that a comparison answers, with method and answer; `own` if it is the interval of the plan's design."""
+    """Question that a comparison answers, with the method and the answer.
+
+    `own` marks the answer that is the interval of the plan's design.
+    """
 
     question: str
     method: str
@@ -50,7 +53,7 @@ def comparison_sentence(analysis: Analysis, found: Comparison) -> str:
 
 
 def comparison_facts(result: PlanResult, found: Comparison) -> dict[str, Any]:
-    """Return sentence and facts of a comparison; the sentence of a planned one comes from its design."""
+    """Return the sentence, the facts and the notes of a comparison; a planned comparison's sentence is its design's."""
     plan, analysis = result.plan, result.analysis
     names = compared(plan.document or {})
     planned = result.headline if (found.first, found.second) in names else None
@@ -79,8 +82,9 @@ def _facts(result: PlanResult, found: Comparison, own: str) -> Iterator[Comparis
 
 
 def _own_interval(plan: Plan) -> str:
-    """Return the statistic that is the interval of the plan's design; a boundary's is shown below the headline
-    instead.
+    """Return the name of the statistic that is the interval of the plan's design.
+
+    "" if the design has none there: the estimate of a boundary is shown below the headline.
     """
     by_score = (plan.document or {}).get("stopping", {}).get("outcome") == PrimaryOutcome.SCORE
     if plan.stopping == StoppingRule.EVIDENCE:
@@ -89,7 +93,10 @@ def _own_interval(plan: Plan) -> str:
 
 
 def undetectable_text(analysis: Analysis, found: Comparison | None = None) -> str:
-    """Return what these trials could not have detected, at a planned comparison's share of alpha."""
+    """Return what these trials could not have detected at the comparison's share of alpha.
+
+    Without `found` it is about all checkpoints, at the largest share.
+    """
     arms = [arm for arm in analysis.arms if found is None or arm.checkpoint in (found.first, found.second)]
     n = min(arm.success.n for arm in arms)
     rate = min((arm.success.rate for arm in arms if arm.success.rate is not None), default=None)

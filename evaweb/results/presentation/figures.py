@@ -15,7 +15,10 @@ Link = Callable[..., str]  # address of the list of trials by checkpoint, scene 
 def draw_arms(
     arms: Sequence[Arm], letters: Mapping[str, str], link: Link, *, mixed: bool = False
 ) -> dict[str, Any]:
-    """Return the figures by name; with `mixed` also the funnels of scenes whose milestones differ by checkpoint."""
+    """Return the figures of the checkpoints by name.
+
+    The funnel of a scene whose milestones differ between checkpoints is drawn only with `mixed`.
+    """
     rows = [(arm.checkpoint, arm.success, link(checkpoint=arm.checkpoint)) for arm in arms]
     order = {arm.checkpoint: arm.series for arm in arms}
     scenes = sorted({name for arm in arms for name in arm.scenes})

@@ -44,14 +44,14 @@ _UNDECIDED = 6  # format from which too few trials are reported as undecided
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """Headline: a sentence per planned comparison, how it was decided, and alternative headlines.
+    """Headline: a sentence per planned comparison, how they were decided, and alternative headlines.
 
-    Alternatives are "" if they have the same blocks.
+    An alternative is "" if it would be from the same blocks.
 
     Attributes:
-        corrected: With the scores corrected after the reveal.
-        at_first: With every first score and no voids.
-        worst: With every attempt that was discarded unscored counted against the result.
+        corrected: Alternative with the scores as corrected after the reveal.
+        at_first: Alternative with every first score and no voids.
+        worst: Alternative with every attempt that was discarded unscored counted against the result.
         estimates: Corrected differences of comparisons that stopped early.
         versions: Headlines of earlier versions of the plan.
         letters: If all checkpoints were compared with each other: two share a letter if they were not separated.
@@ -108,7 +108,10 @@ class Headline:
 
 
 def conclude(plan: Plan, found: Design, now: Tried, decided: Sequence[Block]) -> Headline:
-    """Return the headline of a plan with the design `found` from the blocks that count, `decided`."""
+    """Return the headline of a plan: the conclusion of its design `found` from the blocks `decided`.
+
+    `decided` are the blocks that count; `now` are the current outcomes, from which the alternatives are made.
+    """
     return Headline(
         sentences_of(plan, found, decided),
         f"{rule_text(plan)}, {alpha_text(found)}",
@@ -168,13 +171,13 @@ def letters_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> tuple[tupl
 
 
 def _ranks(found: Design, arms: Sequence[str], said: Findings) -> bool:
-    """Return True if three or more were compared with each other, and all comparisons have ended."""
+    """Return True if three or more checkpoints were all compared with each other, and every comparison has ended."""
     of_all = len(arms) > 2 and len(found.comparisons) == len(arms) * (len(arms) - 1) // 2
     return of_all and found.margin is None and bool(said.ended)
 
 
 def best_of(plan: Plan, found: Design, blocks: Sequence[Block]) -> str:
-    """Return the sentence on the best of three or more checkpoints, or on the remaining ones.
+    """Return the sentence on the best of three or more checkpoints, or on those that no comparison found worse.
 
     "" if it was not asked for or is not decided, or if a test of scores only shows that they differ.
     """
@@ -236,7 +239,10 @@ def _sentence(
 
 
 def _could_separate(plan: Plan, found: Design, pair: tuple[int, int], blocks: Sequence[Block]) -> bool:
-    """Return True if some outcomes of this many trials could have separated these two."""
+    """Return True if this many trials could have separated the pair.
+
+    That is so if they separate it when every trial of its first checkpoint succeeds and every other one fails.
+    """
     if (plan.document or {}).get("format", 1) < _UNDECIDED:
         return True
     apart = [tuple((arm, float(arm == pair[0])) for arm, _ in block) for block in blocks]
@@ -257,7 +263,7 @@ def _counts(found: Design, one: Conclusion, ours: Sequence[float], theirs: Seque
 
 
 def _other(plan: Plan, found: Design, blocks: Sequence[Block], decided: Sequence[Block]) -> str:
-    """Return the sentence from these blocks; "" if they are the same."""
+    """Return the conclusion from `blocks`; "" if they are the same as `decided`."""
     return "" if same_blocks(blocks, decided) else sentence_of(plan, found, blocks)
 
 
@@ -281,7 +287,10 @@ def _estimates(plan: Plan, found: Design, blocks: Sequence[Block]) -> Iterator[s
 
 @dataclass(frozen=True, slots=True)
 class WorstCase:
-    """Comparison with discarded, unscored attempts counted against its winner; `same` if it still wins."""
+    """Conclusion of a comparison with discarded, unscored attempts counted against its winner.
+
+    `same` is True if it still wins.
+    """
 
     sentence: str
     same: bool
@@ -304,7 +313,7 @@ def in_the_worst_case(plan: Plan, found: Design, decided: Sequence[Block], now: 
 
 
 def _as_decided(now: Tried, decided: Sequence[Block]) -> Tried:
-    """Return the current trials with the outcomes that decided; unchanged if these are not from the same trials."""
+    """Return the current trials with the outcomes in `decided`; unchanged if `decided` is not from the same trials."""
     if len(now.counted) != len(decided):
         return now
     outcomes: list[Block] = []

@@ -98,7 +98,7 @@ def _failure_table(
     causes = _ordered({mode.cause for mode in arm.failures}, order["failure"])
 
     def cell(phase: str | None, cause: str | None) -> Cell:
-        """Return the cell of a phase and a cause; None for all."""
+        """Return the count and the trials' address for a phase and a cause; None stands for all phases or causes."""
         chosen = [m for m in arm.failures if phase in (None, m.phase) and cause in (None, m.cause)]
         named = {"failure_phase": phase, "failure": cause}
         where = {field: words or UNSPECIFIED for field, words in named.items() if words is not None}
@@ -206,7 +206,7 @@ def trial_filters(runs: Sequence[Outcome]) -> list[Filter]:
 
 
 def question_of(chosen: Mapping[str, str]) -> TrialQuery:
-    """Return the query for the selected filters; without a status, trials that count."""
+    """Return the query of trials for the selected filters; without a status it is for trials that count."""
     status = chosen["status"] or TrialStatus.SCORED.value
     return TrialQuery(**{**chosen, "status": "" if status == EVERY else status})
 

@@ -21,10 +21,11 @@ from evaweb.statistics.proportions import Proportion
 
 @dataclass(frozen=True)
 class PlanResult:
-    """Result of a plan for one request or one job, which reads the database when first asked.
+    """Result of a plan for one request or one job; each part reads the database at its first use and is kept.
 
-    After a write a new one is made. Whether a user may see it is decided beforehand, by `result_visibility`. `only`
-    selects the trials that are analysed; the conclusion is always of all.
+    After a write to the database a new object is needed. Whether a user may see the result has to be decided before, by
+    the module `ratings.result_visibility`. `only` selects the trials that are analysed; the conclusion is always from
+    all.
     """
 
     plan: Plan

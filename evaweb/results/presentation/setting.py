@@ -18,7 +18,7 @@ def setting_of(plan: Plan) -> str:
 
 
 def setting_now(plan: Plan) -> str:
-    """Return the sentence as of now, with dates in UTC."""
+    """Return the current setting of the result as a sentence, with dates in UTC; "" without trials."""
     station, verdict = "trial__station__", "trial__verdict__"
     groups = plan.handouts.filter(trial__status=TrialStatus.SCORED).order_by()
     rows = list(

@@ -83,7 +83,7 @@ _NAMED = 200  # pairs per database query
 
 
 class NextItem(NamedTuple, Generic[T]):
-    """Next item for one rater, None if there is none; `left` is the number of items for this rater.
+    """Next item for one rater (`found`, None if there is none), and the number of items for this rater (`left`).
 
     `passed` are codes of earlier trials that were skipped, because this machine has no images of them.
     """
@@ -103,7 +103,7 @@ class Pair:
 
 
 def rating_sample(plan: Plan) -> list[int]:
-    """Return the schedule positions of the trials to rate again, in their order; drawn by the plan's key."""
+    """Return the schedule positions of the trials to be rated again, in a random order drawn by the plan's key."""
     n = plan.slots.count()
     drawn = SeededDraws(bytes(plan.key or b""), "second rater").shuffled(range(n))
     return drawn[: math.ceil(plan.second_rater_share * n)]
@@ -121,10 +121,13 @@ def next_to_rate(user: User) -> NextItem[Handout]:
 
 
 def _rated_first(what: str, trial: Trial, user: User) -> None:
-    """Check, before the wording of a score is corrected, that the user is not a potential second rater of the trial.
+    """Refuse to let a potential second rater of the trial correct the wording of its score.
 
     Correcting first would disqualify them as a rater, and mostly for failures; and a rater must not know the score's
     wording.
+
+    Raises:
+        NotAllowed: If `what` is "reworded" and the user may still be asked to rate the trial.
     """
     if what != "reworded":
         return
@@ -154,9 +157,10 @@ def _still_rates(user: User, plan: Plan, trial: Trial) -> bool:
 
 
 def _offered(waiting: Iterable[T], count: int, of: Callable[[T], tuple[Handout, ...]]) -> NextItem[T]:
-    """Return the first item with all images, else the first whose images may still arrive; earlier ones are `passed`.
+    """Return the first item with all images, else the first whose images may still arrive.
 
-    `waiting` is read no further than necessary.
+    `of` gives the trials of an item; the codes of trials whose images are missing are returned as `passed`. `waiting`
+    is read no further than necessary.
     """
     for there, each in zip((is_watchable, may_become_watchable), tee(waiting), strict=True):
         passed: list[str] = []
@@ -307,7 +311,7 @@ def _handout(plan: Plan, code: str) -> Handout:
 
 
 def _is_repeat(before: T, said: Mapping[str, Any], twice: str) -> T:
-    """Return the earlier answer if the same is sent again, as after a lost reply.
+    """Return the earlier answer `before`, because the same answer was sent again, as after a lost reply.
 
     Raises:
         Conflict: If the new answer differs.

@@ -23,10 +23,10 @@ def sealed_reason(plan: Plan, user: Any, sight: Visibility | None = None) -> str
 
 
 def sealing_plans(plan: Plan, user: Any, sight: Visibility | None = None) -> list[Plan]:
-    """Return other plans, blind for this user, because of which the results of this plan are hidden; [] if they are
-    visible.
+    """Return other plans, blind for this user, because of which the results of this plan are hidden.
 
-    All blind plans are returned, not only those that share a checkpoint: the selection would reveal what they compare.
+    [] if they are visible. All blind plans are returned, not only those that share a checkpoint: a selection would
+    reveal what they compare.
     """
     seen = sight or visibility_for_user(user)
     if is_sealed_for(plan, user) or not plan.checkpoints.filter(pk__in=seen.checkpoints).exists():

@@ -32,7 +32,7 @@ def layout_rows(plan: Plan) -> Iterator[list[dict[str, Any]]]:
 
 
 def with_json_regions(pages: Iterable[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
-    """Yield the rows with regions as JSON, "" without any."""
+    """Yield the pages with each row's regions as JSON text, "" if it has none."""
     for rows in pages:
         yield [{**row, "regions": json.dumps(row["regions"]) if row["regions"] else ""} for row in rows]
 

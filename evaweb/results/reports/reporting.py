@@ -193,7 +193,7 @@ def report_context(result: PlanResult) -> dict[str, Any]:
 
 
 def _ends(document: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return what runs with an abnormal end count as, as text."""
+    """Return (kind of abnormal end, what it counts as) as texts, for each kind that the plan decides."""
     said = document.get("counts_as", {})
     return [(words, CountsAs(said[name]).label) for name, words in ENDS.items() if name in said]
 

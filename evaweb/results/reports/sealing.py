@@ -70,7 +70,10 @@ def _conduct(result: PlanResult) -> dict[str, Any]:
 
 
 def _attempts(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
-    """Yield the attempts with the reasons of voids; other reasons may change when an attempt is scored later."""
+    """Yield the columns ATTEMPT of each attempt, and the reason of a void.
+
+    Other reasons are left out, because they may change when an attempt is scored later.
+    """
     for row in rows:
         voided = row["status"] == TrialStatus.VOIDED
         yield [*(plain(row[name]) for name in ATTEMPT), row["reason"] if voided else ""]

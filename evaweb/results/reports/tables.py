@@ -21,7 +21,10 @@ from evaweb.trials.record import HINTS, TrialRecord
 
 
 def _flat(hint: Any) -> Any:
-    """Return a type as used in exports: numbers, times and booleans are kept, everything else is text."""
+    """Return the type of a field's column in exports.
+
+    Numbers, times and booleans keep their type; any other becomes text. None stays allowed.
+    """
     kinds = set(get_args(hint)) or {hint}
     if kinds - {type(None)} <= {bool, int, float, datetime}:
         return hint

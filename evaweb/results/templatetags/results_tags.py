@@ -55,19 +55,19 @@ def difference_text(found: Difference) -> str:
 
 @register.filter
 def probability(p: float) -> str:
-    """Return a probability in the format of papers."""
+    """Return a probability as papers print it, for example "0.03" or "< 0.001"."""
     return wording.probability(p)
 
 
 @register.filter
 def p_value_text(p: float) -> str:
-    """Return "p = 0.03" or "p < 0.001"."""
+    """Return a p-value as text, for example "p = 0.03" or "p < 0.001"."""
     return wording.p_words(p)
 
 
 @register.filter
 def outcome_text(run: Outcome) -> str:
-    """Return success or failure, and the score if it is neither 0 nor 1."""
+    """Return success or failure with its cause, and the share of points if it is neither 0 nor 1."""
     said = "success" if run.success else ": ".join(filter(None, ("failure", run.why)))
     return f"{said}, {100 * run.score:.0f} % of points" if 0 < run.score < 1 else said
 
@@ -92,7 +92,7 @@ def rows_of_trial(rows: Mapping[int, list[Any]], trial: int) -> list[Any]:
 
 @register.simple_tag
 def closed_because(plan: Plan, sealed: bool) -> str:
-    """Return why the plan was closed, as far as the reader may know it."""
+    """Return the reason for which the plan was closed; of a `sealed` plan only what the reader may know."""
     return visible_close_reason(plan, sealed)
 
 
@@ -111,7 +111,7 @@ _FORMATS = (("csv", "Trials as CSV"), ("parquet", "as Parquet"), ("json", "as JS
 
 @register.filter
 def count_and_list(found: list[Any], what: str) -> str:
-    """Return the number of items, and the names of the first of them."""
+    """Return the number of items and the names of the first ones; `what` is the noun that precedes the names."""
     if not found:
         return "none"
     names = ", ".join(str(each) for each in found[:_MOST_NAMED])
@@ -133,19 +133,19 @@ def percent(share: float, digits: int = 3) -> str:
 
 @register.filter
 def shared(total: float, among: int) -> float:
-    """Return one equal share of a value."""
+    """Return one of `among` equal shares of `total`."""
     return total / among
 
 
 @register.filter
 def minus(count: int, shown: list[Any]) -> int:
-    """Return the number of items that are not shown."""
+    """Return the number of items that are not shown, of `count`."""
     return count - len(shown)
 
 
 @register.filter
 def field_text(name: str) -> str:
-    """Return a draft's field by its name on the page."""
+    """Return the name of a draft's field as the page shows it."""
     return _FIELD_WORDS.get(name, name.replace("_", " ").capitalize())
 
 

@@ -34,7 +34,7 @@ _LABELS = {"failure_phase": "Phase", "failure": "Cause"}
 
 @register.simple_tag(takes_context=True)
 def filter_chips(context: Any, names: str) -> list[dict[str, str]]:
-    """Return the active filters among `names`: text `words`, and the query string `without` each."""
+    """Return the active filters among `names`: each as text (`words`), with the query string without it (`without`)."""
     given = context["request"].GET
     chips = []
     for name in names.split():

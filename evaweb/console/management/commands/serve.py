@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 
 class Command(BaseCommand):
-    """Web process: pages, REST, live sockets, and event ingest."""
+    """Command that runs the web process: pages, REST, live sockets, and event ingest."""
 
     help = "Serves pages, REST and live stations until it is told to end."
 

@@ -11,7 +11,7 @@ from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 
 class Command(BaseCommand):
-    """E-stop, stop and halt over REST, in a process that the pages cannot overload."""
+    """Command that answers e-stop, stop and halt over REST, in a process that the pages cannot overload."""
 
     requires_system_checks = (Tags.security, Tags.compatibility)  # the checks of URLs would import every page
     help = "Answers e-stop, stop and halt beside the web process until it is told to end."

@@ -26,7 +26,10 @@ _ONLY_LOOK = ("list", "check", "push")
 
 
 class Command(BaseCommand):
-    """Names are those of the pages: cups is DATA/datasets/cups. A path that starts with / or . is used as given."""
+    """Command with the operations on datasets.
+
+    Names are those of the pages: cups is DATA/datasets/cups. A path that starts with / or . is used as given.
+    """
 
     help = "Publishes, imports, converts, merges, splits, prunes, repairs, checks, lists and pushes datasets."
 

@@ -15,7 +15,7 @@ from evaweb.jobs.workers import queue_names
 
 
 class Command(BaseCommand):
-    """Worker process: one job at a time, at the lowest priority."""
+    """Command that runs a worker: one job at a time, at the lowest priority."""
 
     requires_system_checks = (Tags.security, Tags.compatibility)  # the URL checks would import every page
     help = "Does the jobs that wait: previews and datasets of finished episodes."

@@ -233,7 +233,7 @@ class Command(BaseCommand):
 
 
 def result_lines(found: Analysis) -> Iterator[str]:
-    """Yield each rate with n and interval, and differences with intervals; the conclusion is the headline's."""
+    """Yield a line per rate with its interval, a line per difference with its interval, and the notes."""
     for arm in found.arms:
         yield f"{arm.checkpoint}: {arm.success.successes}/{arm.success.n} {_percent(arm.success.interval)}"
     for one in found.comparisons:

@@ -14,8 +14,9 @@ from evaweb.lab.diagnosis import bundle
 
 
 class Command(BaseCommand):
-    """Command that writes the bundle; without --unblinded nothing about blind plans, because its reader may
-    be blind.
+    """Command that writes the bundle.
+
+    Without --unblinded it has nothing about blind plans, because its reader may be blind.
     """
 
     help = "Versions, settings, machine, deployments, stations, jobs and logs of this lab in one file, without secrets."

@@ -17,7 +17,10 @@ from evaweb.trials.models import Checkpoint, Scene
 
 
 class Command(BaseCommand):
-    """`import FILE --user NAME` imports a file, `export [NAME ...] [--archive FILE.zip]` writes one."""
+    """Command with two forms.
+
+    `import FILE --user NAME` imports a file, `export [NAME ...] [--archive FILE.zip]` writes one.
+    """
 
     help = (
         "Imports and exports scenes, checkpoints and plans as TOML, or with reference pictures as an archive."

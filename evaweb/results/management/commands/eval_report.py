@@ -14,12 +14,12 @@ from evaweb.results.selectors import plan_get
 
 
 class Command(BaseCommand):
-    """`manage.py eval_report PLAN --out DIR`."""
+    """Command that writes the offline report of a plan: `manage.py eval_report PLAN --out DIR`."""
 
     help = "Write the offline report of a plan, with its data and a program that computes every number again."
 
     def add_arguments(self, parser: ArgumentParser) -> None:
-        """Declare the plan and the folder."""
+        """Declare the arguments: the plan and the folder."""
         parser.add_argument("plan", help="its name; with /VERSION where it is not the newest one")
         parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
         parser.add_argument(

@@ -38,7 +38,7 @@ def draw_intervals(
 ) -> Drawing:
     """Draw one row per (name, x of n, address): mark at the rate, band over its 95 % interval, and the numbers.
 
-    `order` is the series of each name; names without one share the first series.
+    `order` maps names to the index of their series; names that it lacks are drawn as series 0.
     """
     step = 36
     height = step * len(rows) + 44
@@ -110,7 +110,10 @@ def draw_violins(arms: Sequence[Arm], letters: Mapping[str, str]) -> Drawing:
 
 
 def draw_difference(found: Comparison) -> Drawing:
-    """Draw the first minus the second in percentage points, with Newcombe's interval, on an axis centred at 0."""
+    """Draw the first checkpoint's rate minus the second's in percentage points.
+
+    The interval is Newcombe's; the axis is centred at 0.
+    """
     height = 114
     scale = Scale(-1, 1, 30, WIDTH - 30)
     interval = found.difference.interval

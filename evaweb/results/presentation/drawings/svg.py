@@ -110,7 +110,7 @@ def printable(figure: Drawing, above: Sequence[str], below: Sequence[str]) -> st
 
 
 def counted(found: Proportion) -> tuple[object, ...]:
-    """Return the cells of the columns PROPORTION."""
+    """Return the cells for a proportion in the columns PROPORTION."""
     interval = found.interval
     return (found.successes, found.n, found.rate, interval and interval.low, interval and interval.high)
 
@@ -126,12 +126,12 @@ def element(tag: str, content: str = "", /, **attributes: object) -> str:
 
 
 def words(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> str:
-    """Return a line of text."""
+    """Return an element with one line of text at (`x`, `y`)."""
     return element("text", escape(text), x=float(x), y=float(y), text_anchor=anchor, class_=class_ or None)
 
 
 def line(points: Sequence[tuple[float, float]], class_: str) -> str:
-    """Return straight lines between points."""
+    """Return an element with straight lines between points."""
     return element("path", d=path(points), class_=class_)
 
 
@@ -141,18 +141,21 @@ def path(points: Sequence[tuple[float, float]]) -> str:
 
 
 def link(address: str, title: str, content: str) -> str:
-    """Return the content as a link to the trials behind it; without an address only with its title."""
+    """Return the content with a tooltip, as a link to `address`; "" makes it no link."""
     inner = element("title", escape(title)) + content
     return element("a", inner, href=address) if address else element("g", inner)
 
 
 def series(i: int | None) -> str:
-    """Return the class of the i-th series; None for no checkpoint."""
+    """Return the style class of series `i`; None stands for a shape that belongs to no checkpoint."""
     return "series-none" if i is None else f"series-{i % SERIES + 1}"
 
 
 def mark(i: int | None, x: float, y: float, r: float = 5) -> str:
-    """Return the mark of the i-th series, with its own shape because not every reader can distinguish the colours."""
+    """Return the mark of the i-th series.
+
+    Each series has a shape of its own, because not every reader can distinguish the colours.
+    """
     shapes = (
         f"M{_n(x - r)} {_n(y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0Z",
         path([(x - r, y - r), (x + r, y - r), (x + r, y + r), (x - r, y + r)]) + "Z",

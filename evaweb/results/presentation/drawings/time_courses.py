@@ -143,7 +143,7 @@ def draw_evidence(
 ) -> Drawing:
     """Draw the e-processes of both directions by pair on a logarithmic scale, with the threshold.
 
-    `drawn` are the series of the first and the second checkpoint.
+    The axis extends to `foreseen` pairs, if given. `drawn` are the series of the first and the second checkpoint.
     """
     wanted = math.log10(2 / found.alpha)
     paths = [[value / math.log(10) for value in path] for path in (found.first, found.second)]
@@ -243,8 +243,9 @@ def _area(upper: Sequence[tuple[float, float]], lower: Sequence[tuple[float, flo
 
 
 def _names(labels: Sequence[tuple[float, int, str]], x: float, lowest: float) -> list[str]:
-    """Return marks and names at the ends of curves, each label (height, series, name); a negative series only
-    takes space.
+    """Return marks and names at the ends of curves; `labels` has (height, series, name) per curve.
+
+    A label with a negative series only reserves space.
     """
     gap = 20 + LINE * (max(len(wrapped(name, _LETTERS)) for _, _, name in labels) - 1)
     return [
@@ -257,7 +258,7 @@ def _names(labels: Sequence[tuple[float, int, str]], x: float, lowest: float) ->
 def _apart(
     labels: Sequence[tuple[float, int, str]], gap: float, lowest: float
 ) -> list[tuple[float, int, str]]:
-    """Return the labels moved down until none overlaps, and up again if they would leave the figure."""
+    """Return the labels moved down until they do not overlap, and up again if they would leave the figure."""
     placed: list[tuple[float, int, str]] = []
     for y, i, name in sorted(labels):
         placed.append((max(y, placed[-1][0] + gap) if placed else y, i, name))

@@ -121,7 +121,7 @@ def main() -> int:
 def statement(
     seal: dict[str, Any], plan: dict[str, Any], shown: dict[str, Any], record: dict[str, Any]
 ) -> Iterator[str]:
-    """Yield lines on what follows from the data, whatever the page states."""
+    """Yield lines that state the result as the data give it, independently of the report's page."""
     kept = seal["at_reveal"] or {}
     yield f"What follows from data/, of {plan['title']} v{plan['version']}, {plan['stopping']['rule']}:"
     for sentence in (*kept.get("headline", ()), kept.get("setting", "")):
@@ -203,7 +203,10 @@ def _as_revealed(rows: Rows, scores: Rows, at_reveal: dict[str, Any] | None) -> 
 
 
 def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, str]:
-    """Return the trial with that score; its cause of failure stays the current one if it failed by both."""
+    """Return the trial with the values of `score`.
+
+    Without a score it is not scored. Its cause of failure stays the current one if its success is unchanged.
+    """
     if score is None:
         return {**row, "status": "ended" if row["status"] == "scored" else row["status"]}
     names = ["success", "score", "milestones"]
@@ -213,7 +216,7 @@ def _as_judged(row: dict[str, str], score: dict[str, str] | None) -> dict[str, s
 
 
 def _agreement(rows: Rows, scores: Rows, ratings: Rows) -> dict[str, Any] | None:
-    """Return the agreement of second raters with the scores of that time, for trials that count."""
+    """Return the agreement of second raters with the scores at the time of their ratings, for trials that count."""
     given = _scores_by_trial(rows, scores)
     pairs = [(_stood(given[row["trial"]], row["at"]), row) for row in ratings if row["trial"] in given]
     if not pairs:
@@ -243,8 +246,9 @@ def _scores_by_trial(rows: Rows, scores: Rows) -> dict[str, Rows]:
 
 
 def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] | None:
-    """Return the agreement of each version of each automatic judge with the scores of that time, for trials
-    that count.
+    """Return the agreement of each version of each automatic judge with the scores at the time of its judgements.
+
+    Only trials that count are included.
     """
     given = _scores_by_trial(rows, scores)
     judges: dict[tuple[str, str], Rows] = {}
@@ -276,7 +280,7 @@ def _judges(rows: Rows, scores: Rows, judgements: Rows) -> list[dict[str, Any]] 
 
 
 def _stood(scores: Rows, at: str) -> dict[str, str]:
-    """Return the last score given by then; the first one if, after a clock was set back, there is none."""
+    """Return the last score given at or before `at`; the first score if a clock set back puts all of them later."""
     then = datetime.fromisoformat(at)
     return next(
         (score for score in reversed(scores) if datetime.fromisoformat(score["scored_at"]) <= then), scores[0]
@@ -319,7 +323,7 @@ def _float(cell: str) -> float | None:
 
 
 def differences(shown: Any, found: Any, where: str) -> Iterator[tuple[str, str]]:
-    """Yield the place of each number, and its fault or ""."""
+    """Yield the place of each number in numbers.json, and how it differs from the recomputed one; "" if it does not."""
     if isinstance(found, Drawn):
         yield where, _drawn(shown, found)
     elif isinstance(shown, dict) and isinstance(found, dict):

@@ -81,7 +81,10 @@ def recorded_blocks(at_reveal: Mapping[str, Any]) -> list[Block]:
 
 
 def blocks_of(trials: Sequence[Row], plan: Mapping[str, Any]) -> list[Block]:
-    """Return outcomes of the compared checkpoints by block, in the schedule's order, up to the last block used."""
+    """Return outcomes of the compared checkpoints by block, in the schedule's order.
+
+    The list ends with the last block that the conclusion of a comparison uses.
+    """
     arms, by_score = arms_of(plan), plan["stopping"].get("outcome") == "score"
     blocks: dict[int, dict[int, tuple[int, float]]] = defaultdict(dict)
     for trial in trials:
@@ -147,7 +150,7 @@ class _Stood:
 
 
 def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str]]], at: str) -> _Stood:
-    """Return a trial with the last of its scores at that time."""
+    """Return the trial with the last score given at or before `at`; it does not count if there was none."""
     then = datetime.fromisoformat(at)
     before = [score for score in given[row["trial"]] if datetime.fromisoformat(score["scored_at"]) <= then]
     counts = row["status"] == "scored" and bool(before)
@@ -157,7 +160,7 @@ def _stood(row: Mapping[str, str], given: Mapping[str, Sequence[Mapping[str, str
 
 
 def _plain(cell: str) -> Any:
-    """Return the cell parsed as JSON, so that equal numbers and lists compare equal; else the text."""
+    """Return the cell parsed as JSON, so that equal numbers and lists compare equal; its text if it is not JSON."""
     try:
         return json.loads(cell)
     except ValueError:
@@ -165,10 +168,11 @@ def _plain(cell: str) -> Any:
 
 
 def conclusions(blocks: Sequence[Block], plan: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return for each comparison the block of its end, its winner, and p of a fixed number's test.
+    """Return for each comparison its number of blocks, the block of its end, its winner, and p of a fixed number's
+    test.
 
-    If checkpoints are dropped, comparisons are decided block by block: the first to end in the schedule's order
-    decides which checkpoints remain.
+    If checkpoints are dropped, comparisons are decided block by block: the first to end in the schedule's order decides
+    which checkpoints remain.
     """
     names, arms = comparisons_of(plan), arms_of(plan)
     sides = [(arms.index(first), arms.index(second)) for first, second in names]
@@ -350,7 +354,10 @@ def _foreseen(plan: Mapping[str, Any]) -> int:
 
 
 def _side(look: Sequence[int], first: float, second: float, margin: float | None) -> int | None:
-    """Return the side (0, 1) for which the boundary stops, or None."""
+    """Return the side (0 or 1) for which the boundary stops at this `look`; None if it does not stop.
+
+    `first` and `second` are the successes of both sides.
+    """
     n, m, *least = look
     if margin is not None:  # with a margin it tests its second arm: the first checkpoint
         first, second = second, first
@@ -367,8 +374,9 @@ def _reaches(
 
 
 def _degree(a: int, n: int, b: int, m: int, margin: float | None) -> tuple[int, int]:
-    """Return how extreme a table is, as a fraction: squared pooled statistic; with a margin that of Agresti
-    and Caffo.
+    """Return how extreme a table with `a` of `n` and `b` of `m` successes is, as a fraction (numerator, denominator).
+
+    It is the squared pooled statistic; with a margin the signed square of Agresti and Caffo's statistic.
     """
     if margin is None:
         x, rest = a + b, n + m - a - b
@@ -470,8 +478,9 @@ def _evidence(
 def estimate(
     boundary: Sequence[Sequence[int]], first: int, n: int, second: int, m: int
 ) -> tuple[float, float, float] | None:
-    """Return the median-unbiased difference of rates with its 95 % interval, by the stagewise order; None if
-    not at a look.
+    """Return the median-unbiased difference of rates and its 95 % interval, by the stagewise order.
+
+    None if the boundary has no look at these numbers of trials, `n` and `m`.
     """
     beyond: list[tuple[float, ...]] = []
     same: list[tuple[float, ...]] = []

@@ -53,7 +53,10 @@ def calibration(pairs: Sequence[tuple[float, bool]]) -> dict[str, Any] | None:
 
 
 def on_milestone(said: Sequence[tuple[bool, bool | None, float | None]]) -> dict[str, Any]:
-    """Return the agreement on (score, judge, probability); the last two are None if the judge gave no verdict."""
+    """Return a judge's agreement with the scores on one milestone, and the Brier score of its probabilities.
+
+    `said` has for each trial the score, the judge's verdict and its probability; both are None if it gave no verdict.
+    """
     pairs = [(scored, reached) for scored, reached, _ in said if reached is not None]
     found = calibration([(p, scored) for scored, _, p in said if p is not None])
     return {
@@ -73,7 +76,7 @@ def score_alpha(pairs: Sequence[tuple[float, float]]) -> float | None:
 
 
 def by_text(milestones: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the values by milestone text; a repeated text is numbered in order: "held (2)"."""
+    """Return a dict from each milestone's text to its value; a repeated text is numbered in order: "held (2)"."""
     found: dict[str, Any] = {}
     for text, said in milestones:
         label, n = text, 1

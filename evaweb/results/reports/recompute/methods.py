@@ -44,7 +44,9 @@ Ends = list[float]
 
 
 def solve(rises: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """Return the argument in [low, high] at which an increasing function has the `wanted` value, by bisection."""
+    """Return the argument in [low, high] at which the increasing function `rises` has the `wanted` value, by
+    bisection.
+    """
     for _ in range(200):
         middle = (low + high) / 2
         if not low < middle < high:
@@ -110,7 +112,10 @@ def newcombe(x1: int, n1: int, x2: int, n2: int) -> Ends:
 
 
 def barnard(x1: int, n1: int, x2: int, n2: int) -> tuple[float, float]:
-    """Return statistic and two-sided probability; which tables are as extreme is decided in integers."""
+    """Return statistic and two-sided p-value of Barnard's test.
+
+    Whether a table is as extreme as the observed one is decided in integers.
+    """
     total = n1 + n2
 
     def square(a: int, b: int) -> tuple[int, int]:
@@ -178,7 +183,7 @@ def better(x1: int, n1: int, x2: int, n2: int) -> float:
 
 
 def mcnemar(first_only: int, second_only: int) -> float:
-    """Return the two-sided probability of a split of the discordant pairs as uneven as this."""
+    """Return the two-sided probability that chance splits the discordant pairs at least as unevenly."""
     n = first_only + second_only
     if n == 0:
         return 1.0
@@ -293,7 +298,7 @@ def mantel_haenszel(tables: Sequence[tuple[int, int, int, int]]) -> dict[str, ob
 
 
 def success_bets(pairs: Sequence[tuple[bool, bool]]) -> list[float]:
-    """Return log e after each pair (outcome of the worse, outcome of the better) of a bet on the latter."""
+    """Return log e after each pair of outcomes (first, second), for a bet that the second arm is better."""
     log_e, path = 0.0, []
     for t, (worse, better_one) in enumerate(pairs):
         p = (1 + sum(w for w, _ in pairs[:t])) / (3 + t)

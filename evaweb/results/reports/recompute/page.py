@@ -88,7 +88,7 @@ class Node:
                 yield " " if each.tag in ("br", "p", "li", "td", "th", "div", "dd", "dt") else ""
 
     def all(self, *tags: str) -> Iterator[Node]:
-        """Yield the descendants in document order, with these tags or all."""
+        """Yield the descendants that have one of these tags, or all without tags, in document order."""
         for each in self.inner:
             if isinstance(each, Node):
                 if not tags or each.tag in tags:
@@ -132,8 +132,9 @@ def plain(text: str) -> str:
 
 
 def read(page: str, styles: str | None) -> tuple[Node, list[str]]:
-    """Return the page, and everything that could hide or change its text; `styles` is the required style,
-    None if unknown.
+    """Return the parsed page, and a list of all that could hide or change its text.
+
+    `styles` is the style sheet that the page must have, None if unknown.
     """
     reader = _Reader()
     reader.feed(re.sub(r"^\s*<!doctype html>", "", page, flags=re.IGNORECASE))
@@ -220,7 +221,10 @@ def _listed(root: Node, heading: str) -> list[str]:
 
 
 def below(root: Node, *head: str) -> list[list[str]]:
-    """Return the rows of the only table with this head; if there are two, one row that matches nothing."""
+    """Return the rows below the header `head` of the page's only table that begins with it.
+
+    [] if there is no such table. If there are several, the result is one row that matches no expected row.
+    """
     tables = [
         [[cell.text for cell in row.all("th", "td")] for row in one.all("tr")] for one in root.all("table")
     ]
@@ -229,7 +233,10 @@ def below(root: Node, *head: str) -> list[list[str]]:
 
 
 def cells_fit(given: Sequence[str], wanted: Sequence[str], later: bool) -> bool:
-    """Return True if each cell has the wanted text; with `later`, corrections may follow the rate."""
+    """Return True if each cell has the wanted text.
+
+    If scores came `later`, a text on later corrections may follow the rate in the first cell.
+    """
     rate, *rest = given or [""]
     return list(rest) == list(wanted[1:]) and (
         rate == wanted[0] or (later and rate.startswith(f"{wanted[0]} with later corrections "))

@@ -107,8 +107,9 @@ def changes(
     seal: Mapping[str, Any],
     record: Mapping[str, Any],
 ) -> list[str]:
-    """Return what differs from the record of the reveal; [] before a reveal. `judged` are the tables of
-    raters and judges.
+    """Return what was changed after the reveal, by the digests in its record; [] before a reveal.
+
+    `judged` are the tables of raters and judges.
     """
     kept = seal["at_reveal"]
     if not kept:

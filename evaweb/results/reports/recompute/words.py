@@ -15,7 +15,10 @@ _FROM = 6  # plan format from which reveals record texts
 def headline_faults(
     said: Sequence[Mapping[str, Any]], blocks: Sequence[Block], plan: Mapping[str, Any], told: Sequence[str]
 ) -> list[str]:
-    """Return conclusions missing from the sentences of a reveal, and sentences without a conclusion."""
+    """Return conclusions missing from the headline's sentences, and sentences without a conclusion.
+
+    `said` are the recomputed conclusions, `told` the sentences recorded at the reveal.
+    """
     if plan.get("format", 1) < _FROM or not said:
         return []
     left, found = list(told), []
@@ -35,7 +38,7 @@ def headline_faults(
 
 
 def _ways(one: Mapping[str, Any], blocks: Sequence[Block], plan: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the possible beginnings of a comparison's sentence, with its counts."""
+    """Yield the possible beginnings of the headline's sentence on one comparison, with its counts."""
     first, second, stopping = one["first"], one["second"], plan["stopping"]
     if one["at"] is None:
         yield f"{first} and {second} were not compared: closed after {one['blocks']} of "
@@ -71,7 +74,7 @@ def _unit(plan: Mapping[str, Any]) -> str:
 
 
 def _best(said: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
-    """Return the beginning of the sentence on the best of several, "" if there must be none."""
+    """Return the beginning of the headline's sentence on the best of all checkpoints; "" if it must not have one."""
     arms, stopping = arms_of(plan), plan["stopping"]
     of_all = len(arms) > 2 and 2 * len(said) == len(arms) * (len(arms) - 1)
     differ = stopping.get("outcome") == "score" and any(one["p"] is not None for one in said)
@@ -89,8 +92,9 @@ def _best(said: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
 
 
 def page_faults(root: Node, shown: Mapping[str, Any], trials: Sequence[Trial], later: bool) -> list[str]:
-    """Return differences of the page's tables from numbers.json and trials.csv; `later`: scores came after
-    the reveal.
+    """Return differences of the page's tables from numbers.json and trials.csv.
+
+    If scores came `later` than the reveal, the page may state corrections.
     """
     arms = {row[0]: row[1:] for row in below(root, "Checkpoint", "Groups")}
     found = []
@@ -126,7 +130,7 @@ def _is_rounded(cell: str, value: float | None, digits: int) -> bool:
 
 
 def _cells(arm: Mapping[str, Any]) -> list[str]:
-    """Return the cells of a checkpoint's row after its letters."""
+    """Return the expected cells of a checkpoint's row that follow its letters."""
     rate = f"{arm['successes']}/{arm['n']}, {100 * arm['rate']:.0f} % [{_ends(arm['wilson'])}]"
     means = (
         f"{100 * arm[name]['value']:.0f} % [{_ends(arm[name]['gaffke'])}]" for name in ("score", "macro")

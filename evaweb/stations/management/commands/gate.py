@@ -10,7 +10,7 @@ from django.core.management.base import BaseCommand, CommandError, CommandParser
 
 
 class Command(BaseCommand):
-    """Connects stations on other computers, so that the web uses them like local ones."""
+    """Command that connects stations on other computers, so that the web uses them like local ones."""
 
     requires_system_checks = (Tags.security, Tags.compatibility)  # the URL checks would import every page
     help = "Lets stations on other computers connect, until it is told to end."
