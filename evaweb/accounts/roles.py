@@ -19,7 +19,7 @@ _NEEDS_ROLE = Pattern(
 
 
 class Role(StrEnum):
-    """The groups; a user without any is a viewer."""
+    """Role of a user, by their groups; a user without any of them is a viewer."""
 
     VIEWER = "viewer"
     OPERATOR = "operator"

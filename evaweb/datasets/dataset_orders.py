@@ -48,21 +48,21 @@ class _Order(BaseModel):
 
 
 class Check(_Order):
-    """Look whether a dataset is what its own metadata promise."""
+    """Order to compare a dataset with its own metadata."""
 
     what: Literal["check"]
     dataset: Name
 
 
 class Repair(_Order):
-    """Take back what a crash left."""
+    """Order to undo what a crash left incomplete in a dataset."""
 
     what: Literal["repair"]
     dataset: Name
 
 
 class Convert(_Order):
-    """Write a dataset as a new one of that version; features may get new names."""
+    """Order to write a dataset as a new one of that version; features may get new names."""
 
     what: Literal["convert"]
     dataset: Name
@@ -73,7 +73,10 @@ class Convert(_Order):
 
 
 class Import(_Order):
-    """Make its episodes ones of this lab, to be checked, reviewed and annotated; `robot` is whose numbers they are."""
+    """Order to import a dataset's episodes, so that they can be checked, reviewed and annotated here.
+
+    `robot` is the robot to whose values the dataset's columns belong.
+    """
 
     what: Literal["import"]
     dataset: Name
@@ -82,7 +85,7 @@ class Import(_Order):
 
 
 class Merge(_Order):
-    """Write the episodes of several datasets, in this order, as a new one."""
+    """Order to write the episodes of several datasets, in this order, as a new one."""
 
     what: Literal["merge"]
     datasets: Annotated[list[Name], Field(min_length=2, max_length=100)]
@@ -92,7 +95,7 @@ class Merge(_Order):
 
 
 class Split(_Order):
-    """Write some episodes of a dataset as new ones below the folder `to`."""
+    """Order to write some episodes of a dataset as new datasets below the folder `to`."""
 
     what: Literal["split"]
     dataset: Name
@@ -103,7 +106,7 @@ class Split(_Order):
 
 
 class Delete(_Order):
-    """Take episodes out of a dataset; later ones move up. Administrators."""
+    """Order to delete episodes from a dataset; later episodes get lower indices. Requires an administrator."""
 
     what: Literal["delete"]
     dataset: Name
@@ -112,7 +115,7 @@ class Delete(_Order):
 
 
 class Push(_Order):
-    """Upload a dataset to the Hugging Face hub. Administrators."""
+    """Order to upload a dataset to the Hugging Face hub. Requires an administrator."""
 
     what: Literal["push"]
     dataset: Name

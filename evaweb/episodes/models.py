@@ -14,7 +14,7 @@ LONGEST_TAG = 60  # longest tag [characters]
 
 
 class EpisodeStatus(models.TextChoices):
-    """How a recording stands; the last three are the words of its outcome."""
+    """Status of a recording; the last three are the possible values of its outcome."""
 
     RECORDING = "recording", "recording"
     FINISHED = "finished", "finished"
@@ -24,7 +24,7 @@ class EpisodeStatus(models.TextChoices):
 
 
 class EpisodeMode(models.TextChoices):
-    """What moved the robot: the modes of a run, and a recording of whatever went on."""
+    """Source of the motion in a recording: a mode of a run, "observe" outside a run, or "collect"."""
 
     CONTINUOUS = "continuous", "continuous"
     STEP = "step", "step by step"

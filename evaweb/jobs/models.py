@@ -8,7 +8,7 @@ from django.db.models.functions import Now
 
 
 class JobStatus(models.TextChoices):
-    """Where a job stands."""
+    """Status of a job."""
 
     QUEUED = "queued", "waiting"
     RUNNING = "running", "running"

@@ -13,7 +13,7 @@ from evaweb.trials.models import Checkpoint
 
 
 class PreflightStatus(models.TextChoices):
-    """Where it stands; evaweb.preflights.services alone moves it."""
+    """Status of a preflight; only evaweb.preflights.services changes it."""
 
     RUNNING = "running", "under way"
     DONE = "done", "done"

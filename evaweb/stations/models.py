@@ -147,7 +147,7 @@ class LeaseRequest(models.Model):
 
 
 class CommandStatus(models.TextChoices):
-    """What became of a command."""
+    """Outcome of a command."""
 
     PRESSED = "pressed", "pressed"
     ACCEPTED = "accepted", "accepted"
