@@ -38,7 +38,7 @@ class CheckpointOut(Schema):
 
     @staticmethod
     def of(checkpoint: Checkpoint) -> Checkpoint:
-        """Return the row itself, whose fields match."""
+        """Return the row unchanged: its attributes have the names of the schema's fields."""
         return checkpoint
 
 

@@ -54,7 +54,7 @@ class SceneOut(Schema):
 
     @staticmethod
     def of(scene: Scene) -> Scene:
-        """Return the row itself, whose fields match."""
+        """Return the row unchanged: its attributes have the names of the schema's fields."""
         return scene
 
 

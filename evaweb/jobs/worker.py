@@ -1,4 +1,4 @@
-"""Worker process: celery for the doorbell, and a poll every few seconds in case a notification was lost."""
+"""Worker process: celery notifies it of new jobs, and it polls every few seconds in case a notification was lost."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _PLAIN = ("state_keys", "action_keys")  # keys of a server without configuration
 
 @dataclass(frozen=True, slots=True)
 class ActionFormat:
-    """Format of an action that servers since N1.6 state."""
+    """Format of one action of the model, as servers since GR00T N1.6 declare it."""
 
     representation: str  # "ABSOLUTE", "DELTA" or "RELATIVE", whose responses are absolute, too
     format: str  # "DEFAULT", "XYZ_ROT6D", "XYZ_ROTVEC"
