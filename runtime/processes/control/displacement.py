@@ -17,7 +17,7 @@ from runtime.processes.control.plausibility import JointPlausibility
 _SIBLING_SILENT = Pattern("control.sibling_silent", "no sign of life from {process} {since}")
 _HELD_ELSEWHERE = Pattern(
     "control.held_elsewhere",
-    "{joint} reads {measured:.3f} rad and is held at {held:.3f}: look whether the robot stands as it is"
+    "{joint} reads {measured:.3f} rad and is held at {held:.3f}: check whether the robot is as it is"
     " shown, then set up again",
 )
 
