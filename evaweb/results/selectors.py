@@ -165,11 +165,11 @@ def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
 
     The progress does not depend on checkpoints, so that it reveals nothing.
     """
-    plan_list = list(plans)
-    slots = Slot.objects.filter(plan__in=plan_list).order_by().values_list("plan").annotate(n=Count("pk"))
+    listed = list(plans)
+    slots = Slot.objects.filter(plan__in=listed).order_by().values_list("plan").annotate(n=Count("pk"))
     foreseen: dict[int, int] = dict(slots)
     trials = Trial.objects.filter(
-        evaluation__in=[plan.evaluation_id for plan in plan_list if plan.evaluation_id]
+        evaluation__in=[plan.evaluation_id for plan in listed if plan.evaluation_id]
     )
     counts = (
         trials.order_by()
@@ -185,7 +185,7 @@ def plan_rows(plans: Iterable[Plan]) -> list[PlanRow]:
     nothing: dict[str, Any] = {"attempts": 0, "counted": 0, "since": None, "until": None}
     return [
         PlanRow(plan, foreseen.get(plan.pk, 0), **by_evaluation.get(plan.evaluation_id, nothing))
-        for plan in plan_list
+        for plan in listed
     ]
 
 

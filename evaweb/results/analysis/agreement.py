@@ -164,9 +164,9 @@ def preference_comparisons(plan: Plan) -> list[Comparison]:
     same = Q(first__checkpoint=F("second__checkpoint"))
     rows = Preference.objects.filter(~same, plan=plan).order_by("pk")
     names = ("first__checkpoint__name", "second__checkpoint__name", "outcome")
-    preferences = list(rows.values_list("first_id", "second_id", *names))
-    people = Counter((first, second) for first, second, *_ in preferences)
-    return [Comparison(*named, 1 / people[first, second]) for first, second, *named in preferences]
+    answers = list(rows.values_list("first_id", "second_id", *names))
+    people = Counter((first, second) for first, second, *_ in answers)
+    return [Comparison(*named, 1 / people[first, second]) for first, second, *named in answers]
 
 
 def preference_ranking(plan: Plan) -> dict[str, Any] | None:
