@@ -243,7 +243,7 @@ def ports() -> Line:
 def stations() -> list[Line]:
     """Return the real-time scheduling that each running station reports."""
     means = "Control sends, and reception sees: each is on time where it runs in SCHED_FIFO."
-    lines = []
+    station_lines = []
     try:
         names = list(Station.objects.filter(active=True).values_list("name", flat=True))
     except Error:  # a lab has no tables before its first start
@@ -259,8 +259,10 @@ def stations() -> list[Line]:
         good = control.startswith("FIFO") and "unlocked" not in control
         text = f"control {control or 'not told'}, reception {reception or 'not told'}"
         advice = "" if good else "give the station's account the rights above, then start it anew"
-        lines.append(Line(f"Station {name}", State.GOOD if good else State.LACKING, text, means, advice))
-    return lines
+        station_lines.append(
+            Line(f"Station {name}", State.GOOD if good else State.LACKING, text, means, advice)
+        )
+    return station_lines
 
 
 def _room(name: str, folder: Path, least_gb: float, good_gb: float, means: str, advice: str) -> Line:
