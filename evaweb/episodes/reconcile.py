@@ -125,8 +125,8 @@ def _folders() -> tuple[list[UUID], list[str]]:
     root, problems = episodes_dir(), list[str]()
     # Folders with a leading dot are incoming from other computers, or being removed.
     named = (path for path in root.iterdir() if not path.name.startswith(".")) if root.is_dir() else ()
-    folders = (path for path in named if path.is_dir())
-    return sorted(_uuids_from_names(folders, "", "no episode", problems)), problems
+    visible = (path for path in named if path.is_dir())
+    return sorted(_uuids_from_names(visible, "", "no episode", problems)), problems
 
 
 def _uuids_from_names(paths: Iterable[Path], suffix: str, otherwise: str, problems: list[str]) -> set[UUID]:
