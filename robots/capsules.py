@@ -42,11 +42,11 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
     return {link: parts for link, parts in by_name.items() if link not in robot.collision.without}
 
 
-def _remembered(shapes: Sequence[Shape]) -> tuple[Capsule, ...]:
+def _remembered(link_shapes: Sequence[Shape]) -> tuple[Capsule, ...]:
     """Return the result of `covering_capsules` from a cache, because a station loads the same robot several times."""
-    key = b"".join(_content(shape) for shape in shapes)
+    key = b"".join(_content(shape) for shape in link_shapes)
     if key not in _about:
-        covering = covering_capsules(shapes)
+        covering = covering_capsules(link_shapes)
         for capsule in covering:
             capsule.start.flags.writeable = capsule.end.flags.writeable = False
         _about[key] = covering
@@ -88,9 +88,9 @@ def covering_capsules(shown: Sequence[Shape]) -> tuple[Capsule, ...]:
     return tuple(smallest_capsule(pieces[piece]) for piece in sorted(left))
 
 
-def _capsule_volume(shapes: Sequence[Shape]) -> float:
+def _capsule_volume(link_shapes: Sequence[Shape]) -> float:
     """Return the volume of a capsule around the shapes [m3]."""
-    capsule = smallest_capsule(shapes, steps=1)
+    capsule = smallest_capsule(link_shapes, steps=1)
     length = float(np.linalg.norm(capsule.end - capsule.start))
     return float(np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius))
 
@@ -123,13 +123,13 @@ def _declared(table: CapsuleTable) -> Capsule:
     return Capsule(np.array(table.start), np.array(table.end), table.radius)
 
 
-def _balls(shapes: Sequence[Shape]) -> tuple[Float64, Float64]:
+def _balls(link_shapes: Sequence[Shape]) -> tuple[Float64, Float64]:
     """Return balls whose convex hull covers the shapes: centres [n, 3] in the link's frame, and radii [n].
 
     The corners of shapes have radius 0.
     """
     centres, sizes = [], []
-    for shape in shapes:
+    for shape in link_shapes:
         corners, size = _corners(shape)
         centres.append(corners @ shape.origin[:3, :3].T + shape.origin[:3, 3])
         sizes.append(np.full(len(corners), size))
